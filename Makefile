@@ -1,0 +1,62 @@
+# Every target makes what it needs: the first one run creates .venv and installs the locked packages.
+SHELL := /bin/bash
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+# One thread per process: parallelism is over runs and tests, and results do not depend on the machine's cores.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+export NUMBA_NUM_THREADS := 1
+
+# The first interpreter found that is new enough; override with `make PYTHON=/path/to/python3 ...`.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && { echo $$p; break; }; done)
+TEST_PROCESSES ?= 2
+
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+TRACKING := sqlite:///$(CURDIR)/outputs/mlflow.db
+
+.PHONY: help install reproduce tables test test-all lint format dashboard lock clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(INSTALLED): requirements.lock pyproject.toml
+	@if [ -z "$(PYTHON)" ]; then echo "mvest needs Python 3.11 or newer; name one with make PYTHON=..." >&2; exit 1; fi
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+install: $(INSTALLED) ## create .venv with the locked packages (every other target does so too)
+
+reproduce: $(INSTALLED) ## Table 1 and its figure
+	$(BIN)/python -m experiments.run experiment=table1
+
+tables: $(INSTALLED) ## everything in results/
+	$(BIN)/python -m experiments.tables
+
+test: $(INSTALLED) ## the tests that finish in minutes
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) -m "not slow"
+
+test-all: $(INSTALLED) ## every test
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES)
+
+lint: $(INSTALLED) ## style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(INSTALLED) ## rewrite the code in the house format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+dashboard: $(INSTALLED) ## MLflow on the recorded runs
+	@mkdir -p outputs
+	$(BIN)/mlflow ui --backend-store-uri $(TRACKING)
+
+clean: ## remove caches and the virtual environment; results and outputs stay
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""The studies: composed by Hydra, run with mvest, logged to MLflow."""

@@ -1,0 +1,1 @@
+"""What the filter is: functions and arrays, never a valve."""

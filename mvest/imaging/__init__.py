@@ -1,0 +1,1 @@
+"""From image volumes to a valve."""

@@ -1,0 +1,1 @@
+"""What the physics is: laws, elements, loads, contact, time integration, sensitivities."""

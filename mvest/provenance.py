@@ -1,0 +1,205 @@
+"""Where a result came from: commit, configuration, package versions, threads and machine.
+
+Everything here is plain dictionaries of strings, numbers and None, ready for JSON.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.errors import InputError
+
+KEY_PACKAGES = (
+    "mvest",
+    "numpy",
+    "scipy",
+    "numba",
+    "pypardiso",
+    "ipctk",
+    "pytetwild",
+    "meshio",
+    "hydra-core",
+    "mlflow",
+)
+"""Packages whose version can change a number or how it was recorded."""
+
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+"""Environment variables that cap the threads of the numerical libraries."""
+
+
+def provenance(directory: Path | None = None) -> dict[str, Any]:
+    """Describe the code and the machine that are about to compute something.
+
+    Parameters
+    ----------
+    directory : Path, optional
+        A folder of the checkout; the one that holds this file if not given.
+
+    Returns
+    -------
+    dict
+        ``git`` (see `git_state`), ``versions`` (package name to version, None where not
+        installed), ``threads`` (environment variable to value, None where unset), ``python``,
+        ``platform``, ``machine`` and ``cpu_count``.
+    """
+    return {
+        "git": git_state(directory if directory is not None else Path(__file__).resolve().parent),
+        "versions": {name: _version(name) for name in KEY_PACKAGES},
+        "threads": {name: os.environ.get(name) for name in THREAD_VARIABLES},
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def git_state(directory: Path) -> dict[str, Any]:
+    """Commit checked out in a folder, and whether its tracked files differ from it.
+
+    Parameters
+    ----------
+    directory : Path
+        Any folder of a checkout.
+
+    Returns
+    -------
+    dict
+        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file was changed); both
+        None outside a checkout, before the first commit, or where git is not installed.
+    """
+    sha = _git(directory, "rev-parse", "--verify", "HEAD")
+    if sha is None:
+        return {"sha": None, "dirty": None}
+    changes = _git(directory, "status", "--porcelain", "--untracked-files=no")
+    return {"sha": sha, "dirty": None if changes is None else bool(changes)}
+
+
+def _git(directory: Path, *arguments: str) -> str | None:
+    try:
+        finished = subprocess.run(
+            ["git", "-C", str(directory), *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=30,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return finished.stdout.strip() if finished.returncode == 0 else None
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def canonical_json(value: Any) -> str:
+    """One and the same text for equal data, whatever the order of its keys.
+
+    Tuples, NumPy arrays and NumPy scalars are written as their plain counterparts, paths as text.
+    Numbers are kept apart by type, as they are in JSON: 1 and 1.0 give different texts.
+
+    Parameters
+    ----------
+    value : object
+        Nested mappings with text keys, sequences, arrays, numbers, text, booleans and None.
+
+    Returns
+    -------
+    str
+        JSON without spaces, keys sorted, ASCII only.
+
+    Raises
+    ------
+    InputError
+        If something in it has no JSON form, NaN and infinities included.
+    """
+    return json.dumps(
+        _plain(value, "value"), sort_keys=True, separators=(",", ":"), allow_nan=False
+    )
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """SHA-256 (64 hexadecimal digits) of the canonical JSON of a configuration.
+
+    Raises
+    ------
+    InputError
+        If the configuration holds something without a JSON form.
+    """
+    return hashlib.sha256(canonical_json(config).encode("ascii")).hexdigest()
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write data as JSON, whole or not at all.
+
+    The text goes to a temporary file beside the target, which then takes the target's name in one
+    step, so that neither an interruption nor a second process ever leaves or sees half a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write or replace; its folder must exist.
+    value : object
+        As for `canonical_json`; here the keys keep their order.
+
+    Raises
+    ------
+    InputError
+        If the data has no JSON form, or the file cannot be written.
+    """
+    text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        try:
+            with temporary.open("x", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path}: {error.strerror}; its folder must exist and be writable"
+        ) from error
+
+
+def _plain(value: Any, where: str) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise InputError(
+                f"{where} is {value}; JSON holds finite numbers only, use None for a missing one"
+            )
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Mapping):
+        wrong = [key for key in value if not isinstance(key, str)]
+        if wrong:
+            raise InputError(f"{where} has the key {wrong[0]!r}; JSON keys are text")
+        return {key: _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, Sequence):
+        return [_plain(item, f"{where}[{index}]") for index, item in enumerate(value)]
+    raise InputError(f"{where} is a {type(value).__name__}, which has no JSON form")

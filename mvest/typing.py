@@ -1,0 +1,12 @@
+"""Names for the array types in signatures; shapes and units stand in each docstring."""
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+"""Array of real numbers in double precision."""
+
+IntArray: TypeAlias = NDArray[np.int64]
+"""Array of indices or counts."""

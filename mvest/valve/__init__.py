@@ -1,0 +1,1 @@
+"""What the anatomy is: leaflets, annulus, chordae, papillary muscles, and their meshes."""
