@@ -1,0 +1,343 @@
+"""Reference finite elements: shape functions, quadrature and faces.
+
+Conventions
+-----------
+* Reference coordinates are ``(xi, eta, zeta)``. Bricks live on ``[-1, 1]^3``; tetrahedra on the unit
+  simplex; wedges on unit triangle ``x [-1, 1]``.
+* ``zeta`` is the thickness direction of every layered element. By convention of the valve meshes it
+  runs from the atrial (-1) to the ventricular (+1) face.
+* Node orders. Bricks are tensor products with ``xi`` fastest: node ``i + 3 j + 9 k`` sits at
+  ``(xi_i, eta_j, zeta_k)`` with ``xi_i, eta_j`` in (-1, 0, 1). ``hex18`` has ``zeta`` in (-1, 1),
+  ``hex27`` in (-1, 0, 1). Wedges repeat the six-node triangle (corners 0, 1, 2, then the middles of
+  01, 12, 20) for each ``zeta``. ``tet10`` has corners 0..3, then the middles of 01, 12, 02, 03, 13,
+  23 (the order VTK uses for ``tetra10``).
+* ``enhanced`` returns the thickness-strain modes of a solid-shell: with two nodes through the
+  thickness the strain E33 is constant in ``zeta`` while bending makes Poisson's effect linear in it
+  (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm and
+  Roehl 1994, Int. J. Numer. Meth. Engng 37:2551, enhanced assumed strain of the thickness
+  direction).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["ELEMENTS", "FACES", "Element", "Face", "element"]
+
+Evaluate = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One reference element.
+
+    Attributes
+    ----------
+    name : str
+    n_nodes : int
+    shape : callable
+        ``(q, 3) -> (q, n_nodes)`` shape functions.
+    gradient : callable
+        ``(q, 3) -> (q, n_nodes, 3)`` derivatives with respect to the reference coordinates.
+    points, weights : ndarray
+        Stiffness quadrature, ``(q, 3)`` and ``(q,)``; the weights sum to the reference volume.
+    enhanced : callable
+        ``(q, 3) -> (q, n_modes)`` enhanced thickness-strain modes; ``n_modes`` is 0 for elements
+        that need none.
+    node_coordinates : ndarray
+        ``(n_nodes, 3)`` reference coordinates of the nodes.
+    outside : callable
+        ``(q, 3) -> (q,)`` distance (in reference coordinates) by which a point is outside; <= 0
+        inside.
+    face : str
+        Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
+    """
+
+    name: str
+    n_nodes: int
+    shape: Evaluate
+    gradient: Evaluate
+    points: FloatArray
+    weights: FloatArray
+    enhanced: Evaluate
+    node_coordinates: FloatArray
+    outside: Evaluate
+    face: str
+    centre: FloatArray
+    top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @property
+    def layered(self) -> bool:
+        """Whether ``zeta`` is a distinguished thickness direction."""
+        return self.top_face.size > 0
+
+
+@dataclass(frozen=True, slots=True)
+class Face:
+    """One reference face with nodes, quadrature and shape tables.
+
+    Attributes
+    ----------
+    name : str
+    n_nodes : int
+    shape : ndarray
+        ``(q, n_nodes)`` shape functions at the quadrature points.
+    gradient : ndarray
+        ``(q, n_nodes, 2)`` derivatives at the quadrature points.
+    weights : ndarray
+        ``(q,)``.
+    corners : ndarray
+        Local indices of triangles ``(m, 3)`` that cover the face, for drawing.
+    """
+
+    name: str
+    n_nodes: int
+    shape: FloatArray
+    gradient: FloatArray
+    weights: FloatArray
+    corners: IntArray
+
+
+def _lagrange(order: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Values and derivatives ``(q, order + 1)`` of the Lagrange basis on equispaced [-1, 1]."""
+    if order == 1:
+        return (
+            np.stack([0.5 * (1 - x), 0.5 * (1 + x)], axis=-1),
+            np.stack([np.full_like(x, -0.5), np.full_like(x, 0.5)], axis=-1),
+        )
+    return (
+        np.stack([0.5 * x * (x - 1), 1 - x * x, 0.5 * x * (x + 1)], axis=-1),
+        np.stack([x - 0.5, -2 * x, x + 0.5], axis=-1),
+    )
+
+
+def _triangle6(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Six-node triangle: values ``(q, 6)`` and derivatives ``(q, 6, 2)``."""
+    z = 1 - x - y
+    value = np.stack(
+        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z], axis=-1
+    )
+    o = np.zeros_like(x)
+    d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
+    d_y = np.stack([1 - 4 * z, o, 4 * y - 1, -4 * x, 4 * x, 4 * (z - y)], axis=-1)
+    return value, np.stack([d_x, d_y], axis=-1)
+
+
+def _no_modes(xi: FloatArray) -> FloatArray:
+    return np.zeros((xi.shape[0], 0))
+
+
+def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
+    points, weights = np.polynomial.legendre.leggauss(n)
+    return np.asarray(points), np.asarray(weights)
+
+
+# Degree-4 rule with six points on the unit triangle (Strang and Fix 1973; weights sum to 1/2).
+_A, _B = 0.445948490915965, 0.091576213509771
+_TRIANGLE_POINTS = np.array(
+    [[_A, _A], [1 - 2 * _A, _A], [_A, 1 - 2 * _A], [_B, _B], [1 - 2 * _B, _B], [_B, 1 - 2 * _B]]
+)
+_TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
+
+
+def _brick(name: str, thickness_order: int) -> Element:
+    def shape(xi: FloatArray) -> FloatArray:
+        a, _ = _lagrange(2, xi[:, 0])
+        b, _ = _lagrange(2, xi[:, 1])
+        c, _ = _lagrange(thickness_order, xi[:, 2])
+        return np.einsum("qk,qj,qi->qkji", c, b, a).reshape(xi.shape[0], -1)
+
+    def gradient(xi: FloatArray) -> FloatArray:
+        a, da = _lagrange(2, xi[:, 0])
+        b, db = _lagrange(2, xi[:, 1])
+        c, dc = _lagrange(thickness_order, xi[:, 2])
+        parts = [(c, b, da), (c, db, a), (dc, b, a)]
+        return np.stack(
+            [np.einsum("qk,qj,qi->qkji", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
+        )
+
+    def modes(xi: FloatArray) -> FloatArray:
+        one = np.ones(xi.shape[0])
+        plane = np.stack([one, xi[:, 0], xi[:, 1], xi[:, 0] * xi[:, 1]], axis=-1)
+        return xi[:, 2:3] * plane
+
+    g3, w3 = _gauss(3)
+    g2, w2 = _gauss(2)
+    points = np.array([[x, y, z] for z in g2 for y in g3 for x in g3])
+    weights = np.array([wx * wy * wz for wz in w2 for wy in w3 for wx in w3])
+    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
+    nodes = np.array([[x, y, z] for z in zetas for y in (-1.0, 0.0, 1.0) for x in (-1.0, 0.0, 1.0)])
+    return Element(
+        name=name,
+        n_nodes=len(nodes),
+        shape=shape,
+        gradient=gradient,
+        points=points,
+        weights=weights,
+        enhanced=modes if thickness_order == 1 else _no_modes,
+        node_coordinates=nodes,
+        outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
+        face="quad9",
+        centre=np.zeros((1, 3)),
+        top_face=np.arange(9) + 9 * (len(zetas) - 1),
+    )
+
+
+def _wedge(name: str, thickness_order: int) -> Element:
+    def shape(xi: FloatArray) -> FloatArray:
+        t, _ = _triangle6(xi[:, 0], xi[:, 1])
+        c, _ = _lagrange(thickness_order, xi[:, 2])
+        return np.einsum("qk,qa->qka", c, t).reshape(xi.shape[0], -1)
+
+    def gradient(xi: FloatArray) -> FloatArray:
+        t, dt = _triangle6(xi[:, 0], xi[:, 1])
+        c, dc = _lagrange(thickness_order, xi[:, 2])
+        parts = [(c, dt[:, :, 0]), (c, dt[:, :, 1]), (dc, t)]
+        return np.stack(
+            [np.einsum("qk,qa->qka", *p).reshape(xi.shape[0], -1) for p in parts], axis=-1
+        )
+
+    def modes(xi: FloatArray) -> FloatArray:
+        third = 1.0 / 3.0
+        plane = np.stack([np.ones(xi.shape[0]), xi[:, 0] - third, xi[:, 1] - third], axis=-1)
+        return xi[:, 2:3] * plane
+
+    g2, w2 = _gauss(2)
+    points = np.array([[*t, z] for z in g2 for t in _TRIANGLE_POINTS])
+    weights = np.array([wt * wz for wz in w2 for wt in _TRIANGLE_WEIGHTS])
+    zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
+    plane_nodes = [[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]
+    nodes = np.array([[*p, z] for z in zetas for p in plane_nodes], dtype=float)
+    return Element(
+        name=name,
+        n_nodes=len(nodes),
+        shape=shape,
+        gradient=gradient,
+        points=points,
+        weights=weights,
+        enhanced=modes if thickness_order == 1 else _no_modes,
+        node_coordinates=nodes,
+        outside=lambda xi: np.max(
+            np.stack([-xi[:, 0], -xi[:, 1], xi[:, 0] + xi[:, 1] - 1, np.abs(xi[:, 2]) - 1]), axis=0
+        ),
+        face="tri6",
+        centre=np.array([[1 / 3, 1 / 3, 0.0]]),
+        top_face=np.arange(6) + 6 * (len(zetas) - 1),
+    )
+
+
+def _tetrahedron(name: str, order: int) -> Element:
+    edges = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+    d_bary = np.array([[-1.0, -1, -1], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+
+    def bary(xi: FloatArray) -> FloatArray:
+        return np.column_stack([1 - xi.sum(axis=1), xi])
+
+    def shape(xi: FloatArray) -> FloatArray:
+        b = bary(xi)
+        if order == 1:
+            return b
+        return np.hstack([b * (2 * b - 1), 4 * b[:, edges[:, 0]] * b[:, edges[:, 1]]])
+
+    def gradient(xi: FloatArray) -> FloatArray:
+        b = bary(xi)
+        corner = np.broadcast_to(d_bary, (xi.shape[0], 4, 3))
+        if order == 1:
+            return corner.copy()
+        middle = 4 * (
+            b[:, edges[:, 0], None] * d_bary[edges[:, 1]]
+            + b[:, edges[:, 1], None] * d_bary[edges[:, 0]]
+        )
+        return np.concatenate([(4 * b[:, :, None] - 1) * corner, middle], axis=1)
+
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    if order == 1:
+        points, weights, nodes = np.full((1, 3), 0.25), np.array([1 / 6]), corners
+    else:
+        a, b = 0.585410196624969, 0.138196601125011  # degree 2, four points (Hammer and Stroud 1956)
+        points = np.array([[b, b, b], [a, b, b], [b, a, b], [b, b, a]])
+        weights = np.full(4, 1 / 24)
+        nodes = np.vstack([corners, 0.5 * (corners[edges[:, 0]] + corners[edges[:, 1]])])
+    return Element(
+        name=name,
+        n_nodes=len(nodes),
+        shape=shape,
+        gradient=gradient,
+        points=points,
+        weights=weights,
+        enhanced=_no_modes,
+        node_coordinates=nodes,
+        outside=lambda xi: -np.min(bary(xi), axis=1),
+        face="tri3" if order == 1 else "tri6",
+        centre=np.full((1, 3), 0.25),
+    )
+
+
+def _faces() -> dict[str, Face]:
+    g3, w3 = _gauss(3)
+    x = np.tile(g3, 3)
+    y = np.repeat(g3, 3)
+    a, da = _lagrange(2, x)
+    b, db = _lagrange(2, y)
+    quad9 = Face(
+        "quad9",
+        9,
+        np.einsum("qj,qi->qji", b, a).reshape(9, 9),
+        np.stack(
+            [
+                np.einsum("qj,qi->qji", b, da).reshape(9, 9),
+                np.einsum("qj,qi->qji", db, a).reshape(9, 9),
+            ],
+            axis=-1,
+        ),
+        np.tile(w3, 3) * np.repeat(w3, 3),
+        np.array(
+            [t for j in (0, 1) for i in (0, 1) for n in [i + 3 * j]
+             for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])]
+        ),
+    )
+    value, derivative = _triangle6(_TRIANGLE_POINTS[:, 0], _TRIANGLE_POINTS[:, 1])
+    tri6 = Face(
+        "tri6", 6, value, derivative, _TRIANGLE_WEIGHTS,
+        np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
+    )
+    third = np.full((1, 3), 1 / 3)
+    tri3 = Face(
+        "tri3", 3, third, np.array([[[-1.0, -1], [1, 0], [0, 1]]]), np.array([0.5]),
+        np.array([[0, 1, 2]]),
+    )
+    return {f.name: f for f in (quad9, tri6, tri3)}
+
+
+FACES: dict[str, Face] = _faces()
+ELEMENTS: dict[str, Element] = {
+    e.name: e
+    for e in (
+        _tetrahedron("tet4", 1),
+        _tetrahedron("tet10", 2),
+        _brick("hex18", 1),
+        _brick("hex27", 2),
+        _wedge("wedge12", 1),
+        _wedge("wedge18", 2),
+    )
+}
+
+
+def element(name: str) -> Element:
+    """The reference element called ``name``.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message lists what there is.
+    """
+    try:
+        return ELEMENTS[name]
+    except KeyError:
+        raise InputError(f"unknown element {name!r}; known elements: {', '.join(ELEMENTS)}") from None

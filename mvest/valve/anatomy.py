@@ -1,0 +1,269 @@
+"""Value objects of the anatomy: leaflets, chordae, motion of the boundary, and the valve they form.
+
+All lengths are millimetres. Every object is frozen and checked on construction, so that a valve that
+exists is a valve that makes sense; the message of a failed check names the field and the entry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Chordae", "LeafletSurface", "Motion", "Valve", "lumped_areas", "vertex_normals"]
+
+
+def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
+    """``array`` as float64 after checking its shape (None matches any length) and its finiteness."""
+    result = np.ascontiguousarray(array, dtype=np.float64)
+    if result.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
+    ):
+        raise InputError(f"{name}: shape {result.shape}, expected {shape} (None: any length)")
+    bad = np.argwhere(~np.isfinite(result))
+    if bad.size:
+        raise InputError(f"{name}: entry {tuple(int(i) for i in bad[0])} is not finite")
+    result.setflags(write=False)
+    return result
+
+
+def _indices(name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]) -> IntArray:
+    """``array`` as int64 after checking its shape and that ``0 <= array < upper``."""
+    result = np.ascontiguousarray(array, dtype=np.int64)
+    if result.ndim != len(shape) or any(
+        want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
+    ):
+        raise InputError(f"{name}: shape {result.shape}, expected {shape} (None: any length)")
+    bad = np.argwhere((result < 0) | (result >= upper))
+    if bad.size:
+        where = tuple(int(i) for i in bad[0])
+        raise InputError(f"{name}: entry {where} is {result[where]}, expected 0 to {upper - 1}")
+    result.setflags(write=False)
+    return result
+
+
+def vertex_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    """Area-weighted unit normals ``(n, 3)`` of a triangulated surface."""
+    corner = vertices[triangles]
+    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normal, triangles[:, k], face)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def lumped_areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    """Area ``(n,)`` in mm^2 that belongs to each vertex: a third of each adjacent triangle."""
+    corner = vertices[triangles]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    return np.bincount(triangles.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeafletSurface:
+    """Midsurface of all leaflets in the reference (open) frame.
+
+    Attributes
+    ----------
+    vertices : ndarray
+        ``(n, 3)`` mm.
+    triangles : ndarray
+        ``(m, 3)``; their normals point to the ventricle.
+    region : ndarray
+        ``(m,)`` index into ``region_names``: which leaflet a triangle belongs to.
+    region_names : tuple of str
+    fibre : ndarray
+        ``(n, 3)`` unit vectors, the collagen direction at the vertices.
+    thickness : ndarray
+        ``(n,)`` mm, positive.
+
+    Raises
+    ------
+    InputError, GeometryError
+        On wrong shapes, values that are not finite, unknown regions, thickness that is not
+        positive, fibres without direction.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray
+    region_names: tuple[str, ...]
+    fibre: FloatArray
+    thickness: FloatArray
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "vertices", _finite("vertices", self.vertices, (None, 3)))
+        n = len(self.vertices)
+        set_(self, "triangles", _indices("triangles", self.triangles, n, (None, 3)))
+        m = len(self.triangles)
+        set_(self, "region", _indices("region", self.region, len(self.region_names), (m,)))
+        set_(self, "thickness", _finite("thickness", self.thickness, (n,)))
+        if np.any(self.thickness <= 0):
+            i = int(np.argmin(self.thickness))
+            raise GeometryError(f"thickness of vertex {i} is {self.thickness[i]} mm, expected > 0")
+        fibre = _finite("fibre", self.fibre, (n, 3))
+        length = np.linalg.norm(fibre, axis=1)
+        if np.any(length < 1e-8):
+            raise GeometryError(f"fibre of vertex {int(np.argmin(length))} has no direction")
+        set_(self, "fibre", fibre / length[:, None])
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit vertex normals ``(n, 3)``, towards the ventricle."""
+        return vertex_normals(self.vertices, self.triangles)
+
+    @property
+    def areas(self) -> FloatArray:
+        """Lumped vertex areas ``(n,)`` mm^2."""
+        return lumped_areas(self.vertices, self.triangles)
+
+    @property
+    def vertex_region(self) -> IntArray:
+        """Region ``(n,)`` of each vertex: the smallest index among its triangles."""
+        result = np.full(len(self.vertices), len(self.region_names), dtype=np.int64)
+        np.minimum.at(result, self.triangles.ravel(), np.repeat(self.region, 3))
+        return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chordae:
+    """Chordae tendineae: one straight cable from a papillary tip to a point of the leaflets each.
+
+    Attributes
+    ----------
+    tip : ndarray
+        ``(c,)`` index of the papillary tip.
+    insertion : ndarray
+        ``(c, 3)`` mm, insertion on the midsurface in the reference frame.
+    family : ndarray
+        ``(c,)`` index into ``family_names`` (marginal, basal, ...).
+    family_names : tuple of str
+    rest_length : ndarray
+        ``(c,)`` mm.
+    axial_stiffness : ndarray
+        ``(c,)`` N, Young's modulus times cross section.
+    toe_strain : float
+        Strain over which the stiffness rises from zero to ``axial_stiffness``.
+    """
+
+    tip: IntArray
+    insertion: FloatArray
+    family: IntArray
+    family_names: tuple[str, ...]
+    rest_length: FloatArray
+    axial_stiffness: FloatArray
+    toe_strain: float
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "insertion", _finite("chordae insertion", self.insertion, (None, 3)))
+        c = len(self.insertion)
+        set_(self, "tip", _indices("chordae tip", self.tip, np.iinfo(np.int64).max, (c,)))
+        n_families = len(self.family_names)
+        set_(self, "family", _indices("chordae family", self.family, n_families, (c,)))
+        for name in ("rest_length", "axial_stiffness"):
+            value = _finite(f"chordae {name}", getattr(self, name), (c,))
+            if np.any(value <= 0):
+                i = int(np.argmin(value))
+                raise InputError(f"{name} of chord {i} is {value[i]}, expected > 0")
+            set_(self, name, value)
+        if not 0 < self.toe_strain < 0.5:
+            raise InputError(f"toe strain {self.toe_strain}, expected between 0 and 0.5")
+
+    def __len__(self) -> int:
+        return len(self.insertion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Prescribed positions of annulus and papillary tips at key frames.
+
+    Attributes
+    ----------
+    phase : ndarray
+        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame); the loading decides
+        how phase runs in time.
+    annulus : ndarray
+        ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions.
+    papillary_tips : ndarray
+        ``(f, n_tips, 3)`` mm.
+    """
+
+    phase: FloatArray
+    annulus: FloatArray
+    papillary_tips: FloatArray
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "phase", _finite("motion phase", self.phase, (None,)))
+        f = len(self.phase)
+        if f < 2 or self.phase[0] != 0 or self.phase[-1] != 1 or np.any(np.diff(self.phase) <= 0):
+            raise InputError(f"motion phase {self.phase}: expected strictly increasing from 0 to 1")
+        set_(self, "annulus", _finite("motion annulus", self.annulus, (f, None, 3)))
+        tips = _finite("motion papillary_tips", self.papillary_tips, (f, None, 3))
+        set_(self, "papillary_tips", tips)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Valve:
+    """One valve: what the images show of it, in one resolution.
+
+    Attributes
+    ----------
+    surface : LeafletSurface
+    annulus : ndarray
+        ``(k,)`` vertices of ``surface`` along the annulus, in loop order.
+    free_edge : ndarray
+        ``(k2,)`` vertices along the free edge, in loop order.
+    papillary_tips : ndarray
+        ``(n_tips, 3)`` mm in the reference frame.
+    chordae : Chordae
+    motion : Motion
+        Of exactly the vertices ``annulus`` and of the tips.
+    """
+
+    surface: LeafletSurface
+    annulus: IntArray
+    free_edge: IntArray
+    papillary_tips: FloatArray
+    chordae: Chordae
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        n = len(self.surface.vertices)
+        set_(self, "annulus", _indices("annulus", self.annulus, n, (None,)))
+        set_(self, "free_edge", _indices("free_edge", self.free_edge, n, (None,)))
+        set_(self, "papillary_tips", _finite("papillary_tips", self.papillary_tips, (None, 3)))
+        n_tips = len(self.papillary_tips)
+        if len(self.chordae) and int(self.chordae.tip.max()) >= n_tips:
+            i = int(np.argmax(self.chordae.tip))
+            raise InputError(
+                f"chord {i} starts at papillary tip {self.chordae.tip[i]}, but there are {n_tips}"
+            )
+        if self.motion.annulus.shape[1] != len(self.annulus):
+            raise InputError(
+                f"motion moves {self.motion.annulus.shape[1]} annulus points, the valve has "
+                f"{len(self.annulus)}"
+            )
+        if self.motion.papillary_tips.shape[1] != n_tips:
+            raise InputError(
+                f"motion moves {self.motion.papillary_tips.shape[1]} papillary tips, the valve has "
+                f"{n_tips}"
+            )
+        self._check_chordae_connected()
+
+    def _check_chordae_connected(self) -> None:
+        """Raise unless every chord ends on the leaflets (within 3 mm of a vertex)."""
+        for i, point in enumerate(self.chordae.insertion):
+            gap = float(np.min(np.linalg.norm(self.surface.vertices - point, axis=1)))
+            if gap > 3.0:
+                raise GeometryError(
+                    f"chord {i} is disconnected: its insertion is {gap:.1f} mm from the leaflets"
+                )
