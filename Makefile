@@ -57,6 +57,11 @@ dashboard: $(INSTALLED) ## MLflow on the recorded runs
 	@mkdir -p outputs
 	$(BIN)/mlflow ui --backend-store-uri $(TRACKING)
 
+lock: $(INSTALLED) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
+	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra viz \
+		--generate-hashes --no-annotate --custom-compile-command "make lock" $(UPGRADE) \
+		--quiet --output-file requirements.lock
+
 clean: ## remove caches and the virtual environment; results and outputs stay
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
