@@ -1,0 +1,149 @@
+"""Clinical measurements of a valve: leaflets, tenting, papillary tips.
+
+Plain arrays in, numbers in mm, mm² or mm³ out. Lengths follow the usual echocardiographic
+definitions; each docstring says which. The annulus is measured in `mvest.valve.annulus`, closure
+(orifice, coaptation) in `mvest.valve.closure` and `mvest.valve.passing_ball`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.annulus import AnnulusPlane, checked_loop, unit_vector
+from mvest.valve.closure import project_leaflets
+from mvest.valve.proximity import plane_section
+
+
+@dataclass(frozen=True, slots=True)
+class TentingMeasurements:
+    """Tenting of a closed valve.
+
+    Attributes
+    ----------
+    height
+        Largest distance of the coaptation line below the annulus plane, mm (negative: billowing).
+    area
+        Area between annulus plane and leaflets in the middle antero-posterior plane, mm².
+    volume
+        Volume between the annulus plane and the leaflets inside the annulus, mm³; parts of a
+        leaflet above the plane count negative.
+    """
+
+    height: float
+    area: float
+    volume: float
+
+
+def measure_tenting(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    resolution: float = 0.2,
+) -> TentingMeasurements:
+    """Measure tenting as seen from the atrium: first leaflet surface below each annulus point.
+
+    Every point of the projected annulus is assigned the depth of the first leaflet surface met on
+    the way from atrium to ventricle; height is the largest depth on the middle plane, area and
+    volume its sums over the middle line and the whole annulus. Points where nothing is met (an
+    open orifice) count as no depth. On a valve that is closed this is the usual definition.
+
+    Parameters
+    ----------
+    vertices, triangles
+        Midsurface of all leaflets, ``(n, 3)`` mm and ``(m, 3)``.
+    annulus
+        ``(k, 3)`` mm in loop order.
+    resolution
+        Pixel size, mm.
+    """
+    image = project_leaflets(vertices, triangles, annulus, plane, resolution)
+    depth = np.where(image.inside & np.isfinite(image.depth), image.depth, 0.0)
+    centre = int(np.argmin(np.abs(image.lateral)))
+    column = depth[:, centre]
+    return TentingMeasurements(
+        height=float(column[np.argmax(column)]),
+        area=float(column.sum() * resolution),
+        volume=float(depth.sum() * resolution**2),
+    )
+
+
+def leaflet_length(
+    vertices: FloatArray,
+    triangles: IntArray,
+    plane: AnnulusPlane,
+    origin: FloatArray | None = None,
+    direction: FloatArray | None = None,
+) -> float:
+    """Length (mm) of a leaflet from annulus to free edge along a plane section.
+
+    The section is the plane through `origin` spanned by the annulus normal and `direction`; its
+    length is the sum of the segments in which it cuts the leaflet's triangles.
+
+    Parameters
+    ----------
+    vertices, triangles
+        The triangles of one leaflet.
+    origin
+        ``(3,)`` mm, default the annulus centre.
+    direction
+        ``(3,)``, default the anterior direction: the middle of A2 or P2.
+    """
+    start = plane.origin if origin is None else np.asarray(origin, dtype=np.float64)
+    along = plane.anterior if direction is None else np.asarray(direction, dtype=np.float64)
+    segments, _ = plane_section(
+        vertices, triangles, start, unit_vector(np.cross(plane.normal, along), "direction")
+    )
+    return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
+
+
+def surface_area(vertices: FloatArray, triangles: IntArray) -> float:
+    """Area (mm²) of a triangulated surface."""
+    corners = np.asarray(vertices)[triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(0.5 * np.linalg.norm(cross, axis=1).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class PapillaryMeasurements:
+    """Place of the papillary tips (mm).
+
+    Attributes
+    ----------
+    depth
+        ``(n_tips,)`` distance below the annulus plane.
+    centre_distance
+        ``(n_tips,)`` distance to the annulus centre.
+    annulus_distance
+        ``(n_tips,)`` distance to the nearest annulus point (tethering length).
+    separation
+        ``(n_tips, n_tips)`` distances between tips.
+    """
+
+    depth: FloatArray
+    centre_distance: FloatArray
+    annulus_distance: FloatArray
+    separation: FloatArray
+
+
+def measure_papillary_tips(
+    tips: FloatArray, annulus: FloatArray, plane: AnnulusPlane
+) -> PapillaryMeasurements:
+    """Measure where the papillary tips ``(n_tips, 3)`` mm lie relative to the annulus."""
+    loop = checked_loop(annulus)
+    points = np.asarray(tips, dtype=np.float64).reshape(-1, 3)
+    following = np.roll(loop, -1, axis=0)
+    step = following - loop
+    squared = np.maximum((step**2).sum(axis=1), 1e-30)
+    offset = points[:, None] - loop
+    fraction = np.clip((offset * step).sum(axis=2) / squared, 0.0, 1.0)
+    gaps = np.linalg.norm(offset - fraction[..., None] * step, axis=2)
+    return PapillaryMeasurements(
+        depth=plane.coordinates(points)[:, 2],
+        centre_distance=np.linalg.norm(points - plane.origin, axis=1),
+        annulus_distance=gaps.min(axis=1),
+        separation=np.linalg.norm(points[:, None] - points[None], axis=2),
+    )
