@@ -1,0 +1,395 @@
+"""The rules that keep the project a house: who may import whom, and what a tracked file may say.
+
+Imports are read from the source, so that one inside a function or for type checking counts as well.
+"""
+
+import ast
+import ipaddress
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import mvest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+LEAVES = ("mvest.errors", "mvest.units", "mvest.typing", "mvest.elements")
+VALUE_OBJECTS = ("mvest.valve.anatomy", "mvest.valve.mesh", "mvest.valve.embedding")
+
+# What each station of mvest may import from mvest, itself aside. What is not listed has no place.
+MAY_IMPORT: dict[str, tuple[str, ...]] = {
+    "mvest": (),
+    "mvest.errors": LEAVES,
+    "mvest.units": LEAVES,
+    "mvest.typing": LEAVES,
+    "mvest.elements": LEAVES,
+    "mvest.provenance": LEAVES,
+    "mvest.valve": LEAVES,
+    "mvest.mechanics": (*LEAVES, *VALUE_OBJECTS),
+    "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),
+    "mvest.estimation": LEAVES,
+    "mvest.model": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
+    "mvest.study": (
+        *LEAVES,
+        "mvest.provenance",
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.imaging",
+        "mvest.estimation",
+        "mvest.model",
+    ),
+    "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
+}
+NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
+NEVER_IN_EXPERIMENTS = ("tests",)
+
+IMPORT_NAME = {
+    "hydra-core": ("hydra", "omegaconf"),
+    "hydra-joblib-launcher": ("hydra_plugins",),
+    "hydra-submitit-launcher": ("hydra_plugins",),
+    "pynrrd": ("nrrd",),
+    "simpleitk": ("SimpleITK",),
+}
+
+
+class Import(NamedTuple):
+    line: int
+    name: str
+    at_import_time: bool
+
+
+def within(name: str, module: str) -> bool:
+    return name == module or name.startswith(module + ".")
+
+
+def imports(source: str, module: str, is_package: bool = False) -> Iterator[Import]:
+    """Every absolute dotted name that a module's source imports, wherever it does so."""
+    tree = ast.parse(source)
+    deferred: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        is_guard = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if is_guard or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            deferred.update(ast.walk(node))
+    for node in ast.walk(tree):
+        names: list[str] = []
+        match node:
+            case ast.Import():
+                names = [alias.name for alias in node.names]
+            case ast.ImportFrom():
+                parents = module.split(".")
+                keep = len(parents) - node.level + is_package
+                base = ".".join([*parents[:keep], *([node.module] if node.module else [])])
+                base = base if node.level else str(node.module)
+                names = [f"{base}.{alias.name}" for alias in node.names]
+            case ast.Call(
+                func=ast.Name(id="__import__" | "import_module")
+                | ast.Attribute(attr="import_module"),
+                args=[ast.Constant(value=str(name)), *_],
+            ):
+                names = [name]
+        for name in names:
+            yield Import(node.lineno, name, node not in deferred)
+
+
+def import_violations(source: str, module: str, is_package: bool = False) -> list[str]:
+    """Import-direction rules that a module's source breaks, one message each."""
+    if not within(module, "mvest"):
+        forbidden, allowed, station = NEVER_IN_EXPERIMENTS, ("mvest",), module.split(".")[0]
+    else:
+        forbidden = NEVER_IN_MVEST
+        station = ".".join(module.split(".")[:2])
+        if station not in MAY_IMPORT:
+            return [f"{module} has no place in the house: add {station} to MAY_IMPORT"]
+        allowed = MAY_IMPORT[station]
+    broken = []
+    for line, name, _ in imports(source, module, is_package):
+        if any(within(name, other) for other in forbidden):
+            broken.append(f"{module}:{line} imports {name}")
+        elif within(name, "mvest"):
+            inside = station != "mvest" and within(name, station)
+            if not inside and not any(within(name, other) for other in allowed):
+                broken.append(f"{module}:{line} imports {name}")
+    return broken
+
+
+def modules(*packages: str) -> list[tuple[str, Path]]:
+    found = []
+    for path in sorted(path for package in packages for path in (ROOT / package).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found.append((".".join(parts[:-1] if parts[-1] == "__init__" else parts), path))
+    return found
+
+
+def test_imports_go_one_way() -> None:
+    found = modules("mvest", "experiments")
+    assert "mvest.errors" in dict(found)
+    broken = [
+        message
+        for module, path in found
+        for message in import_violations(
+            path.read_text(encoding="utf-8"), module, path.name == "__init__.py"
+        )
+    ]
+    assert broken == []
+
+
+def test_conf_is_data() -> None:
+    code = [path for path in (ROOT / "conf").rglob("*.py") if ast.parse(path.read_text()).body[1:]]
+    assert code == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        # Siblings do not cross, however the import is written.
+        ("mvest.valve.template", "import mvest.mechanics.law"),
+        ("mvest.valve.template", "from mvest import imaging"),
+        ("mvest.valve.template", "from ..estimation import gaussian"),
+        ("mvest.mechanics.law", "from mvest.estimation.gaussian import Gaussian"),
+        ("mvest.mechanics.law", "def f():\n    import mvest.imaging"),
+        ("mvest.imaging.tracking", "from mvest.mechanics import static"),
+        ("mvest.estimation.ekf", "from mvest.valve.anatomy import Valve"),
+        ("mvest.estimation.ekf", "import importlib\nimportlib.import_module('mvest.mechanics')"),
+        # Of the valve, mechanics and imaging know the value objects only.
+        ("mvest.mechanics.law", "from mvest.valve.template import make_template"),
+        ("mvest.imaging.tracking", "from mvest.valve.measurements import orifice_area"),
+        # Leaves import nothing but each other.
+        ("mvest.errors", "from mvest.provenance import git_state"),
+        ("mvest.elements", "from mvest.mechanics import assembly"),
+        ("mvest.units", "from .valve import anatomy"),
+        # Joints: the model knows no images and no study, reporting knows no physics.
+        ("mvest.model", "from mvest.imaging import tracking"),
+        ("mvest.model", "import mvest.study"),
+        ("mvest.valve.template", "import mvest.model"),
+        ("mvest.mechanics.law", "from mvest.study import Case"),
+        ("mvest.reporting.tables", "from mvest.mechanics import law"),
+        ("mvest.reporting.tables", "if TYPE_CHECKING:\n    import mvest.mechanics"),
+        # The library knows nothing of how it is run.
+        ("mvest.study", "import hydra"),
+        ("mvest.study", "from omegaconf import OmegaConf"),
+        ("mvest.reporting.tables", "def f():\n    import mlflow.tracking"),
+        ("mvest.study", "from experiments.run import main"),
+        ("mvest.study", "import tests.test_house"),
+        ("experiments.run", "from tests.valve import shapes"),
+        # The package's face stays empty, and a new station has to be given its place.
+        ("mvest", "from mvest.errors import MvestError"),
+        ("mvest.helpers", "import math"),
+    ],
+)  # fmt: skip
+def test_a_wrong_import_is_seen(module: str, source: str) -> None:
+    assert len(import_violations(source, module, is_package=module == "mvest")) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("mvest.valve.template", "from mvest.valve.anatomy import Valve\nfrom . import mesh"),
+        ("mvest.mechanics.law", "from mvest.valve.mesh import SolidMesh\nimport mvest.elements"),
+        ("mvest.imaging.tracking", "from ..valve.anatomy import Motion\nimport numpy"),
+        ("mvest.errors", "from mvest.typing import FloatArray"),
+        ("mvest.model", "from mvest import estimation, mechanics, valve"),
+        ("mvest.study", "from mvest import estimation, imaging, mechanics, model, valve"),
+        ("experiments.run", "import hydra, mlflow\nfrom mvest.study import Case"),
+        # A name that only begins alike is another package.
+        ("mvest.study", "import hydrate, mlflower, testslide"),
+    ],
+)
+def test_a_right_import_passes(module: str, source: str) -> None:
+    assert import_violations(source, module) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "is_package", "source", "expected"),
+    [
+        ("a.b.c", False, "from . import d", "a.b.d"),
+        ("a.b", True, "from . import d", "a.b.d"),
+        ("a.b.c", False, "from .d import e", "a.b.d.e"),
+        ("a.b.c", False, "from ..d import e", "a.d.e"),
+        ("a.b", True, "from ..d import e", "a.d.e"),
+    ],
+)
+def test_relative_imports_are_resolved(
+    module: str, is_package: bool, source: str, expected: str
+) -> None:
+    assert [found.name for found in imports(source, module, is_package)] == [expected]
+
+
+# --- dependencies -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def import_names(requirements: list[str]) -> set[str]:
+    names: set[str] = set()
+    for text in requirements:
+        distribution = canonicalize_name(Requirement(text).name)
+        names.update(IMPORT_NAME.get(distribution, (distribution.replace("-", "_"),)))
+    return names
+
+
+def undeclared(source: str, module: str, required: set[str], optional: set[str]) -> list[str]:
+    """Third-party imports that an installation without extras would not satisfy."""
+    own = {"mvest", "experiments", "conf"}
+    messages = []
+    for line, name, at_import_time in imports(source, module):
+        top = name.split(".")[0]
+        if top in own | required or top in sys.stdlib_module_names:
+            continue
+        if top not in optional:
+            messages.append(f"{module}:{line} imports {top}, which pyproject.toml does not name")
+        elif at_import_time:
+            messages.append(f"{module}:{line} imports {top} of an extra outside a function")
+    return messages
+
+
+def test_what_is_imported_is_declared(project: dict) -> None:
+    required = import_names(project["dependencies"])
+    extras = project["optional-dependencies"]
+    optional = import_names(
+        [text for name in ("viz", "imaging", "cluster") for text in extras[name]]
+    )
+    messages = [
+        message
+        for module, path in modules("mvest", "experiments")
+        if path.name != "__init__.py"
+        for message in undeclared(path.read_text(encoding="utf-8"), module, required, optional)
+    ]
+    assert messages == []
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("import numpy.linalg", 0),
+        ("import os", 0),
+        ("import seaborn", 1),
+        ("import pyvista", 1),
+        ("def view():\n    import pyvista", 0),
+        ("def view():\n    import seaborn", 1),
+    ],
+)
+def test_an_undeclared_import_is_seen(source: str, count: int) -> None:
+    assert len(undeclared(source, "mvest.reporting.views", {"numpy"}, {"pyvista"})) == count
+
+
+def test_the_lock_file_fits_the_declared_dependencies(project: dict) -> None:
+    extras = project["optional-dependencies"]
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    locked = {
+        canonicalize_name(found[1]): found[2]
+        for line in lines
+        if (found := re.match(r"([A-Za-z0-9._-]+)==([^\s;]+)", line))
+    }
+    for text in [*project["dependencies"], *extras["dev"], *extras["viz"]]:
+        requirement = Requirement(text)
+        version = locked.get(canonicalize_name(requirement.name))
+        assert version is not None, f"run `make lock`: {text} is missing"
+        assert requirement.specifier.contains(version), f"run `make lock`: {text} has {version}"
+
+
+def test_the_lock_file_names_packages_and_hashes_only() -> None:
+    pinned = re.compile(
+        r"#.*|[A-Za-z0-9._-]+==[^\s;]+( ; [^@]+)? \\|    --hash=sha256:[0-9a-f]{64}( \\)?"
+    )
+    lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if not pinned.fullmatch(line)] == []
+
+
+# --- what tracked files say ---------------------------------------------------------------------
+
+MACHINE_PATH = re.compile(
+    r"(?<![\w.{}<>$~/)-])/(?:home|root|Users|work|opt|tmp|mnt|scratch|private)/[\w.]"
+)
+URL = re.compile(
+    r"\b(?:https?|ftp|ssh|git|postgresql)://(?:[^@/\s\"'`<>]+@)?([^/:\s\"'`<>)\]}\\,]+)"
+)
+PRIVATE_ENDINGS = ("local", "internal", "intranet", "lan", "corp", "home", "localdomain")
+LOOPBACK = ("localhost", "127.0.0.1", "0.0.0.0")
+
+
+def is_public(host: str) -> bool:
+    """Whether anyone on the internet could mean the same host by this name."""
+    try:
+        return ipaddress.ip_address(host).is_global
+    except ValueError:
+        return "." in host and host.rsplit(".", 1)[1].lower() not in PRIVATE_ENDINGS
+
+
+def private_mentions(text: str) -> list[str]:
+    """Machine paths, file addresses and hosts that only one network knows."""
+    found = [match[0] for match in MACHINE_PATH.finditer(text)]
+    found += re.findall(r"file:" + r"//\S+", text)
+    hosts = (match[1] for match in URL.finditer(text))
+    return found + [host for host in hosts if host not in LOOPBACK and not is_public(host)]
+
+
+def tracked_files() -> list[Path]:
+    try:
+        listing = subprocess.run(
+            ["git", "-C", str(ROOT), "ls-files", "-z"], check=True, capture_output=True, text=True
+        ).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout, so nothing is tracked")
+    return [ROOT / name for name in listing.split("\0") if name and (ROOT / name).is_file()]
+
+
+def test_tracked_files_name_no_machine_path_and_no_private_host() -> None:
+    mentions = {}
+    for path in tracked_files():
+        content = path.read_bytes()
+        if b"\0" in content[:8192]:
+            continue
+        if found := private_mentions(content.decode("utf-8", errors="replace")):
+            mentions[str(path.relative_to(ROOT))] = found
+    assert mentions == {}
+
+
+# The examples are put together here, so that this file passes its own check.
+@pytest.mark.parametrize(
+    "text",
+    [
+        "see /" + "home/someone/data",
+        "path=/" + "tmp/out.json",
+        '"/' + 'Users/someone"',
+        "(/" + "work/project)",
+        "--find-links file:" + "///srv/wheels",
+        "http:" + "//packages.example.internal/simple",
+        "http:" + "//buildhost:8080/simple",
+        "http:" + "//someone:secret@10.0.0.7/simple",
+        "git clone ssh:" + "//git@server.lan/repository",
+    ],
+)
+def test_a_private_mention_is_seen(text: str) -> None:
+    assert len(private_mentions(text)) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "https://pypi.org/simple and https://doi.org/10.1000/182.",
+        "open http://127.0.0.1:5000 or http://localhost:5000/",
+        "${HOME}/work/data, outputs/work/mesh.vtu, ./tmp/file, <root>/home/x",
+        "#!/usr/bin/env bash",
+        "kPa/mm and at /root",
+    ],
+)
+def test_a_public_mention_passes(text: str) -> None:
+    assert private_mentions(text) == []
+
+
+def test_versions_agree(project: dict) -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    cited = re.search(r"^version: (\S+)$", citation, flags=re.MULTILINE)
+    assert cited is not None
+    assert cited[1] == project["version"] == mvest.__version__
