@@ -1,0 +1,144 @@
+"""From a branching network of chordae to straight cables with path lengths.
+
+Detailed valve models hold chordae as a graph: a trunk leaves a papillary anchor, splits, and fans
+out into many insertions. The mechanics here knows one straight tension-only cable per (anchor,
+insertion). Two quantities carry over exactly and one is shared out:
+
+* the **rest length** is the length of the shortest path along the network, so that a cable tightens
+  exactly when its path is drawn straight;
+* the **insertion** is the network's end on the leaflet;
+* the **axial stiffness** shares each trunk among the insertions beyond it. If the insertions of one
+  anchor pull equally hard, the force in network edge ``e`` is ``n_e`` times that at an insertion,
+  where ``n_e`` counts the insertions whose path contains ``e``. Insertion ``j`` then gives by
+  ``sum_e n_e l_e / EA`` per unit force, and a cable of rest length ``L_j`` that gives as much has
+  the stiffness ``EA L_j / sum_e n_e l_e``.
+
+What is lost: a trunk can only point in one direction, so branches of one trunk restrain each other
+sideways; straight cables do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Cables", "trace_cables"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cables:
+    """Straight cables that stand for a network.
+
+    Attributes
+    ----------
+    anchor, insertion : ndarray
+        ``(c,)`` node indices.
+    length : ndarray
+        ``(c,)`` mm along the network.
+    stiffness_share : ndarray
+        ``(c,)`` in (0, 1]: axial stiffness of the cable over that of the chord material.
+    """
+
+    anchor: IntArray
+    insertion: IntArray
+    length: FloatArray
+    stiffness_share: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+
+def trace_cables(
+    nodes: FloatArray, edges: IntArray, anchors: IntArray, leaflet: IntArray
+) -> Cables:
+    """Trace every path of a chord network from an anchor to the leaflet.
+
+    Parameters
+    ----------
+    nodes : ndarray
+        ``(n, 3)`` mm.
+    edges : ndarray
+        ``(k, 2)`` chord segments between nodes.
+    anchors : ndarray
+        Nodes fixed in the papillary muscles.
+    leaflet : ndarray
+        Nodes of the leaflets. A path ends at the first one it meets.
+
+    Raises
+    ------
+    InputError
+        If indices are out of range or a segment has no length.
+    GeometryError
+        If a chord segment reaches no anchor or an anchor reaches no leaflet.
+    """
+    nodes = np.asarray(nodes, dtype=float)
+    edges, anchors = np.asarray(edges), np.asarray(anchors)
+    n = len(nodes)
+    for name, index in (("edges", edges), ("anchors", anchors), ("leaflet", np.asarray(leaflet))):
+        if index.size and not (index.min() >= 0 and index.max() < n):
+            raise InputError(f"chord network: {name} refer to nodes outside 0 to {n - 1}")
+    length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+    if np.any(length <= 0):
+        raise InputError(f"chord segment {int(np.argmin(length))} has no length")
+    on_leaflet = np.zeros(n, dtype=bool)
+    on_leaflet[leaflet] = True
+
+    # Edges out of leaflet nodes are left out: two chords that insert at one node do not continue.
+    both = np.vstack([edges, edges[:, ::-1]])
+    outward = ~on_leaflet[both[:, 0]]
+    graph = sp.csr_matrix(
+        (np.concatenate([length, length])[outward], (both[outward, 0], both[outward, 1])),
+        shape=(n, n),
+    )
+    distance, predecessor = dijkstra(graph, indices=anchors, return_predecessors=True)
+    reached: NDArray[np.bool_] = np.asarray(np.isfinite(distance).any(axis=0))
+    loose = np.flatnonzero(~reached[edges].all(axis=1))
+    if loose.size:
+        raise GeometryError(
+            f"{loose.size} chord segments are connected to no anchor (first: {loose[:5].tolist()})"
+        )
+    ends = np.unique(edges[on_leaflet[edges]])
+    found = np.isfinite(distance[:, ends])
+    if not found.any(axis=1).all():
+        raise GeometryError(
+            f"chord anchor at node {int(anchors[np.argmin(found.any(axis=1))])} reaches no leaflet"
+        )
+    anchor_index, end_index = np.nonzero(found)
+    share = np.concatenate(
+        [
+            _stiffness_shares(distance[i], predecessor[i], ends[found[i]])
+            for i in range(len(anchors))
+        ]
+    )
+    return Cables(
+        anchor=anchors[anchor_index],
+        insertion=ends[end_index],
+        length=distance[anchor_index, ends[end_index]],
+        stiffness_share=share,
+    )
+
+
+def _stiffness_shares(distance: FloatArray, predecessor: IntArray, ends: IntArray) -> FloatArray:
+    """``L_j / sum_e n_e l_e`` for the insertions of one anchor."""
+    paths = []
+    users: dict[int, int] = {}
+    for end in ends.tolist():
+        path = [end]
+        while predecessor[path[-1]] >= 0:
+            path.append(int(predecessor[path[-1]]))
+        path.pop()  # the anchor itself; the others name the segment that leads to them
+        for node in path:
+            users[node] = users.get(node, 0) + 1
+        paths.append(path)
+    give = [
+        sum(users[node] * (distance[node] - distance[predecessor[node]]) for node in path)
+        for path in paths
+    ]
+    return distance[ends] / np.array(give)
