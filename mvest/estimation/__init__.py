@@ -1,1 +1,58 @@
-"""What the filter is: functions and arrays, never a valve."""
+"""What the filter is: functions and arrays, never a valve.
+
+A model is any function from parameters to a `Prediction`; a filter is settings that can be called
+on a model, a prior, an observation and its noise, and returns an `Estimate`. Names are the
+textbook's: parameters m, covariance P, process noise Q, observation noise R, Jacobian H, innovation
+covariance S, gain K.
+"""
+
+from mvest.estimation.diagnostics import (
+    Consistency,
+    ZTest,
+    chi_square_band,
+    consistency,
+    lag_one_autocorrelation,
+    moran,
+    nees,
+    zero_mean,
+)
+from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.identifiability import Identifiability, cramer_rao_bound, identifiability
+from mvest.estimation.iterated import IteratedFilter
+from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
+from mvest.estimation.paper import PaperFilter
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.transform import Identity, Log, Transform
+from mvest.estimation.update import Update, kalman_update
+
+__all__ = [
+    "Consistency",
+    "Estimate",
+    "Filter",
+    "Gaussian",
+    "Identifiability",
+    "Identity",
+    "InnovationSummary",
+    "IteratedFilter",
+    "Log",
+    "NoiseCovariance",
+    "ObservationModel",
+    "ObservationNoise",
+    "PaperFilter",
+    "Prediction",
+    "Reason",
+    "Transform",
+    "Update",
+    "ZTest",
+    "chi_square_band",
+    "consistency",
+    "cramer_rao_bound",
+    "identifiability",
+    "kalman_update",
+    "lag_one_autocorrelation",
+    "moran",
+    "nees",
+    "observation_noise",
+    "zero_mean",
+]

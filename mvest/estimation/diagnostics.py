@@ -1,0 +1,210 @@
+"""Is a filter's uncertainty honest? Consistency of errors and innovations with their covariances.
+
+The tests follow Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation (2001), section 5.4. Each takes plain arrays.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv, ndtr
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import checked_covariance
+from mvest.estimation.noise import SparseMatrix, csc
+from mvest.estimation.prediction import require_finite
+from mvest.typing import FloatArray, IntArray
+
+
+def chi_square_band(degrees_of_freedom: float, level: float = 0.95) -> tuple[float, float]:
+    """Central band that holds a chi-square number with probability `level`.
+
+    Raises
+    ------
+    InputError
+        If there is no degree of freedom, or the level is not between 0 and 1.
+    """
+    if not degrees_of_freedom > 0 or not 0.0 < level < 1.0:
+        raise InputError(
+            f"a chi-square band needs at least one degree of freedom and a level between 0 and 1; "
+            f"got {degrees_of_freedom:g} and {level:g}"
+        )
+    # A chi-square number with k degrees of freedom is twice a gamma number of shape k/2.
+    shape = 0.5 * degrees_of_freedom
+    tail = 0.5 * (1.0 - level)
+    return 2.0 * float(gammaincinv(shape, tail)), 2.0 * float(gammaincinv(shape, 1.0 - tail))
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> float:
+    """Normalised estimation error squared (m − truth)ᵀ P⁻¹ (m − truth).
+
+    Parameters
+    ----------
+    error : (p,) in units of each parameter
+    covariance : (p, p), positive definite
+
+    Returns
+    -------
+    float
+        Chi-square with p degrees of freedom if the estimate is unbiased and P is its covariance.
+    """
+    error = np.asarray(error, dtype=np.float64)
+    if error.ndim != 1:
+        raise InputError(f"an error must have shape (p,); got {error.shape}")
+    require_finite(error, "the error")
+    P = checked_covariance(covariance, error.size, "the covariance")
+    try:
+        root = np.linalg.cholesky(P)
+    except np.linalg.LinAlgError as problem:
+        raise InputError(f"NEES needs a positive definite covariance; got\n{P}") from problem
+    whitened = np.linalg.solve(root, error)
+    return float(whitened @ whitened)
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Average of N chi-square numbers against the band in which it should lie.
+
+    Attributes
+    ----------
+    average : float
+        Mean of the NEES or NIS of N independent runs.
+    expected : float
+        Its expectation, the degrees of freedom of one run.
+    band : (float, float)
+        Band that holds the average with the chosen probability.
+    runs : int
+        N.
+    """
+
+    average: float
+    expected: float
+    band: tuple[float, float]
+    runs: int
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the average lies in its band; above it the covariances are too small."""
+        return self.band[0] <= self.average <= self.band[1]
+
+
+def consistency(values: FloatArray, degrees_of_freedom: int, level: float = 0.95) -> Consistency:
+    """Test NEES or NIS values (N,) of independent runs, chi-square with equal degrees of freedom.
+
+    N times their mean is chi-square with N · degrees_of_freedom degrees of freedom.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim != 1 or values.size == 0:
+        raise InputError(f"consistency needs values of shape (N,), N > 0; got {values.shape}")
+    require_finite(values, "the values")
+    N = values.size
+    low, high = chi_square_band(N * degrees_of_freedom, level)
+    return Consistency(float(values.mean()), float(degrees_of_freedom), (low / N, high / N), N)
+
+
+@dataclass(frozen=True, slots=True)
+class ZTest:
+    """A statistic against its expectation and standard deviation under the null hypothesis.
+
+    Attributes
+    ----------
+    statistic, expected, std : float
+        The measured value; its mean and standard deviation if the hypothesis holds.
+    """
+
+    statistic: float
+    expected: float
+    std: float
+
+    @property
+    def z(self) -> float:
+        """Distance from the expectation in standard deviations."""
+        return (self.statistic - self.expected) / self.std
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided probability of a larger distance, from the normal limit."""
+        return 2.0 * float(ndtr(-abs(self.z)))
+
+
+def zero_mean(innovation: FloatArray) -> ZTest:
+    """Test that uncorrelated innovations (n,) of equal variance have the mean zero.
+
+    The variance is estimated from the data and the mean's normality follows from the central limit
+    theorem, so that the innovations need not be normal; needs some thirty of them.
+    """
+    w = _series(innovation)
+    return ZTest(float(w.mean()), 0.0, float(w.std(ddof=1) / np.sqrt(w.size)))
+
+
+def lag_one_autocorrelation(innovation: FloatArray, order: IntArray | None = None) -> ZTest:
+    """Test that neighbours in an ordering (along a curve, in time) are uncorrelated.
+
+    Parameters
+    ----------
+    innovation : (n,)
+        Standardised innovations.
+    order : (n,) permutation or None
+        Innovation k of the ordering is `innovation[order[k]]`; None takes them as they are.
+
+    Returns
+    -------
+    ZTest
+        First sample autocorrelation r₁, of expectation −1/n and variance (n − 2)²/(n²(n − 1)) under
+        independence (Dufour and Roy, J. Econometrics 29 (1985) 257-273, for exchangeable normal
+        numbers; 1/n in the limit for any independent ones).
+    """
+    w = _series(innovation)
+    n = w.size
+    if order is not None:
+        order = np.asarray(order)
+        if not np.array_equal(np.sort(order), np.arange(n)):
+            raise InputError(f"an order must be a permutation of the {n} innovations")
+        w = w[order]
+    w = w - w.mean()
+    r1 = float(w[1:] @ w[:-1] / (w @ w))
+    return ZTest(r1, -1.0 / n, (n - 2) / (n * np.sqrt(n - 1)))
+
+
+def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:
+    """Moran's I: test that innovations at neighbouring points are uncorrelated.
+
+    Parameters
+    ----------
+    innovation : (n,)
+        Standardised innovations, one for each point.
+    neighbours : sparse (n, n)
+        Weight of each pair of points, non-negative with a zero diagonal (for example a mesh's
+        adjacency).
+
+    Returns
+    -------
+    ZTest
+        I, its expectation −1/(n − 1) and standard deviation for independent normal numbers (Cliff
+        and Ord, Spatial Processes, 1981, eq. 2.28).
+    """
+    w = _series(innovation)
+    n = w.size
+    A = csc(neighbours)
+    if A.shape != (n, n):
+        raise InputError(f"neighbours must have shape ({n}, {n}); got {A.shape}")
+    if A.nnz == 0 or np.any(A.data < 0.0) or np.any(A.diagonal() != 0.0):
+        raise InputError("neighbours need non-negative weights, a zero diagonal and one pair")
+    w = w - w.mean()
+    S0 = float(A.sum())
+    S1 = 0.5 * float(((A + A.T).power(2)).sum())
+    S2 = float(np.sum((A.sum(axis=0) + A.sum(axis=1)) ** 2))
+    I = n / S0 * float(w @ (A @ w)) / float(w @ w)
+    expected = -1.0 / (n - 1)
+    variance = (n**2 * S1 - n * S2 + 3.0 * S0**2) / ((n**2 - 1.0) * S0**2) - expected**2
+    return ZTest(I, expected, float(np.sqrt(variance)))
+
+
+def _series(innovation: FloatArray) -> FloatArray:
+    w = np.asarray(innovation, dtype=np.float64)
+    if w.ndim != 1 or w.size < 3:
+        raise InputError(f"innovations must have shape (n,) with n at least 3; got {w.shape}")
+    require_finite(w, "the innovations")
+    if np.ptp(w) == 0.0:
+        raise InputError(f"all {w.size} innovations equal {w[0]:g}: nothing to test")
+    return w

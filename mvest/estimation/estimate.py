@@ -1,0 +1,223 @@
+"""What a filter returns: the estimate, how it came about, and why the filter stopped."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from scipy.special import ndtri
+
+from mvest.errors import InputError
+from mvest.estimation.diagnostics import chi_square_band
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.transform import Transform, covariance_to_physical
+from mvest.estimation.update import Update
+from mvest.typing import FloatArray
+
+OnIterate: TypeAlias = Callable[[int, FloatArray, float], None]
+"""Called after each iterate with its number, the parameters (p,) and the objective."""
+
+
+class Reason(Enum):
+    """Why a filter stopped; the value is the text for a reader."""
+
+    CONVERGED = "converged: the change of every parameter is below the tolerance"
+    MAX_ITERATIONS = "not converged: the largest permitted number of iterations is reached"
+    NO_DECREASE = "not converged: no step along the search direction lowers the objective"
+    MODEL_FAILED = "not converged: the model gives no prediction where the filter needs one"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the estimate is one."""
+        return self is Reason.CONVERGED
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InnovationSummary:
+    """The innovation e = y − h and how well its covariance S explains it.
+
+    The paper's filter sees the same y again in each round, so that there y is not independent of
+    the state it is compared with, and its `nis` is smaller than a chi-square number.
+
+    Attributes
+    ----------
+    size : int
+        Number n of observations.
+    rms, max_abs : float, in units of the observation
+        Root mean square and largest absolute value of e.
+    nis : float
+        eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
+    nis_band : (float, float)
+        Band that holds such a number with 95 % probability.
+    log_likelihood : float
+        log N(e; 0, S).
+    standardised : (n,)
+        S^(-1/2) e, to be tested for whiteness.
+    """
+
+    size: int
+    rms: float
+    max_abs: float
+    nis: float
+    nis_band: tuple[float, float]
+    log_likelihood: float
+    standardised: FloatArray
+
+    @classmethod
+    def of(cls, innovation: FloatArray, update: Update) -> "InnovationSummary":
+        """Summarise the innovation of one update."""
+        return cls(
+            size=innovation.size,
+            rms=float(np.sqrt(np.mean(innovation**2))),
+            max_abs=float(np.max(np.abs(innovation))),
+            nis=update.nis,
+            nis_band=chi_square_band(innovation.size),
+            log_likelihood=update.log_likelihood,
+            standardised=update.standardised_innovation,
+        )
+
+    @property
+    def consistent(self) -> bool:
+        """Whether `nis` lies in its band."""
+        return self.nis_band[0] <= self.nis <= self.nis_band[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Estimate of p parameters after k iterates, the start included; the last is the estimate.
+
+    "Filter coordinates" are z = T(m) of the transform. Covariances are carried over to first order.
+
+    Attributes
+    ----------
+    names : tuple of str, (p,)
+    prior : Gaussian
+        Prior of the parameters as it was given.
+    transform : Transform
+    transformed_iterates : (k, p), filter coordinates
+    transformed_iterate_covariances : (k, p, p), filter coordinates
+        Paper's filter: covariance after round k, row 0 the prior's. Iterated filter: covariance of
+        the posterior linearised at iterate k.
+    objective : (k,)
+        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Iterated filter: the same plus the prior's term. NaN
+        in the last row if the model failed there.
+    log_likelihood : (k,)
+        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`.
+    prediction : Prediction or None
+        Observation predicted at the estimate itself and its Jacobian with respect to the
+        parameters; None if the model failed there.
+    innovation : InnovationSummary or None
+        Innovation at the last iterate; None if the model failed there.
+    reason : Reason
+    detail : str
+        Numbers to the reason, or the failed model's own words.
+    forward_solves : int
+        How often the model was run, failed runs included.
+    """
+
+    names: tuple[str, ...]
+    prior: Gaussian
+    transform: Transform
+    transformed_iterates: FloatArray
+    transformed_iterate_covariances: FloatArray
+    objective: FloatArray
+    log_likelihood: FloatArray
+    prediction: Prediction | None
+    innovation: InnovationSummary | None
+    reason: Reason
+    detail: str
+    forward_solves: int
+
+    @property
+    def converged(self) -> bool:
+        """Whether the filter stopped because it had converged."""
+        return self.reason.converged
+
+    @property
+    def iterations(self) -> int:
+        """Number of updates, one less than the number of iterates."""
+        return len(self.transformed_iterates) - 1
+
+    @property
+    def iterates(self) -> FloatArray:
+        """Parameters at each iterate (k, p)."""
+        return np.array([self.transform.inverse(z) for z in self.transformed_iterates])
+
+    @property
+    def iterate_covariances(self) -> FloatArray:
+        """Covariance of the parameters at each iterate (k, p, p)."""
+        pairs = zip(self.transformed_iterates, self.transformed_iterate_covariances, strict=True)
+        return np.array([covariance_to_physical(self.transform, z, P) for z, P in pairs])
+
+    @property
+    def iterate_std(self) -> FloatArray:
+        """Standard deviations of the parameters at each iterate (k, p)."""
+        return _std(self.iterate_covariances)
+
+    @property
+    def transformed_iterate_std(self) -> FloatArray:
+        """Standard deviations at each iterate in filter coordinates (k, p)."""
+        return _std(self.transformed_iterate_covariances)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Estimated parameters (p,)."""
+        return self.transform.inverse(self.transformed_iterates[-1])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the estimated parameters (p, p)."""
+        return self.iterate_covariances[-1]
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the estimated parameters (p,)."""
+        return _std(self.covariance)
+
+    @property
+    def transformed(self) -> Gaussian:
+        """The estimate in filter coordinates."""
+        return Gaussian(self.transformed_iterates[-1], self.transformed_iterate_covariances[-1])
+
+    def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper ends (p,) of each parameter's central credible interval.
+
+        The interval is symmetric in filter coordinates, so that of a positive parameter that is
+        estimated by its logarithm stays positive.
+        """
+        if not 0.0 < level < 1.0:
+            raise InputError(f"an interval's level must lie between 0 and 1; got {level:g}")
+        z = self.transformed
+        half_width = float(ndtri(0.5 + 0.5 * level)) * z.std
+        return self.transform.inverse(z.mean - half_width), self.transform.inverse(
+            z.mean + half_width
+        )
+
+
+class Filter(Protocol):
+    """What every filter is: settings that can be called on a model, a prior and observations."""
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Estimate the parameters of `model` from the observation y (n,) with noise R.
+
+        `prior` is N(m, P) of the parameters themselves, `transform` (default `Identity`) chooses
+        the coordinates to work in, `on_iterate` is told of each iterate.
+        """
+        ...
+
+
+def _std(covariances: FloatArray) -> FloatArray:
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))

@@ -1,0 +1,167 @@
+"""What the data can tell apart, computed from the Jacobian before any data are taken."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance, observation_noise
+from mvest.estimation.prediction import require_finite
+from mvest.typing import FloatArray
+
+RELEVANT_SHARE = 0.1
+"""Smallest share of a parameter in a combination that is worth naming."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identifiability:
+    """Fisher information of p parameters in units of their scales, and what follows from it.
+
+    Attributes
+    ----------
+    names : tuple of str, (p,)
+    scale : (p,) in units of each parameter
+        What counts as a large change of each parameter; eigenvectors depend on it.
+    information : (p, p)
+        Scaled Fisher information D Hᵀ R⁻¹ H D, D = diag(scale), plus D P⁻¹ D of a prior if given.
+    eigenvalues : (p,), ascending
+        A combination with eigenvalue λ has the standard deviation 1/√λ, in parts of the scales.
+    eigenvectors : (p, p)
+        Column i belongs to eigenvalue i; the first is the combination that is known worst.
+    covariance : (p, p) in products of the parameters' units
+        Cramér-Rao bound: no unbiased estimator has a smaller covariance. Infinite (and NaN off the
+        diagonal) for parameters that the data leave undetermined.
+    """
+
+    names: tuple[str, ...]
+    scale: FloatArray
+    information: FloatArray
+    eigenvalues: FloatArray
+    eigenvectors: FloatArray
+    covariance: FloatArray
+
+    @property
+    def std(self) -> FloatArray:
+        """Smallest attainable standard deviations (p,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def condition_number(self) -> float:
+        """Largest over smallest eigenvalue; infinite if a combination is undetermined."""
+        smallest = float(self.eigenvalues[0])
+        return float(self.eigenvalues[-1]) / smallest if smallest > 0.0 else np.inf
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlations (p, p) at the bound; NaN for undetermined parameters."""
+        std = self.std
+        result = np.full_like(self.covariance, np.nan)
+        known = np.ix_(np.isfinite(std), np.isfinite(std))
+        result[known] = self.covariance[known] / np.outer(std, std)[known]
+        return result
+
+    def flat(self, limit: float = 0.5) -> tuple[str, ...]:
+        """Combinations whose standard deviation exceeds `limit` parts of the scales, in words."""
+        with np.errstate(divide="ignore"):
+            widths = 1.0 / np.sqrt(self.eigenvalues)
+        return tuple(
+            f"{_combination(self.names, self.eigenvectors[:, i])}: "
+            + (f"known to ±{100 * width:.3g} %" if np.isfinite(width) else "not determined at all")
+            for i, width in enumerate(widths)
+            if width > limit
+        )
+
+
+def identifiability(
+    H: FloatArray,
+    R: NoiseCovariance,
+    scale: FloatArray,
+    *,
+    prior: Gaussian | None = None,
+    names: Sequence[str] | None = None,
+) -> Identifiability:
+    """Cramér-Rao bound and flat directions of an observation with Jacobian H and noise R.
+
+    With W H D = U diag(s) Vᵀ, Wᵀ W = R⁻¹, D = diag(scale), the scaled Fisher information is
+    V diag(s²) Vᵀ and the bound D V diag(s⁻²) Vᵀ D. A prior is one more observation of the
+    parameters (Van Trees' bound, to first order).
+
+    Parameters
+    ----------
+    H : (n, p) in units of the observation per unit of each parameter
+    R : scalar, (n,) or sparse (n, n), in squared units of the observation
+    scale : (p,) in units of each parameter
+        Positive; the parameters' own size makes every statement relative.
+    prior : Gaussian, optional
+        Must be positive definite.
+    names : p names, optional
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, or a value is not admissible.
+    """
+    H = np.asarray(H, dtype=np.float64)
+    if H.ndim != 2 or H.size == 0:
+        raise InputError(f"a Jacobian must have shape (n, p); got {H.shape}")
+    require_finite(H, "the Jacobian")
+    n, p = H.shape
+    D = np.asarray(scale, dtype=np.float64)
+    if D.shape != (p,) or not np.all(np.isfinite(D)) or np.any(D <= 0.0):
+        raise InputError(f"scale must be {p} positive numbers; got {scale}")
+    names = tuple(f"m[{i}]" for i in range(p)) if names is None else tuple(names)
+    if len(names) != p:
+        raise InputError(f"{p} parameters need as many names; got {names}")
+
+    rows = observation_noise(R, n).whiten(H) * D
+    if prior is not None:
+        if prior.size != p:
+            raise InputError(f"the prior must have {p} parameters; it has {prior.size}")
+        try:
+            rows = np.vstack([rows, np.linalg.solve(prior.factor, np.diag(D))])
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                "the prior's covariance must be positive definite here; leave fixed parameters out"
+            ) from error
+    _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < p)
+    s = np.concatenate([s, np.zeros(p - s.size)])
+    s[s <= s[0] * np.finfo(np.float64).eps * max(rows.shape)] = 0.0
+    s, V = s[::-1], Vt[::-1].T
+
+    return Identifiability(
+        names=names,
+        scale=D,
+        information=(V * s**2) @ V.T,
+        eigenvalues=s**2,
+        eigenvectors=V,
+        covariance=_bound(D, s, V),
+    )
+
+
+def cramer_rao_bound(
+    H: FloatArray, R: NoiseCovariance, prior: Gaussian | None = None
+) -> FloatArray:
+    """Smallest covariance (p, p) of an unbiased estimate; see `Identifiability.covariance`."""
+    return identifiability(H, R, np.ones(np.shape(H)[-1]), prior=prior).covariance
+
+
+def _bound(D: FloatArray, s: FloatArray, V: FloatArray) -> FloatArray:
+    known = s > 0.0
+    X = D[:, None] * V[:, known] / s[known]
+    covariance = X @ X.T
+    # A parameter with any share in an undetermined combination is itself undetermined.
+    lost = np.any(np.abs(V[:, ~known]) > np.sqrt(np.finfo(np.float64).eps), axis=1)
+    covariance[lost, :] = np.nan
+    covariance[:, lost] = np.nan
+    covariance[lost, lost] = np.inf
+    return covariance
+
+
+def _combination(names: Sequence[str], vector: FloatArray) -> str:
+    """An eigenvector in words, the largest share first and positive."""
+    order = np.argsort(-np.abs(vector))
+    vector = vector * np.sign(vector[order[0]])
+    terms = [f"{vector[i]:+.2f} {names[i]}" for i in order if abs(vector[i]) >= RELEVANT_SHARE]
+    return " ".join(terms).removeprefix("+")

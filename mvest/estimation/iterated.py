@@ -1,0 +1,223 @@
+"""The iterated extended Kalman filter: Gauss-Newton on one maximum-a-posteriori problem."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.run import FilterRun, require_settings
+from mvest.estimation.transform import Transform
+from mvest.estimation.update import kalman_update
+from mvest.typing import FloatArray
+
+FIRST_DAMPING = 1.0
+"""Damping after the first rejected step; the full Gauss-Newton step is about halved."""
+
+DAMPING_FACTOR = 10.0
+"""Growth of the damping with each further rejection, and its fall after a good step."""
+
+NO_DAMPING = 1e-3
+"""Damping below which a step is as good as the full one, so that the next is the full one."""
+
+SUFFICIENT_DECREASE = 1e-4
+"""Least decrease of the objective, as a part of the predicted one, that accepts a step (Nocedal
+and Wright, Numerical Optimization, 2nd ed. 2006, algorithm 4.1 and section 3.1)."""
+
+ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)
+"""Relative decrease of the objective that cannot be told from rounding."""
+
+GOOD_DECREASE = 0.5
+"""Part of the predicted decrease from which on the linearisation is trusted with less damping."""
+
+
+@dataclass(frozen=True, slots=True)
+class IteratedFilter:
+    """Posterior mode and its covariance, each observation counted once.
+
+    Minimises, in filter coordinates z with the prior N(m, P), the objective::
+
+        J(z) = ½ (y − h(z))ᵀ R⁻¹ (y − h(z)) + ½ (z − m)ᵀ P⁻¹ (z − m)
+
+    by the iterated extended Kalman filter (Bell and Cathey, IEEE Trans. Autom. Control 38 (1993)
+    294-297, who show that it is Gauss-Newton on J). At each iterate zᵢ, with H = dh/dz there::
+
+        e    = y − h(zᵢ) + H (zᵢ − m)             innovation of the prior, linearised at zᵢ
+        z*, P* = update of m, P with e, H, R      see `kalman_update`
+        zᵢ₊₁ = zᵢ + step
+
+    The update always starts from the prior, never from the last posterior. The step is z* − zᵢ if
+    that lowers J enough; otherwise Levenberg and Marquardt's
+    step = (B + λ diag B)⁻¹ B (z* − zᵢ), where B is the Hessian of the linearised J in coordinates
+    in which the prior is N(0, I), with λ growing until J decreases. A step at which the model gives
+    no prediction is rejected in the same way. The covariance is P* at the last iterate: the
+    posterior's to the order of Gauss-Newton, that is without the second derivatives of h.
+
+    The run ends where the model has been run: the reported prediction belongs to the estimate, and
+    the iterate is not changed any more once the next full step is below the tolerance.
+
+    Attributes
+    ----------
+    tolerance : float
+        Stop when the next full step changes no parameter by more than this, relative to its size
+        (or to its standard deviation if that is larger).
+    objective_tolerance : float
+        Stop when the next full step would lower J by less than this. J is a negative logarithm of a
+        probability, so that its absolute value has a meaning. What rounding hides counts as less.
+    max_iterations : int
+        Largest number of accepted steps.
+    max_rejections : int
+        Largest number of rejected steps in a row.
+    start : (p,) parameters or None
+        First iterate; None starts at the prior's mean.
+
+    Raises
+    ------
+    InputError
+        If a setting, a shape or a covariance is not admissible; never for a failing model.
+    """
+
+    tolerance: float = 1e-4
+    objective_tolerance: float = 1e-9
+    max_iterations: int = 20
+    max_rejections: int = 8
+    start: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
+        if not (np.isfinite(self.objective_tolerance) and self.objective_tolerance > 0.0):
+            raise InputError(
+                f"the objective's tolerance must be positive; got {self.objective_tolerance}"
+            )
+        if self.max_rejections < 0:
+            raise InputError(f"max_rejections must not be negative; got {self.max_rejections}")
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Find the posterior mode; see `Filter` for the arguments."""
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        # With P = L Lᵀ and z = m + L x the prior of x is N(0, I): P may be singular, and the
+        # damping of the steps does not depend on the units of the parameters.
+        L = run.prior.factor
+        unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
+        x = self._first(run, L)
+        point = _evaluate(run, L, x)
+        if isinstance(point, Prediction):
+            return run.fail(run.prior.mean + L @ x, run.prior.covariance, point)
+
+        damping, iterations = 0.0, 0
+        while True:
+            innovation = run.y - point.prediction.y + point.H @ point.x
+            update = kalman_update(unit, innovation, point.H, run.noise)
+            P = L @ update.posterior.covariance @ L.T
+            run.record(point.z, P, point.objective, update.log_likelihood)
+
+            step = update.posterior.mean - point.x
+            A = run.noise.whiten(point.H)
+            B = np.eye(prior.size) + A.T @ A
+            decrease = 0.5 * float(step @ B @ step)
+            reason: Reason | None = None
+            detail = f"{iterations} iterations, the next full step would lower J by {decrease:.2e}"
+            if run.negligible(L @ step, point.z, P, self.tolerance) or decrease <= max(
+                self.objective_tolerance, ROUND_OFF * point.objective
+            ):
+                reason = Reason.CONVERGED
+            elif iterations == self.max_iterations:
+                reason = Reason.MAX_ITERATIONS
+            else:
+                accepted, damping, rejected = self._search(run, L, point, B, step, damping)
+                if accepted is not None:
+                    point = accepted
+                    iterations += 1
+                elif rejected is not None:
+                    reason, detail = Reason.MODEL_FAILED, f"{detail}; {rejected}"
+                else:
+                    reason = Reason.NO_DECREASE
+            if reason is not None:
+                return run.finish(reason, detail, point.prediction, innovation, update)
+
+    def _first(self, run: FilterRun, L: FloatArray) -> FloatArray:
+        """Coordinates x of the first iterate."""
+        if self.start is None:
+            return np.zeros(run.prior.size)
+        start = np.array(self.start, dtype=np.float64)
+        if start.shape != run.prior.mean.shape or not np.all(np.isfinite(start)):
+            raise InputError(f"start must be {run.prior.size} finite numbers; got {self.start}")
+        offset = run.transform.forward(start) - run.prior.mean
+        x = np.asarray(np.linalg.lstsq(L, offset, rcond=None)[0], dtype=np.float64)
+        if not np.allclose(L @ x, offset, rtol=1e-9, atol=1e-12):
+            raise InputError(
+                f"start {self.start} differs from the prior's mean in a parameter (or combination) "
+                f"that the prior holds fixed"
+            )
+        return x
+
+    def _search(
+        self,
+        run: FilterRun,
+        L: FloatArray,
+        point: "_Point",
+        B: FloatArray,
+        step: FloatArray,
+        damping: float,
+    ) -> "tuple[_Point | None, float, str | None]":
+        """The next iterate and its damping, or None and the model's words if it failed to the end.
+
+        Accepts a step only if it lowers the objective.
+        """
+        failure: str | None = None
+        scale = np.diag(np.diagonal(B))
+        for _ in range(self.max_rejections + 1):
+            trial_step = np.linalg.solve(B + damping * scale, B @ step) if damping else step
+            predicted = 0.5 * float(trial_step @ (B + 2.0 * damping * scale) @ trial_step)
+            trial = _evaluate(run, L, point.x + trial_step)
+            if isinstance(trial, Prediction):
+                failure = trial.reason
+            else:
+                failure = None
+                gain = (point.objective - trial.objective) / predicted
+                if gain >= GOOD_DECREASE:
+                    relaxed = damping / DAMPING_FACTOR
+                    return trial, relaxed if relaxed >= NO_DAMPING else 0.0, None
+                if gain >= SUFFICIENT_DECREASE:
+                    return trial, damping, None
+            damping = max(FIRST_DAMPING, DAMPING_FACTOR * damping)
+        return None, damping, failure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """An iterate at which the model gave a prediction.
+
+    `x` (p,) are the coordinates in which the prior is N(0, I), `z` (p,) the filter's, `H` (n, p) is
+    dh/dx, and `objective` is J.
+    """
+
+    x: FloatArray
+    z: FloatArray
+    prediction: Prediction
+    H: FloatArray
+    objective: float
+
+
+def _evaluate(run: FilterRun, L: FloatArray, x: FloatArray) -> _Point | Prediction:
+    """The iterate at x, or the failed prediction there."""
+    z = run.prior.mean + L @ x
+    prediction = run.predict(z)
+    if not prediction.converged:
+        return prediction
+    objective = run.misfit(prediction) + 0.5 * float(x @ x)
+    return _Point(x, z, prediction, run.jacobian(z, prediction) @ L, objective)

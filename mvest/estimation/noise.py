@@ -1,0 +1,122 @@
+"""Covariance R of the observation noise, used only through W with Wᵀ W = R⁻¹.
+
+An n × n matrix is never formed densely: R is one variance, n variances, or a sparse matrix.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu, spsolve_triangular
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import SYMMETRY_TOLERANCE
+from mvest.estimation.prediction import require_finite
+from mvest.typing import FloatArray
+
+SparseMatrix: TypeAlias = "sparse.sparray[Any, Any] | sparse.spmatrix[Any]"
+"""A sparse matrix of SciPy in any of its formats."""
+
+CscMatrix: TypeAlias = "sparse.csc_array[np.float64]"
+"""A sparse matrix by columns in double precision."""
+
+NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix"
+"""R as one variance, n variances (n,), or a sparse symmetric positive definite (n, n) matrix."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationNoise:
+    """Noise of n observations with covariance R.
+
+    Attributes
+    ----------
+    size : int
+        Number n of observations.
+    log_determinant : float
+        log det R.
+    whiten : function from (n,) or (n, p) to the same shape
+        Multiplies with W, where Wᵀ W = R⁻¹; whitened noise has the covariance I. Row i of the
+        result belongs to observation i.
+    """
+
+    size: int
+    log_determinant: float
+    whiten: Callable[[FloatArray], FloatArray]
+
+
+def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
+    """Check a noise covariance and factorise it once.
+
+    Parameters
+    ----------
+    R : scalar, (n,) or sparse (n, n), in squared units of the observation
+    size : int
+        Number n of observations.
+
+    Raises
+    ------
+    InputError
+        If R is dense, has the wrong size, or is not symmetric positive definite.
+    """
+    if isinstance(R, sparse.sparray | sparse.spmatrix):
+        return _sparse_noise(csc(R), size)
+    variance = np.asarray(R, dtype=np.float64)
+    if variance.ndim != 0 and variance.shape != (size,):
+        raise InputError(
+            f"R must be one variance, the {size} variances of the observations, or a scipy.sparse "
+            f"matrix of shape ({size}, {size}); got a dense array of shape {variance.shape}"
+        )
+    require_finite(np.atleast_1d(variance), "R")
+    if np.any(variance <= 0.0):
+        i = int(np.argmin(variance))
+        raise InputError(f"R must be positive; variance {i} is {variance.flat[i]:g}")
+    weight = 1.0 / np.sqrt(variance)
+
+    def whiten(values: FloatArray) -> FloatArray:
+        return (weight * values.T).T
+
+    log_determinant = float(np.sum(np.log(np.broadcast_to(variance, (size,)))))
+    return ObservationNoise(size, log_determinant, whiten)
+
+
+def csc(matrix: SparseMatrix) -> CscMatrix:
+    """A sparse matrix of any format and number type as columns in double precision."""
+    # SciPy's stubs know no common constructor for all formats.
+    return sparse.csc_array(cast(Any, matrix), dtype=np.float64)
+
+
+def _sparse_noise(R: CscMatrix, size: int) -> ObservationNoise:
+    if R.shape != (size, size):
+        raise InputError(f"R must have shape ({size}, {size}); got {R.shape}")
+    require_finite(R.data, "R")
+    asymmetry = float(np.max(np.abs((R - R.T).data), initial=0.0))
+    scale = float(np.max(np.abs(R.data), initial=0.0))
+    if asymmetry > SYMMETRY_TOLERANCE * scale:
+        raise InputError(f"R must be symmetric; it differs from its transpose by {asymmetry:g}")
+    # Without pivoting off the diagonal the LU factors of a symmetric matrix are L and D Lᵀ in one
+    # fill-reducing order; R is positive definite exactly if every pivot in D is positive.
+    try:
+        lu = splu(
+            R,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:
+        raise InputError(f"R must be positive definite; it is singular ({error})") from error
+    pivots = lu.U.diagonal()
+    if np.any(pivots <= 0.0) or np.any(lu.perm_r != lu.perm_c):
+        raise InputError(f"R must be positive definite; its smallest pivot is {pivots.min():g}")
+    position = lu.perm_c
+    lower = sparse.csr_array(lu.L)
+    weight = 1.0 / np.sqrt(pivots)
+
+    def whiten(values: FloatArray) -> FloatArray:
+        ordered = np.empty_like(values, dtype=np.float64)
+        ordered[position] = values
+        solved = np.asarray(spsolve_triangular(lower, ordered, lower=True, unit_diagonal=True))
+        return (weight * solved.T).T[position]
+
+    return ObservationNoise(size, float(np.sum(np.log(pivots))), whiten)

@@ -1,0 +1,95 @@
+"""The extended Kalman filter as the method paper runs it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.gaussian import Gaussian, as_covariance
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel
+from mvest.estimation.run import FilterRun, require_settings
+from mvest.estimation.transform import Transform, covariance_to_filter
+from mvest.estimation.update import kalman_update
+from mvest.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PaperFilter:
+    """Extended Kalman filter that cycles the same frames as new observations.
+
+    Estimation of patient-specific material properties of the mitral valve using 4D transesophageal
+    echocardiography (ISBI 2013): the parameters are a random walk, and in each round all frames
+    together are one observation::
+
+        m⁻ = m,  P⁻ = P + Q                      process
+        e  = y − h(m⁻),  H = dh/dm at m⁻         model
+        m, P = update of m⁻, P⁻ with e, H, R     see `kalman_update`
+
+    until two consecutive rounds agree. The observation is counted again in each round, so `P` is
+    the filter's covariance but not that of a posterior: with Q = 0 it shrinks like 1/rounds, with
+    Q > 0 it settles at a value set by Q and R. For a posterior use `IteratedFilter`.
+
+    No step is shortened: if the model fails at an iterate, the run ends there and says so.
+
+    Attributes
+    ----------
+    Q : float, (p,) or (p, p) in squared units of the parameters
+        Covariance added in each round. With a transform it is carried into filter coordinates at
+        the prior's mean.
+    tolerance : float
+        Stop when no parameter changed by more than this, relative to its size (or to its standard
+        deviation if that is larger).
+    max_iterations : int
+        Largest number of rounds.
+
+    Raises
+    ------
+    InputError
+        If a setting, a shape or a covariance is not admissible; never for a failing model.
+    """
+
+    Q: float | FloatArray = 0.01
+    tolerance: float = 1e-4
+    max_iterations: int = 50
+
+    def __post_init__(self) -> None:
+        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Run rounds until they agree; see `Filter` for the arguments."""
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        Q = covariance_to_filter(
+            run.transform, run.prior.mean, as_covariance(self.Q, prior.size, "Q")
+        )
+        m, P = run.prior.mean, run.prior.covariance
+        converged, rounds = False, 0
+        while True:
+            prediction = run.predict(m)
+            if not prediction.converged:
+                return run.fail(m, P, prediction)
+            H = run.jacobian(m, prediction)
+            innovation = run.y - prediction.y
+            update = kalman_update(Gaussian(m, P + Q), innovation, H, run.noise)
+            run.record(m, P, run.misfit(prediction), update.log_likelihood)
+
+            # The run of the model at the last iterate is one more than the rounds: it is what makes
+            # the reported prediction that of the estimate, and not of the iterate before.
+            if converged or rounds == self.max_iterations:
+                reason = Reason.CONVERGED if converged else Reason.MAX_ITERATIONS
+                detail = f"{rounds} rounds, tolerance {self.tolerance:g}"
+                return run.finish(reason, detail, prediction, innovation, update)
+
+            change = update.posterior.mean - m
+            m, P = update.posterior.mean, update.posterior.covariance
+            converged = run.negligible(change, m, P, self.tolerance)
+            rounds += 1

@@ -1,0 +1,171 @@
+"""One run of a filter: its problem in filter coordinates, its count of solves, its history."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, InnovationSummary, OnIterate, Reason
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance, observation_noise
+from mvest.estimation.prediction import (
+    ObservationModel,
+    Prediction,
+    read_only,
+    require_finite,
+)
+from mvest.estimation.transform import Identity, Transform, to_filter
+from mvest.estimation.update import Update
+from mvest.typing import FloatArray
+
+
+class FilterRun:
+    """The checked problem of a filter and what has happened so far.
+
+    Holds two invariants: every run of the model is counted, and none is repeated at the parameters
+    of the run before.
+
+    Attributes
+    ----------
+    prior : Gaussian
+        Prior in filter coordinates.
+    y : (n,) in units of the observation
+    noise : ObservationNoise
+    transform : Transform
+    names : tuple of str, (p,)
+    forward_solves : int
+    """
+
+    def __init__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        names: Sequence[str] | None,
+        transform: Transform | None,
+        on_iterate: OnIterate | None,
+    ) -> None:
+        self.y = read_only(y)
+        if self.y.ndim != 1 or self.y.size == 0:
+            raise InputError(f"the observation y must have shape (n,), n > 0; got {self.y.shape}")
+        require_finite(self.y, "the observation y")
+        self.noise = observation_noise(R, self.y.size)
+        self.transform = Identity() if transform is None else transform
+        self.names = tuple(f"m[{i}]" for i in range(prior.size)) if names is None else tuple(names)
+        if len(self.names) != prior.size or len(set(self.names)) != prior.size:
+            raise InputError(
+                f"{prior.size} parameters need as many different names; got {self.names}"
+            )
+        self.prior = to_filter(self.transform, prior)
+        self.forward_solves = 0
+        self._physical_prior = prior
+        self._model = model
+        self._on_iterate = on_iterate
+        self._last: tuple[FloatArray, Prediction] | None = None
+        self._iterates: list[FloatArray] = []
+        self._covariances: list[FloatArray] = []
+        self._objectives: list[float] = []
+        self._log_likelihoods: list[float] = []
+
+    def predict(self, z: FloatArray) -> Prediction:
+        """Run the model at filter coordinates z (p,), unless it was just run there.
+
+        Raises
+        ------
+        InputError
+            If the model breaks its contract: a prediction of other shapes than (n,), (n, p).
+        """
+        if self._last is not None and np.array_equal(self._last[0], z):
+            return self._last[1]
+        m = self.transform.inverse(z)
+        if not np.all(np.isfinite(m)):
+            return Prediction.failed(f"the parameters {m} are not finite")
+        self.forward_solves += 1
+        prediction = self._model(m.copy())
+        n, p = self.y.size, self.prior.size
+        if prediction.converged and prediction.jacobian.shape != (n, p):
+            raise InputError(
+                f"the model must predict {n} observations and their derivatives with respect to "
+                f"{p} parameters; got y of shape {prediction.y.shape} and jacobian of shape "
+                f"{prediction.jacobian.shape}"
+            )
+        self._last = (z.copy(), prediction)
+        return prediction
+
+    def jacobian(self, z: FloatArray, prediction: Prediction) -> FloatArray:
+        """dh/dz (n, p) at filter coordinates z, from the model's dh/dm."""
+        return prediction.jacobian * self.transform.derivative(z)
+
+    def misfit(self, prediction: Prediction) -> float:
+        """½ (y − h)ᵀ R⁻¹ (y − h)."""
+        e = self.noise.whiten(self.y - prediction.y)
+        return 0.5 * float(e @ e)
+
+    def negligible(self, change: FloatArray, z: FloatArray, P: FloatArray, limit: float) -> bool:
+        """Whether a change of z moves no parameter by more than `limit`, relatively.
+
+        Relative to |m|, or to the standard deviation of m where that is larger: a change far below
+        the standard deviation is none that matters, and m may be zero.
+        """
+        D = np.abs(self.transform.derivative(z))
+        std = D * np.sqrt(np.diagonal(P))
+        scale = np.maximum(np.abs(self.transform.inverse(z)), std)
+        return bool(np.all(D * np.abs(change) <= limit * scale))
+
+    def record(self, z: FloatArray, P: FloatArray, objective: float, log_likelihood: float) -> None:
+        """Append an iterate (filter coordinates) to the history."""
+        self._iterates.append(np.array(z))
+        self._covariances.append(np.array(P))
+        self._objectives.append(objective)
+        self._log_likelihoods.append(log_likelihood)
+        if self._on_iterate is not None:
+            number = len(self._iterates) - 1
+            self._on_iterate(number, self.transform.inverse(z).copy(), objective)
+
+    def finish(
+        self,
+        reason: Reason,
+        detail: str,
+        prediction: Prediction,
+        innovation: FloatArray,
+        update: Update,
+    ) -> Estimate:
+        """The estimate at the last recorded iterate, at which `prediction` was made."""
+        return self._estimate(reason, detail, prediction, InnovationSummary.of(innovation, update))
+
+    def fail(self, z: FloatArray, P: FloatArray, prediction: Prediction) -> Estimate:
+        """The end of a run whose next iterate (z, P) has no prediction."""
+        self.record(z, P, np.nan, np.nan)
+        detail = f"at {self.transform.inverse(z)}: {prediction.reason}"
+        return self._estimate(Reason.MODEL_FAILED, detail, None, None)
+
+    def _estimate(
+        self,
+        reason: Reason,
+        detail: str,
+        prediction: Prediction | None,
+        innovation: InnovationSummary | None,
+    ) -> Estimate:
+        return Estimate(
+            names=self.names,
+            prior=self._physical_prior,
+            transform=self.transform,
+            transformed_iterates=read_only(np.array(self._iterates)),
+            transformed_iterate_covariances=read_only(np.array(self._covariances)),
+            objective=read_only(np.array(self._objectives)),
+            log_likelihood=read_only(np.array(self._log_likelihoods)),
+            prediction=prediction,
+            innovation=innovation,
+            reason=reason,
+            detail=detail,
+            forward_solves=self.forward_solves,
+        )
+
+
+def require_settings(*, tolerance: float, max_iterations: int) -> None:
+    """Raise InputError unless a filter's tolerance and iteration limit make sense."""
+    if not (np.isfinite(tolerance) and tolerance > 0.0):
+        raise InputError(f"a filter's tolerance must be positive; got {tolerance}")
+    if max_iterations < 1:
+        raise InputError(f"a filter needs at least one iteration; got {max_iterations}")

@@ -1,0 +1,101 @@
+"""The Kalman update for many observations and few parameters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.prediction import read_only
+from mvest.typing import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """Outcome of one Kalman update.
+
+    Attributes
+    ----------
+    posterior : Gaussian
+        N(m⁺, P⁺).
+    log_likelihood : float
+        log N(e; 0, S) of the innovation, the evidence of the linear model.
+    nis : float
+        Normalised innovation squared eᵀ S⁻¹ e; chi-square with n degrees of freedom if the model
+        and its covariances are right.
+    standardised_innovation : (n,)
+        S^(-1/2) e in the noise's whitened coordinates; independent standard normal numbers if the
+        model and its covariances are right.
+    """
+
+    posterior: Gaussian
+    log_likelihood: float
+    nis: float
+    standardised_innovation: FloatArray
+
+
+def kalman_update(
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, noise: ObservationNoise
+) -> Update:
+    r"""Condition N(m, P) on an innovation e = y − h(m) with the Jacobian H.
+
+    The textbook's equations (Särkkä, Bayesian Filtering and Smoothing, 2013, eq. 4.21)::
+
+        S  = H P Hᵀ + R                 innovation covariance
+        K  = P Hᵀ S⁻¹                   gain
+        m⁺ = m + K e
+        P⁺ = (I − K H) P = (P⁻¹ + Hᵀ R⁻¹ H)⁻¹
+        log p(e) = −½ (n log 2π + log det S + eᵀ S⁻¹ e)
+
+    need an n × n matrix S. With P = L Lᵀ, Wᵀ W = R⁻¹ and the thin singular value decomposition
+    W H L = U diag(s) Vᵀ, of which there are only p values, they become::
+
+        W S Wᵀ  = I + U diag(s²) Uᵀ
+        log det S = log det R + Σ log(1 + s²)               matrix determinant lemma
+        m⁺ = m + L V diag(s / (1 + s²)) Uᵀ W e
+        P⁺ = X Xᵀ,  X = L V diag(1 / √(1 + s²))
+        (W S Wᵀ)^(-1/2) = I + U diag(1 / √(1 + s²) − 1) Uᵀ
+
+    at a cost of n p² and a memory of n p. P⁺ is a product X Xᵀ, hence symmetric positive
+    semi-definite whatever the rounding, and Hᵀ R⁻¹ H, whose condition number is the square of
+    that of W H, is never formed. P may be singular.
+
+    Parameters
+    ----------
+    prior : Gaussian
+        N(m, P) of p parameters.
+    innovation : (n,) in units of the observation
+        e = y − h(m).
+    H : (n, p) in units of the observation per unit of parameter
+    noise : ObservationNoise
+        R of the n observations.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree.
+    """
+    n, p = noise.size, prior.size
+    if innovation.shape != (n,) or H.shape != (n, p):
+        raise InputError(
+            f"{n} observations of {p} parameters need an innovation of shape ({n},) and H of shape "
+            f"({n}, {p}); got {innovation.shape} and {H.shape}"
+        )
+    m, L = prior.mean, prior.factor
+    e = noise.whiten(innovation)
+    # All p right singular vectors are needed, also where fewer observations than parameters exist.
+    U, s, Vt = np.linalg.svd(noise.whiten(H) @ L, full_matrices=n < p)
+    U = U[:, : s.size]
+    shrink = np.ones(p)
+    shrink[: s.size] = 1.0 / np.sqrt(1.0 + s**2)
+
+    Ue = U.T @ e
+    X = (L @ Vt.T) * shrink
+    posterior = Gaussian(m + L @ (Vt[: s.size].T @ (s / (1.0 + s**2) * Ue)), X @ X.T)
+
+    standardised = e + U @ ((shrink[: s.size] - 1.0) * Ue)
+    nis = float(standardised @ standardised)
+    log_det_S = noise.log_determinant + float(np.sum(np.log1p(s**2)))
+    log_likelihood = -0.5 * (n * np.log(2.0 * np.pi) + log_det_S + nis)
+    return Update(posterior, float(log_likelihood), nis, read_only(standardised))

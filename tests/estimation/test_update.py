@@ -1,0 +1,193 @@
+"""The update against a dense textbook Kalman filter that shares no code with it."""
+
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.linalg import sqrtm
+
+from mvest.errors import InputError
+from mvest.estimation import Gaussian, kalman_update, observation_noise
+
+
+def textbook_update(m, P, e, H, R):
+    """The textbook's equations with the dense n x n matrices that the library avoids."""
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    sign, log_det = np.linalg.slogdet(S)
+    assert sign > 0
+    nis = e @ np.linalg.inv(S) @ e
+    log_likelihood = -0.5 * (e.size * np.log(2 * np.pi) + log_det + nis)
+    return m + K @ e, P - K @ H @ P, log_likelihood, nis, S
+
+
+def random_spd(rng, n, condition=10.0):
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    return (Q * np.geomspace(1.0, condition, n)) @ Q.T
+
+
+def banded_spd(rng, n):
+    """A sparse R with correlated neighbours, rows in an order that needs a permutation."""
+    A = sparse.diags_array(
+        [rng.uniform(0.2, 0.4, n - 3), np.full(n, 1.5), np.zeros(n - 3)], offsets=[-3, 0, 3]
+    )
+    order = rng.permutation(n)
+    return sparse.csr_array((A @ A.T).tocsr()[order][:, order])
+
+
+def noise_of(kind, rng, n):
+    """R as the library takes it and as a dense matrix."""
+    if kind == "scalar":
+        return 0.3, 0.3 * np.eye(n)
+    if kind == "diagonal":
+        variances = rng.uniform(0.1, 2.0, n)
+        return variances, np.diag(variances)
+    R = banded_spd(rng, n)
+    return R, R.toarray()
+
+
+@pytest.mark.parametrize("kind", ["scalar", "diagonal", "sparse"])
+@pytest.mark.parametrize(("n", "p"), [(12, 3), (4, 4), (5, 8), (30, 1)])
+def test_equals_the_textbook_filter_likelihood_included(kind, n, p):
+    rng = np.random.default_rng(7)
+    P = random_spd(rng, p)
+    m, e, H = rng.standard_normal(p), rng.standard_normal(n), rng.standard_normal((n, p))
+    R, R_dense = noise_of(kind, rng, n)
+
+    update = kalman_update(Gaussian(m, P), e, H, observation_noise(R, n))
+
+    mean, covariance, log_likelihood, nis, _ = textbook_update(m, P, e, H, R_dense)
+    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-12, atol=1e-12)
+    assert update.log_likelihood == pytest.approx(log_likelihood, rel=1e-12)
+    assert update.nis == pytest.approx(nis, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["scalar", "diagonal", "sparse"])
+def test_information_form_equals_covariance_form(kind):
+    # P+ = (P^-1 + H' R^-1 H)^-1 and m+ = P+ (P^-1 m + H' R^-1 y): a second route to the numbers.
+    rng = np.random.default_rng(8)
+    n, p = 20, 3
+    P = random_spd(rng, p)
+    m, y, H = rng.standard_normal(p), rng.standard_normal(n), rng.standard_normal((n, p))
+    R, R_dense = noise_of(kind, rng, n)
+    update = kalman_update(Gaussian(m, P), y - H @ m, H, observation_noise(R, n))
+
+    R_inverse = np.linalg.inv(R_dense)
+    covariance = np.linalg.inv(np.linalg.inv(P) + H.T @ R_inverse @ H)
+    mean = covariance @ (np.linalg.inv(P) @ m + H.T @ R_inverse @ y)
+    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["scalar", "diagonal", "sparse"])
+def test_standardised_innovation_is_the_whitened_one(kind):
+    # W is not unique, but W'W = R^-1 is: check it, then the definition (W S W')^(-1/2) W e.
+    rng = np.random.default_rng(9)
+    n, p = 9, 2
+    P, e, H = random_spd(rng, p), rng.standard_normal(n), rng.standard_normal((n, p))
+    R, R_dense = noise_of(kind, rng, n)
+    noise = observation_noise(R, n)
+    W = noise.whiten(np.eye(n))
+    np.testing.assert_allclose(W.T @ W, np.linalg.inv(R_dense), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(noise.whiten(e), W @ e, rtol=1e-12)
+    assert noise.log_determinant == pytest.approx(np.linalg.slogdet(R_dense)[1], rel=1e-12)
+
+    update = kalman_update(Gaussian(np.zeros(p), P), e, H, noise)
+    *_, S = textbook_update(np.zeros(p), P, e, H, R_dense)
+    expected = np.linalg.inv(sqrtm(W @ S @ W.T).real) @ W @ e
+    np.testing.assert_allclose(update.standardised_innovation, expected, rtol=1e-10, atol=1e-11)
+
+
+def test_sequential_updates_equal_one_update():
+    # Observing two halves one after the other is observing the whole, likelihoods adding up; wrong
+    # for a gain or a likelihood that is right for one observation only.
+    rng = np.random.default_rng(10)
+    n, p = 14, 3
+    prior = Gaussian(rng.standard_normal(p), random_spd(rng, p))
+    y, H = rng.standard_normal(n), rng.standard_normal((n, p))
+    R = rng.uniform(0.1, 1.0, n)
+    whole = kalman_update(prior, y - H @ prior.mean, H, observation_noise(R, n))
+
+    first = kalman_update(prior, (y - H @ prior.mean)[:5], H[:5], observation_noise(R[:5], 5))
+    m = first.posterior.mean
+    second = kalman_update(first.posterior, (y - H @ m)[5:], H[5:], observation_noise(R[5:], n - 5))
+    np.testing.assert_allclose(second.posterior.mean, whole.posterior.mean, rtol=1e-11)
+    np.testing.assert_allclose(second.posterior.covariance, whole.posterior.covariance, rtol=1e-10)
+    assert first.log_likelihood + second.log_likelihood == pytest.approx(
+        whole.log_likelihood, rel=1e-12
+    )
+
+
+def test_a_fixed_parameter_stays_fixed():
+    # Zero variance: P is singular, P^-1 does not exist, and the parameter must not move at all.
+    rng = np.random.default_rng(11)
+    P = np.diag([1.0, 0.0, 4.0])
+    H, e = rng.standard_normal((6, 3)), rng.standard_normal(6)
+    update = kalman_update(Gaussian(np.array([1.0, 2.0, 3.0]), P), e, H, observation_noise(0.5, 6))
+    mean, covariance, *_ = textbook_update(np.array([1.0, 2.0, 3.0]), P, e, H, 0.5 * np.eye(6))
+    assert update.posterior.mean[1] == 2.0
+    assert not update.posterior.covariance[1].any()
+    np.testing.assert_allclose(update.posterior.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(update.posterior.covariance, covariance, rtol=1e-12, atol=1e-14)
+
+
+def test_nearly_parallel_columns_keep_their_digits():
+    # H = [[1, 1], [0, d], [0, 0]] with d = 1e-7, R = r and P = I. With u = (m1 + m2), v = d m2 the
+    # information is [[1, 1], [1, 1 + d^2]] / r + I, whose determinant is
+    # (1/r + 1)((1 + d^2)/r + 1) - 1/r^2 = 1 + 2/r + d^2/r + d^2/r^2. For r = 1e-14 the terms are
+    # 1, 2e14, 1 and 1e14: the last one, d^2/r^2, is lost when H'R^-1 H (entries 1e14, determinant a
+    # difference of 1e28 - 1e28) is formed, and kept when it is not.
+    d, r = 1e-7, 1e-14
+    H = np.array([[1.0, 1.0], [0.0, d], [0.0, 0.0]])
+    update = kalman_update(
+        Gaussian(np.zeros(2), np.eye(2)), np.zeros(3), H, observation_noise(r, 3)
+    )
+    determinant = 1.0 + 2.0 / r + d**2 / r + d**2 / r**2
+    # P+[0, 0] is the other diagonal entry of the information over its determinant.
+    expected = ((1.0 + d**2) / r + 1.0) / determinant
+    assert update.posterior.covariance[0, 0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_three_hundred_thousand_observations_take_little_time_and_memory():
+    # A dense n x n matrix would need 720 GB; what is needed are some arrays of n x p, 7 MB each.
+    n, p = 300_000, 3
+    rng = np.random.default_rng(12)
+    H, e = rng.standard_normal((n, p)), rng.standard_normal(n)
+    noise = observation_noise(rng.uniform(0.5, 1.0, n), n)
+    prior = Gaussian(np.zeros(p), np.eye(p))
+    start = time.perf_counter()
+    kalman_update(prior, e, H, noise)
+    seconds = time.perf_counter() - start
+
+    tracemalloc.start()
+    kalman_update(prior, e, H, noise)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert seconds < 1.0
+    assert peak < 60e6
+
+
+def test_large_sparse_noise_needs_no_dense_matrix():
+    # Noise correlated between the three coordinates of a point and with the next point.
+    n = 60_000
+    band = sparse.diags_array([np.full(n - 3, 0.3), np.ones(n)], offsets=[-3, 0])
+    tracemalloc.start()
+    noise = observation_noise(band @ band.T, n)
+    white = noise.whiten(np.ones((n, 2)))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert white.shape == (n, 2)
+    # det(B B') = 1 for a unit triangular B.
+    assert noise.log_determinant == pytest.approx(0.0, abs=1e-8)
+    assert peak < 60e6
+
+
+def test_wrong_shapes_are_refused():
+    prior, noise = Gaussian(np.zeros(2), np.eye(2)), observation_noise(1.0, 3)
+    with pytest.raises(InputError, match=r"innovation of shape \(3,\)"):
+        kalman_update(prior, np.zeros(4), np.zeros((3, 2)), noise)
+    with pytest.raises(InputError, match=r"H of shape \(3, 2\)"):
+        kalman_update(prior, np.zeros(3), np.zeros((3, 3)), noise)
