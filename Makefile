@@ -1,5 +1,4 @@
 # Every target makes what it needs: the first one run creates .venv and installs the locked packages.
-SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
