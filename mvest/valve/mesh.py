@@ -40,7 +40,8 @@ class SolidMesh:
         ``(m,)`` index into ``region_names``.
     region_names : tuple of str
     fibre : ndarray
-        ``(n, 3)`` unit collagen directions at the nodes.
+        ``(m, k, 3)`` unit collagen directions at the nodes of each element, so that the direction may
+        jump between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
     pressure_faces : ndarray
         ``(f, kf)`` nodes of the ventricular faces, normals pointing out of the solid.
 
@@ -70,7 +71,10 @@ class SolidMesh:
             raise InputError("the mesh has no elements")
         n_regions = len(self.region_names)
         set_(self, "region", _indices("element region", self.region, n_regions, (m,)))
-        set_(self, "fibre", _finite("mesh fibre", self.fibre, (n, 3)))
+        fibre = np.asarray(self.fibre, dtype=np.float64)
+        if fibre.shape == (n, 3):
+            fibre = fibre[self.elements]
+        set_(self, "fibre", _finite("mesh fibre", fibre, (m, reference.n_nodes, 3)))
         face_nodes = FACES[reference.face].n_nodes
         faces = _indices("pressure_faces", self.pressure_faces, n, (None, face_nodes))
         set_(self, "pressure_faces", faces)

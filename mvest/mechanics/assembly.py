@@ -1,0 +1,114 @@
+"""Where element arrays become global: the sparsity pattern and the scatter into it.
+
+Everything that adds stiffness does so as dense node-pair blocks: a group couples a list of row nodes
+with a list of column nodes, and its tangent is ``(rows, columns, 3, 3)``. The pattern is kept at node
+level (block rows of 3x3), so positions are looked up once and the scatter is a plain indexed addition.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from scipy import sparse
+
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Pattern", "add_forces", "scatter_blocks", "scatter_matrices"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pattern:
+    """Sparsity pattern of a matrix with 3x3 blocks.
+
+    Attributes
+    ----------
+    n : int
+        Number of nodes.
+    keys : ndarray
+        Sorted ``row * n + column`` of all blocks; the position of a block is its rank.
+    """
+
+    n: int
+    keys: IntArray
+
+    @classmethod
+    def of(cls, n: int, groups: list[tuple[IntArray, IntArray]]) -> Pattern:
+        """Pattern that holds all groups; a group is ``(rows (g, r), columns (g, c))``.
+
+        The pattern is symmetric and contains the diagonal.
+        """
+        keys = [np.arange(n, dtype=np.int64) * (n + 1)]
+        for rows, columns in groups:
+            key = np.unique(rows[:, :, None] * n + columns[:, None, :])
+            keys.append(key)
+            keys.append((key % n) * n + key // n)
+        return cls(n, np.unique(np.concatenate(keys)))
+
+    def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
+        """Positions ``(g, r, c)`` of the blocks that couple ``rows (g, r)`` and ``columns (g, c)``."""
+        key = rows[:, :, None] * self.n + columns[:, None, :]
+        return np.searchsorted(self.keys, key)
+
+    def holds(self, rows: IntArray, columns: IntArray) -> bool:
+        """Whether all blocks of the groups are in the pattern."""
+        key = (rows[:, :, None] * self.n + columns[:, None, :]).ravel()
+        at = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
+        return bool(np.array_equal(self.keys[at], key))
+
+    @property
+    def diagonal(self) -> IntArray:
+        """Positions ``(n,)`` of the diagonal blocks."""
+        return np.searchsorted(self.keys, np.arange(self.n, dtype=np.int64) * (self.n + 1))
+
+    def zeros(self) -> FloatArray:
+        """Block data ``(n_blocks, 3, 3)``."""
+        return np.zeros((len(self.keys), 3, 3))
+
+    def matrix(self, blocks: FloatArray) -> sparse.csr_matrix:
+        """The matrix ``(3n, 3n)`` with the given block data."""
+        rows, columns = np.divmod(self.keys, self.n)
+        pointer = np.searchsorted(rows, np.arange(self.n + 1))
+        size = 3 * self.n
+        return sparse.bsr_matrix((blocks, columns, pointer), shape=(size, size)).tocsr()
+
+
+@nb.njit(cache=True)
+def add_forces(out: FloatArray, nodes: IntArray, forces: FloatArray) -> None:
+    """Add group forces ``(g, k, 3)`` on ``nodes (g, k)`` into ``out (n, 3)``."""
+    for g in range(nodes.shape[0]):
+        for a in range(nodes.shape[1]):
+            for i in range(3):
+                out[nodes[g, a], i] += forces[g, a, i]
+
+
+@nb.njit(cache=True)
+def scatter_matrices(data: FloatArray, positions: IntArray, matrices: FloatArray) -> None:
+    """Add matrices ``(g, 3r, 3c)`` (node-major) into block data at ``positions (g, r, c)``."""
+    for g in range(positions.shape[0]):
+        for a in range(positions.shape[1]):
+            for b in range(positions.shape[2]):
+                block = data[positions[g, a, b]]
+                for i in range(3):
+                    for j in range(3):
+                        block[i, j] += matrices[g, 3 * a + i, 3 * b + j]
+
+
+@nb.njit(cache=True)
+def scatter_blocks(
+    data: FloatArray, positions: IntArray, weights: FloatArray, blocks: FloatArray
+) -> None:
+    """Add ``w_a w_b block`` for points ``(k, w)`` with one 3x3 block each into the data."""
+    for k in range(positions.shape[0]):
+        for a in range(positions.shape[1]):
+            if weights[k, a] == 0.0:
+                continue
+            for b in range(positions.shape[2]):
+                factor = weights[k, a] * weights[k, b]
+                if factor == 0.0:
+                    continue
+                target = data[positions[k, a, b]]
+                for i in range(3):
+                    for j in range(3):
+                        target[i, j] += factor * blocks[k, i, j]

@@ -1,0 +1,412 @@
+"""The solid: strains, internal forces and tangents of all elements of a mesh.
+
+An element is written once, for every shape: it gets its tables from :mod:`mvest.elements` and its
+stress from a law, and knows neither global degrees of freedom nor what the law is. Kernels receive
+element arrays (element axis first) and return element arrays; :mod:`mvest.mechanics.assembly`
+scatters.
+
+Kinematics. Shape-function gradients are stored along the axes of the fibre frame Q of each quadrature
+point, ``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange strain comes
+out in the fibre frame in which the law lives.
+
+Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = (det J0 / det J) (G^3 x G^3) p``
+(G^3 the contravariant thickness vector at the centre). The parameters alpha of an element solve
+``int M^T S dV = 0`` and are eliminated inside the element by Newton's method at every evaluation, so
+that to the outside the element has an energy of nodal positions only (its condensed tangent is the
+Schur complement). The modes integrate to zero against constant stress: the patch test holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numba as nb
+import numpy as np
+
+from mvest.elements import Element
+from mvest.errors import InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh import SolidMesh
+
+__all__ = ["Law", "Solid", "SolidState"]
+
+ENHANCED_ITERATIONS = 12
+ENHANCED_TOLERANCE = 1e-11
+"""Relative size of the last alpha correction (strain) at which the elimination stops."""
+
+
+class Law(Protocol):
+    """What the solid needs from a material law (see :class:`mvest.mechanics.law.BiotLaw`)."""
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """Strain measure ``(e, q, 6)`` whose rate is damped."""
+
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
+
+    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
+        """Derivative of the stress with respect to log E_f of a region."""
+
+    def history_stress(
+        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Change of the stress for a change of the previous strain measure."""
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """Change of the strain measure for a change of the Green-Lagrange strain."""
+
+
+@dataclass(slots=True, eq=False)
+class SolidState:
+    """Everything the solid knows at one set of nodal positions.
+
+    Attributes
+    ----------
+    green : ndarray
+        ``(e, q, 6)`` Green-Lagrange strain, enhanced part included.
+    stress, tangent : ndarray
+        ``(e, q, 6)`` and ``(e, q, 6, 6)`` MPa.
+    alpha : ndarray
+        ``(e, n_modes)`` enhanced parameters.
+    deformation : ndarray
+        ``(e, q, 3, 3)`` F in the fibre frame.
+    """
+
+    green: FloatArray
+    stress: FloatArray
+    tangent: FloatArray
+    alpha: FloatArray
+    deformation: FloatArray
+
+
+class Solid:
+    """A mesh with its law, ready to be evaluated.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    law : Law
+        With one entry per region of the mesh.
+    density : float
+        t/mm^3.
+    enhanced : bool
+        Whether the enhanced thickness strain of solid-shells is switched on.
+    """
+
+    def __init__(
+        self, mesh: SolidMesh, law: Law, *, density: float = 1.04e-9, enhanced: bool = True
+    ) -> None:
+        if not density > 0:
+            raise InputError(f"density {density} t/mm^3, expected > 0")
+        self.mesh = mesh
+        self.law = law
+        reference = mesh.reference
+        self.n_nodes = len(mesh.nodes)
+        self.gradients, self.volumes = _fibre_gradients(mesh, reference)
+        if enhanced:
+            self.modes = _enhanced_modes(mesh, reference)
+        else:
+            self.modes = np.zeros((*self.volumes.shape, 6, 0))
+        self.n_modes = self.modes.shape[3]
+        self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
+        self._alpha = np.zeros((len(mesh.elements), self.n_modes))
+
+    def initial_strain(self) -> FloatArray:
+        """Strain measure of the reference state, zeros ``(e, q, 6)``."""
+        return np.zeros((*self.volumes.shape, 6))
+
+    def evaluate(self, x: FloatArray, previous: FloatArray, rate: float) -> SolidState:
+        """Strain, stress and tangent at nodal positions ``x (n, 3)`` mm."""
+        elements, region = self.mesh.elements, self.mesh.region
+        green_u, f = _strains(x, elements, self.gradients)
+        if self.n_modes == 0:
+            stress, tangent = self.law.response(green_u, region, previous, rate)
+            return SolidState(green_u, stress, tangent, self._alpha, f)
+        alpha = self._alpha
+        for _ in range(ENHANCED_ITERATIONS):
+            green = green_u + np.einsum("eqim,em->eqi", self.modes, alpha)
+            stress, tangent = self.law.response(green, region, previous, rate)
+            residual, matrix = _enhanced_system(self.modes, self.volumes, stress, tangent)
+            step = -np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
+            size = np.max(np.abs(step), initial=0.0)
+            if not np.isfinite(size) or size < ENHANCED_TOLERANCE:
+                break
+            # An enhanced strain beyond +-0.2 per iteration is far outside the law's small strains.
+            alpha = alpha + np.clip(step, -0.2, 0.2)
+        if np.isfinite(alpha).all():
+            self._alpha = alpha
+        return SolidState(green, stress, tangent, alpha, f)
+
+    def forces(self, state: SolidState) -> FloatArray:
+        """Internal forces ``(e, k, 3)`` N."""
+        return _forces(self.gradients, self.volumes, state.deformation, state.stress)
+
+    def tangents(self, state: SolidState) -> FloatArray:
+        """Condensed consistent tangents ``(e, 3k, 3k)`` N/mm."""
+        return _tangents(
+            self.gradients, self.volumes, state.deformation, state.stress, state.tangent, self.modes
+        )
+
+    def condensed_forces(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
+        """Nodal forces ``(e, k, 3)`` of a partial change of stress, alpha re-equilibrated.
+
+        Parameters
+        ----------
+        d_stress : ndarray
+            ``(e, q, 6)`` partial derivative of S with respect to a parameter at fixed strain.
+        """
+        if self.n_modes:
+            d_stress = d_stress + np.einsum(
+                "eqij,eqjm,em->eqi", state.tangent, self.modes, self._alpha_change(state, d_stress)
+            )
+        return _forces(self.gradients, self.volumes, state.deformation, d_stress)
+
+    def green_change(
+        self, state: SolidState, dx: FloatArray, d_stress: FloatArray
+    ) -> FloatArray:
+        """Total change of the Green-Lagrange strain ``(e, q, 6)``.
+
+        Parameters
+        ----------
+        dx : ndarray
+            ``(n, 3)`` derivative of the nodal positions.
+        d_stress : ndarray
+            ``(e, q, 6)`` partial derivative of S at fixed strain.
+        """
+        d_green = _strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
+        if self.n_modes:
+            total = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, d_green)
+            change = self._alpha_change(state, total)
+            d_green = d_green + np.einsum("eqim,em->eqi", self.modes, change)
+        return d_green
+
+    def _alpha_change(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
+        residual, matrix = _enhanced_system(self.modes, self.volumes, d_stress, state.tangent)
+        return -np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
+
+
+def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
+    """Gradients ``(e, q, k, 3)`` along the fibre frame and quadrature volumes ``(e, q)``."""
+    x_e = mesh.nodes[mesh.elements]
+    d = reference.gradient(reference.points)
+    jacobian = np.einsum("eai,qaj->eqij", x_e, d)
+    frame = _fibre_frames(mesh, reference, jacobian)
+    gradients = np.einsum("qaj,eqji,eqim->eqam", d, np.linalg.inv(jacobian), frame)
+    return np.ascontiguousarray(gradients), np.linalg.det(jacobian) * reference.weights
+
+
+def _fibre_frames(mesh: SolidMesh, reference: Element, jacobian: FloatArray) -> FloatArray:
+    """Orthonormal frames ``(e, q, 3, 3)``, columns: fibre, in the sheet across it, normal."""
+    fibre = np.einsum("qa,eai->eqi", reference.shape(reference.points), mesh.fibre)
+    if reference.layered:
+        normal = np.cross(jacobian[..., 0], jacobian[..., 1])
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        fibre = fibre - np.sum(fibre * normal, axis=-1, keepdims=True) * normal
+    length = np.linalg.norm(fibre, axis=-1, keepdims=True)
+    if np.any(length < 1e-6):
+        bad = int(np.argwhere(length[..., 0] < 1e-6)[0, 0])
+        raise InputError(f"the fibre of element {bad} has no direction within the leaflet")
+    fibre = fibre / length
+    if not reference.layered:
+        axis = np.eye(3)[np.argmin(np.abs(fibre), axis=-1)]
+        normal = np.cross(fibre, axis)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.stack([fibre, np.cross(normal, fibre), normal], axis=-1)
+
+
+def _enhanced_modes(mesh: SolidMesh, reference: Element) -> FloatArray:
+    """Modes ``(e, q, 6, m)`` in the fibre frame, engineering shear."""
+    polynomial = reference.enhanced(reference.points)
+    x_e = mesh.nodes[mesh.elements]
+    jacobian = np.einsum("eai,qaj->eqij", x_e, reference.gradient(reference.points))
+    centre = np.einsum("eai,aj->eij", x_e, reference.gradient(reference.centre)[0])
+    frame = _fibre_frames(mesh, reference, jacobian)
+    thickness_vector = np.linalg.inv(centre)[:, 2, :]
+    # Unit amplitude means unit thickness strain: scale by the length of G^3.
+    thickness_vector /= np.linalg.norm(thickness_vector, axis=1, keepdims=True)
+    g = np.einsum("ei,eqim->eqm", thickness_vector, frame)
+    dyad = np.stack(
+        [
+            g[..., 0] ** 2,
+            g[..., 1] ** 2,
+            g[..., 2] ** 2,
+            2 * g[..., 1] * g[..., 2],
+            2 * g[..., 0] * g[..., 2],
+            2 * g[..., 0] * g[..., 1],
+        ],
+        axis=-1,
+    )
+    ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
+    return np.ascontiguousarray(
+        ratio[:, :, None, None] * dyad[:, :, :, None] * polynomial[None, :, None, :]
+    )
+
+
+def _lumped_volume(mesh: SolidMesh, reference: Element, volumes: FloatArray) -> FloatArray:
+    """Nodal volumes ``(n,)`` mm^3 by diagonal scaling (Hinton, Rock and Zienkiewicz 1976).
+
+    Row sums would give zero or negative masses to the corners of quadratic elements.
+    """
+    shape = reference.shape(reference.points)
+    diagonal = np.einsum("qa,eq->ea", shape**2, volumes)
+    share = diagonal / diagonal.sum(axis=1, keepdims=True) * volumes.sum(axis=1, keepdims=True)
+    return np.bincount(mesh.elements.ravel(), share.ravel(), minlength=len(mesh.nodes))
+
+
+@nb.njit(cache=True)
+def _strains(
+    x: FloatArray, elements: IntArray, gradients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    n_e, n_q, n_a, _ = gradients.shape
+    green = np.empty((n_e, n_q, 6))
+    deformation = np.zeros((n_e, n_q, 3, 3))
+    for e in range(n_e):
+        for q in range(n_q):
+            f = deformation[e, q]
+            for a in range(n_a):
+                node = elements[e, a]
+                for i in range(3):
+                    for m in range(3):
+                        f[i, m] += x[node, i] * gradients[e, q, a, m]
+            g = green[e, q]
+            for m in range(3):
+                g[m] = 0.5 * (f[0, m] ** 2 + f[1, m] ** 2 + f[2, m] ** 2 - 1.0)
+            g[3] = f[0, 1] * f[0, 2] + f[1, 1] * f[1, 2] + f[2, 1] * f[2, 2]
+            g[4] = f[0, 0] * f[0, 2] + f[1, 0] * f[1, 2] + f[2, 0] * f[2, 2]
+            g[5] = f[0, 0] * f[0, 1] + f[1, 0] * f[1, 1] + f[2, 0] * f[2, 1]
+    return green, deformation
+
+
+@nb.njit(cache=True)
+def _strain_derivative(
+    dx: FloatArray, elements: IntArray, gradients: FloatArray, deformation: FloatArray
+) -> FloatArray:
+    n_e, n_q, n_a, _ = gradients.shape
+    out = np.zeros((n_e, n_q, 6))
+    df = np.empty((3, 3))
+    for e in range(n_e):
+        for q in range(n_q):
+            f = deformation[e, q]
+            df[:, :] = 0.0
+            for a in range(n_a):
+                node = elements[e, a]
+                for i in range(3):
+                    for m in range(3):
+                        df[i, m] += dx[node, i] * gradients[e, q, a, m]
+            g = out[e, q]
+            for i in range(3):
+                g[0] += f[i, 0] * df[i, 0]
+                g[1] += f[i, 1] * df[i, 1]
+                g[2] += f[i, 2] * df[i, 2]
+                g[3] += f[i, 1] * df[i, 2] + df[i, 1] * f[i, 2]
+                g[4] += f[i, 0] * df[i, 2] + df[i, 0] * f[i, 2]
+                g[5] += f[i, 0] * df[i, 1] + df[i, 0] * f[i, 1]
+    return out
+
+
+@nb.njit(cache=True)
+def _enhanced_system(
+    modes: FloatArray, volumes: FloatArray, stress: FloatArray, tangent: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    n_e, n_q, _, n_m = modes.shape
+    residual = np.zeros((n_e, n_m))
+    matrix = np.zeros((n_e, n_m, n_m))
+    dm = np.empty((6, n_m))
+    for e in range(n_e):
+        for q in range(n_q):
+            w = volumes[e, q]
+            for k in range(n_m):
+                for i in range(6):
+                    value = 0.0
+                    for j in range(6):
+                        value += tangent[e, q, i, j] * modes[e, q, j, k]
+                    dm[i, k] = value
+                    residual[e, k] += w * modes[e, q, i, k] * stress[e, q, i]
+            for k in range(n_m):
+                for m in range(n_m):
+                    value = 0.0
+                    for i in range(6):
+                        value += modes[e, q, i, k] * dm[i, m]
+                    matrix[e, k, m] += w * value
+    return residual, matrix
+
+
+@nb.njit(cache=True)
+def _forces(
+    gradients: FloatArray, volumes: FloatArray, deformation: FloatArray, stress: FloatArray
+) -> FloatArray:
+    n_e, n_q, n_a, _ = gradients.shape
+    out = np.zeros((n_e, n_a, 3))
+    fs = np.empty((3, 3))
+    for e in range(n_e):
+        for q in range(n_q):
+            f, s, w = deformation[e, q], stress[e, q], volumes[e, q]
+            for i in range(3):
+                fs[i, 0] = w * (f[i, 0] * s[0] + f[i, 1] * s[5] + f[i, 2] * s[4])
+                fs[i, 1] = w * (f[i, 0] * s[5] + f[i, 1] * s[1] + f[i, 2] * s[3])
+                fs[i, 2] = w * (f[i, 0] * s[4] + f[i, 1] * s[3] + f[i, 2] * s[2])
+            for a in range(n_a):
+                g = gradients[e, q, a]
+                for i in range(3):
+                    out[e, a, i] += fs[i, 0] * g[0] + fs[i, 1] * g[1] + fs[i, 2] * g[2]
+    return out
+
+
+@nb.njit(cache=True)
+def _tangents(
+    gradients: FloatArray,
+    volumes: FloatArray,
+    deformation: FloatArray,
+    stress: FloatArray,
+    tangent: FloatArray,
+    modes: FloatArray,
+) -> FloatArray:
+    n_e, n_q, n_a, _ = gradients.shape
+    n_m = modes.shape[3]
+    n_d = 3 * n_a
+    out = np.empty((n_e, n_d, n_d))
+    b = np.zeros((n_q * 6, n_d))
+    db = np.empty((n_q * 6, n_d))
+    g_all = np.empty((n_q * 3, n_a))
+    sg = np.empty((n_q * 3, n_a))
+    k_am = np.empty((n_m, n_d))
+    k_mm = np.empty((n_m, n_m))
+    for e in range(n_e):
+        k_mm[:, :] = 0.0
+        for q in range(n_q):
+            f, s, w = deformation[e, q], stress[e, q], volumes[e, q]
+            r = 6 * q
+            for a in range(n_a):
+                g0, g1, g2 = gradients[e, q, a, 0], gradients[e, q, a, 1], gradients[e, q, a, 2]
+                for i in range(3):
+                    c = 3 * a + i
+                    b[r, c] = f[i, 0] * g0
+                    b[r + 1, c] = f[i, 1] * g1
+                    b[r + 2, c] = f[i, 2] * g2
+                    b[r + 3, c] = f[i, 1] * g2 + f[i, 2] * g1
+                    b[r + 4, c] = f[i, 0] * g2 + f[i, 2] * g0
+                    b[r + 5, c] = f[i, 0] * g1 + f[i, 1] * g0
+                p = 3 * q
+                g_all[p, a], g_all[p + 1, a], g_all[p + 2, a] = g0, g1, g2
+                sg[p, a] = w * (s[0] * g0 + s[5] * g1 + s[4] * g2)
+                sg[p + 1, a] = w * (s[5] * g0 + s[1] * g1 + s[3] * g2)
+                sg[p + 2, a] = w * (s[4] * g0 + s[3] * g1 + s[2] * g2)
+            db[r : r + 6] = w * np.dot(np.ascontiguousarray(tangent[e, q]), b[r : r + 6])
+        k = np.dot(b.T, db)
+        geometric = np.dot(g_all.T, sg)
+        for a in range(n_a):
+            for c in range(n_a):
+                for i in range(3):
+                    k[3 * a + i, 3 * c + i] += geometric[a, c]
+        if n_m > 0:
+            k_am[:, :] = 0.0
+            for q in range(n_q):
+                m_q = np.ascontiguousarray(modes[e, q])
+                k_am += np.dot(m_q.T, db[6 * q : 6 * q + 6])
+                k_mm += volumes[e, q] * np.dot(m_q.T, np.dot(np.ascontiguousarray(tangent[e, q]), m_q))
+            k -= np.dot(k_am.T, np.linalg.solve(k_mm, k_am))
+        out[e] = k
+    return out

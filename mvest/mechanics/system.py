@@ -1,0 +1,329 @@
+"""All forces of a body at one instant: residual, consistent tangent and partial derivatives.
+
+The residual is written as internal minus external force, so that equilibrium is ``r(x) = 0``:
+``r = f_solid + f_cables + f_contact + f_hinge - p f_pressure``; the time integrator adds inertia and
+mass-proportional damping. The tangent is dr/dx, exact in every term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from mvest.errors import InputError
+from mvest.mechanics.assembly import Pattern, add_forces, scatter_blocks, scatter_matrices
+from mvest.mechanics.cables import Cables, Hinge
+from mvest.mechanics.contact import Contact, ContactPairs
+from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.solid import Solid, SolidState
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
+
+_NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loads:
+    """What is prescribed at one instant.
+
+    Attributes
+    ----------
+    pressure : float
+        MPa.
+    tips : ndarray
+        ``(n_tips, 3)`` mm papillary tips.
+    hinge : ndarray
+        ``(h, 3)`` mm targets of the hinge points.
+    fixed : ndarray
+        ``(n_fixed, 3)`` mm positions of the fixed nodes.
+    body_force : ndarray or None
+        ``(n, 3)`` N dead nodal forces.
+    """
+
+    pressure: float = 0.0
+    tips: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    hinge: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    fixed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    body_force: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Factors:
+    """Factors on the nominal loads and chordae, all 1 by default."""
+
+    pressure: float = 1.0
+    chord_stiffness: float = 1.0
+    chord_rest_length: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One parameter to differentiate by: its name and its current value.
+
+    Names are ``E_f.REGION`` (MPa; the region's other moduli follow in proportion),
+    ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length`` (factors). A further parameter
+    is one entry in ``PARTIAL_DERIVATIVES``.
+    """
+
+    name: str
+    value: float
+
+    @property
+    def kind(self) -> str:
+        """The name without the region."""
+        return self.name.partition(".")[0]
+
+    @property
+    def region(self) -> str:
+        """The region, empty for parameters of the whole valve."""
+        return self.name.partition(".")[2]
+
+
+@dataclass(slots=True, eq=False)
+class Evaluation:
+    """Residual (without inertia) and what is needed to differentiate it."""
+
+    residual: FloatArray
+    scale: float
+    solid: SolidState
+    blocks: FloatArray | None
+
+
+class System:
+    """A body with everything that acts on it.
+
+    Parameters
+    ----------
+    solid : Solid
+    pressure : PressureLoad or None
+    cables : Cables or None
+    contact : Contact or None
+    hinge : Hinge or None
+    fixed_nodes : ndarray
+        Nodes whose positions are prescribed.
+    """
+
+    def __init__(
+        self,
+        solid: Solid,
+        *,
+        pressure: PressureLoad | None = None,
+        cables: Cables | None = None,
+        contact: Contact | None = None,
+        hinge: Hinge | None = None,
+        fixed_nodes: IntArray = _NO_NODES,
+        factors: Factors | None = None,
+    ) -> None:
+        self.solid = solid
+        self.pressure = pressure
+        self.cables = cables
+        self.contact = contact
+        self.hinge = hinge
+        self.fixed_nodes = np.asarray(fixed_nodes, dtype=np.int64)
+        self.factors = factors or Factors()
+        self.n = solid.n_nodes
+        if self.fixed_nodes.size and (
+            self.fixed_nodes.min() < 0 or self.fixed_nodes.max() >= self.n
+        ):
+            raise InputError(f"fixed_nodes must lie between 0 and {self.n - 1}")
+        self._contact_groups: set[tuple[int, int]] = set()
+        self._build_pattern()
+
+    # -- sparsity -----------------------------------------------------------------------------------
+    def _static_groups(self) -> list[tuple[IntArray, IntArray]]:
+        elements = self.solid.mesh.elements
+        groups = [(elements, elements)]
+        if self.pressure is not None:
+            groups.append((self.pressure.faces, self.pressure.faces))
+        for part in (
+            self.cables.patches if self.cables else None,
+            self.hinge.points if self.hinge else None,
+        ):
+            if part is not None:
+                groups.append((part.nodes, part.nodes))
+        return groups
+
+    def _build_pattern(self) -> None:
+        groups = self._static_groups()
+        if self.contact is not None and self._contact_groups:
+            hosts = np.array(sorted(self._contact_groups))
+            elements = self.solid.mesh.elements
+            groups.append((elements[hosts[:, 0]], elements[hosts[:, 1]]))
+        self.pattern = Pattern.of(self.n, groups)
+        elements = self.solid.mesh.elements
+        self._at_elements = self.pattern.positions(elements, elements)
+        if self.pressure is not None:
+            self._at_faces = self.pattern.positions(self.pressure.faces, self.pressure.faces)
+        if self.cables is not None:
+            nodes = self.cables.patches.nodes
+            self._at_cables = self.pattern.positions(nodes, nodes)
+        if self.hinge is not None:
+            nodes = self.hinge.points.nodes
+            self._at_hinge = self.pattern.positions(nodes, nodes)
+        if self.contact is not None:
+            nodes = self.contact.points.nodes
+            self._at_points = self.pattern.positions(nodes, nodes)
+        self._at_diagonal = self.pattern.diagonal
+        self._csr_order: IntArray | None = None
+        self._matrix: sparse.csr_matrix | None = None
+
+    def search_contact(self, x: FloatArray) -> ContactPairs | None:
+        """Candidate pairs at nodal positions ``x``; extends the sparsity pattern where needed."""
+        if self.contact is None:
+            return None
+        pairs = self.contact.search(self.contact.points(x))
+        new = {(int(a), int(b)) for a, b in pairs.hosts} - self._contact_groups
+        if new:
+            self._contact_groups |= new
+            self._build_pattern()
+        elements = self.solid.mesh.elements
+        a, b = elements[pairs.hosts[:, 0]], elements[pairs.hosts[:, 1]]
+        self._forward = self.pattern.positions(a, b)
+        self._backward = self.pattern.positions(b, a)
+        return pairs
+
+    # -- evaluation ---------------------------------------------------------------------------------
+    def evaluate(
+        self,
+        x: FloatArray,
+        loads: Loads,
+        pairs: ContactPairs | None,
+        previous: FloatArray,
+        rate: float,
+        *,
+        tangent: bool,
+    ) -> Evaluation:
+        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm."""
+        state = self.solid.evaluate(x, previous, rate)
+        residual = np.zeros((self.n, 3))
+        add_forces(residual, self.solid.mesh.elements, self.solid.forces(state))
+        scale = float(np.linalg.norm(residual))
+        blocks = None
+        if tangent:
+            blocks = self.pattern.zeros()
+            scatter_matrices(blocks, self._at_elements, self.solid.tangents(state))
+        p = self.factors.pressure * loads.pressure
+        if self.pressure is not None and p != 0:
+            external = np.zeros((self.n, 3))
+            add_forces(external, self.pressure.faces, p * self.pressure.forces(x))
+            residual -= external
+            scale = max(scale, float(np.linalg.norm(external)))
+            if blocks is not None:
+                scatter_matrices(blocks, self._at_faces, -p * self.pressure.tangents(x))
+        if loads.body_force is not None:
+            residual -= loads.body_force
+            scale = max(scale, float(np.linalg.norm(loads.body_force)))
+        if self.cables is not None:
+            force, stiffness, _, _ = self._cable_forces(x, loads)
+            patches = self.cables.patches
+            add_forces(residual, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
+            if blocks is not None:
+                scatter_blocks(blocks, self._at_cables, patches.weights, stiffness)
+        if self.hinge is not None:
+            force = self.hinge.forces(x, loads.hinge)
+            points = self.hinge.points
+            add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
+            if blocks is not None:
+                scatter_blocks(blocks, self._at_hinge, points.weights, self.hinge.blocks)
+        if self.contact is not None and pairs is not None:
+            points = self.contact.points
+            y = points(x)
+            force = self.contact.forces(pairs, y)
+            add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
+            if blocks is not None:
+                self.contact.add_tangent(
+                    pairs, y, blocks, self._forward, self._backward, self._at_points
+                )
+        return Evaluation(residual, scale, state, blocks)
+
+    def _cable_forces(
+        self, x: FloatArray, loads: Loads
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        assert self.cables is not None
+        return self.cables.forces(
+            x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
+        )
+
+    def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.csr_matrix:
+        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times the lumped mass; fixed rows are identity."""
+        blocks = blocks.copy()
+        for i in range(3):
+            blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
+        if self.fixed_nodes.size:
+            fixed = np.zeros(self.n, dtype=bool)
+            fixed[self.fixed_nodes] = True
+            rows, columns = np.divmod(self.pattern.keys, self.n)
+            blocks[fixed[rows] | fixed[columns]] = 0.0
+            blocks[self._at_diagonal[self.fixed_nodes]] = np.eye(3)
+        if self._matrix is None or self._csr_order is None:
+            numbered = np.arange(blocks.size, dtype=float).reshape(blocks.shape)
+            template = self.pattern.matrix(numbered)
+            template.sort_indices()
+            self._csr_order = template.data.astype(np.int64)
+            self._matrix = template
+        matrix = sparse.csr_matrix(
+            (blocks.ravel()[self._csr_order], self._matrix.indices, self._matrix.indptr),
+            shape=self._matrix.shape,
+        )
+        matrix.has_sorted_indices = True
+        return matrix
+
+    # -- partial derivatives ------------------------------------------------------------------------
+    def partial_stress(self, parameter: Parameter, state: SolidState) -> FloatArray:
+        """Partial derivative of the stress ``(e, q, 6)`` by the parameter, at fixed strain."""
+        if parameter.kind != "E_f":
+            return np.zeros_like(state.stress)
+        names = self.solid.mesh.region_names
+        if parameter.region not in names:
+            raise InputError(
+                f"parameter {parameter.name!r}: unknown region; the mesh has {', '.join(names)}"
+            )
+        which = names.index(parameter.region)
+        by_log = self.solid.law.stress_of_region(state.stress, self.solid.mesh.region, which)
+        return by_log / parameter.value
+
+    def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
+        """Partial derivative of the residual ``(n, 3)`` by the parameter, the solid's part aside."""
+        try:
+            derivative = PARTIAL_DERIVATIVES[parameter.kind]
+        except KeyError:
+            raise InputError(
+                f"unknown parameter {parameter.name!r}; known: E_f.REGION, "
+                + ", ".join(k for k in PARTIAL_DERIVATIVES if k != "E_f")
+            ) from None
+        return derivative(self, x, loads)
+
+
+def _none(system: System, x: FloatArray, loads: Loads) -> FloatArray:
+    return np.zeros((system.n, 3))
+
+
+def _by_pressure(system: System, x: FloatArray, loads: Loads) -> FloatArray:
+    out = np.zeros((system.n, 3))
+    if system.pressure is not None:
+        add_forces(out, system.pressure.faces, -loads.pressure * system.pressure.forces(x))
+    return out
+
+
+def _by_cables(index: int) -> Callable[[System, FloatArray, Loads], FloatArray]:
+    def derivative(system: System, x: FloatArray, loads: Loads) -> FloatArray:
+        out = np.zeros((system.n, 3))
+        if system.cables is not None:
+            force = system._cable_forces(x, loads)[index]
+            patches = system.cables.patches
+            add_forces(out, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
+        return out
+
+    return derivative
+
+
+PARTIAL_DERIVATIVES: dict[str, Callable[[System, FloatArray, Loads], FloatArray]] = {
+    "E_f": _none,
+    "pressure_scale": _by_pressure,
+    "chord_stiffness": _by_cables(2),
+    "chord_rest_length": _by_cables(3),
+}
