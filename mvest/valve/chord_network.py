@@ -29,11 +29,11 @@ from scipy.sparse.csgraph import dijkstra
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Cables", "trace_cables"]
+__all__ = ["ChordPaths", "trace_cables"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cables:
+class ChordPaths:
     """Straight cables that stand for a network.
 
     Attributes
@@ -57,7 +57,7 @@ class Cables:
 
 def trace_cables(
     nodes: FloatArray, edges: IntArray, anchors: IntArray, leaflet: IntArray
-) -> Cables:
+) -> ChordPaths:
     """Trace every path of a chord network from an anchor to the leaflet.
 
     Parameters
@@ -117,7 +117,7 @@ def trace_cables(
             for i in range(len(anchors))
         ]
     )
-    return Cables(
+    return ChordPaths(
         anchor=anchors[anchor_index],
         insertion=ends[end_index],
         length=distance[anchor_index, ends[end_index]],

@@ -25,7 +25,7 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.units import kpa_to_mpa
 from mvest.valve.anatomy import Chordae, LeafletSurface, Motion, Valve
-from mvest.valve.chord_network import Cables, trace_cables
+from mvest.valve.chord_network import ChordPaths, trace_cables
 from mvest.valve.donor_file import REGION_NAMES, DonorArrays, donor_file, load_arrays
 from mvest.valve.proximity import closest_points
 from mvest.valve.remesh import Remeshed
@@ -93,7 +93,7 @@ class DonorRecording:
         ``(n_annulus, 3)`` mm, prescribed at phase 1 for the vertices ``annulus``.
     papillary_tips : ndarray
         ``(n_tips, 3)`` mm; the anchors grouped by position. They do not move.
-    cables : Cables
+    cables : ChordPaths
         The chord network as straight cables; ``anchor`` counts papillary tips and ``insertion``
         vertices of ``surface``.
     """
@@ -105,7 +105,7 @@ class DonorRecording:
     phase: FloatArray
     annulus_displacement: FloatArray
     papillary_tips: FloatArray
-    cables: Cables
+    cables: ChordPaths
 
     def positions(self, triangle: IntArray, weights: FloatArray, frame: int) -> FloatArray:
         """Recorded positions ``(k, 3)`` mm of material points in one frame.

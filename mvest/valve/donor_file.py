@@ -104,7 +104,7 @@ def load_arrays(path: Path) -> DonorArrays:
         If the file is unreadable, lacks an array, or its arrays contradict each other.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             missing = sorted({*_REAL, *_INTEGER} - set(archive.files))
             if missing:
                 raise InputError(f"{path}: arrays {', '.join(missing)} are missing. {_ORIGIN}")

@@ -28,7 +28,7 @@ __all__ = ["LayeredMesh", "layered_wedges"]
 
 LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
 """Node levels that one layer of each element adds."""
-LEAST_AREA_RATIO = 0.35
+LEAST_AREA_RATIO = 0.5
 """Smallest accepted ratio of least to greatest area factor in a six-node triangle. [choice]"""
 
 
@@ -86,7 +86,7 @@ def layered_wedges(
         Number of layers.
     onto : LeafletSurface, optional
         Finer surface that the edge middles are laid on (its boundary loops for boundary edges), and
-        from which fibre and thickness are taken everywhere; without it edges are straight.
+        from which normals, fibre and thickness are taken; without it edges are straight.
     smoothing : int
         Rounds of averaging normals and thickness with their neighbours in the sheet.
 
@@ -112,14 +112,15 @@ def layered_wedges(
         curved = _lay_on(onto, middles, on_boundary)
         middles, straightened = _pull_back(surface.vertices, middles, curved, sheet)
     points = np.vstack([surface.vertices, middles])
+    small = sheet[:, FACES["tri6"].corners].reshape(-1, 3)
+    normals = vertex_normals(points, small)
     if onto is not None:
         at = closest_points(points, onto.vertices, onto.triangles)
         thickness = at.interpolate(onto.thickness, onto.triangles)
         fibre = at.interpolate(onto.fibre, onto.triangles)
+        normals = at.interpolate(onto.normals, onto.triangles)
 
-    small = sheet[:, FACES["tri6"].corners].reshape(-1, 3)
     average = _neighbour_average(small, len(points))
-    normals = vertex_normals(points, small)
     for _ in range(smoothing):
         normals = _unit(average @ normals)
         thickness = average @ thickness
