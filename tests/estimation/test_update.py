@@ -93,6 +93,8 @@ def test_standardised_innovation_is_the_whitened_one(kind):
     W = noise.whiten(np.eye(n))
     np.testing.assert_allclose(W.T @ W, np.linalg.inv(R_dense), rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(noise.whiten(e), W @ e, rtol=1e-12)
+    # Row i belongs to observation i: rows left in the order of the factorisation miss it.
+    assert np.all(np.diagonal(W) > 0.0)
     assert noise.log_determinant == pytest.approx(np.linalg.slogdet(R_dense)[1], rel=1e-12)
 
     update = kalman_update(Gaussian(np.zeros(p), P), e, H, noise)
@@ -135,12 +137,11 @@ def test_a_fixed_parameter_stays_fixed():
 
 
 def test_nearly_parallel_columns_keep_their_digits():
-    # H = [[1, 1], [0, d], [0, 0]] with d = 1e-7, R = r and P = I. With u = (m1 + m2), v = d m2 the
-    # information is [[1, 1], [1, 1 + d^2]] / r + I, whose determinant is
-    # (1/r + 1)((1 + d^2)/r + 1) - 1/r^2 = 1 + 2/r + d^2/r + d^2/r^2. For r = 1e-14 the terms are
-    # 1, 2e14, 1 and 1e14: the last one, d^2/r^2, is lost when H'R^-1 H (entries 1e14, determinant a
-    # difference of 1e28 - 1e28) is formed, and kept when it is not.
-    d, r = 1e-7, 1e-14
+    # H = [[1, 1], [0, d], [0, 0]] with d = 1e-9, R = r and P = I. The information is
+    # [[1, 1], [1, 1 + d²]]/r + I, and its determinant (1/r + 1)((1 + d²)/r + 1) - 1/r² is
+    # 1 + 2/r + d²/r + d²/r². For r = 1e-18 these are 1, 2e18, 1 and 1e18. The last one comes from
+    # the difference of d² between entries of 1e18, which H'R^-1 H has no digits for.
+    d, r = 1e-9, 1e-18
     H = np.array([[1.0, 1.0], [0.0, d], [0.0, 0.0]])
     update = kalman_update(
         Gaussian(np.zeros(2), np.eye(2)), np.zeros(3), H, observation_noise(r, 3)

@@ -1,0 +1,120 @@
+"""Filters in logarithmic coordinates, and what they report in both."""
+
+import numpy as np
+import pytest
+
+from mvest.estimation import (
+    Gaussian,
+    Identity,
+    IteratedFilter,
+    Log,
+    PaperFilter,
+    Prediction,
+    Reason,
+)
+
+
+def logarithm(m):
+    """h(m) = log m, which is linear in the filter's coordinates."""
+    if np.any(m <= 0.0):
+        return Prediction.failed(f"no logarithm of {m}")
+    return Prediction(np.log(m), np.diag(1.0 / m))
+
+
+def test_log_problem_with_a_known_answer():
+    # Prior N(5, 0.25): z0 = log 5, variance 0.25/25 = 0.01. One observation log 6 of z with the
+    # same variance pulls halfway: z = log sqrt 30, variance 0.005; back: sqrt 30, 30 * 0.005.
+    prior = Gaussian(np.array([5.0]), np.array([[0.25]]))
+    estimate = IteratedFilter()(logarithm, prior, np.log([6.0]), 0.01, transform=Log())
+    assert estimate.transformed.mean[0] == pytest.approx(0.5 * np.log(30), rel=1e-13)
+    assert estimate.transformed.covariance[0, 0] == pytest.approx(0.005, rel=1e-12)
+    assert estimate.mean[0] == pytest.approx(np.sqrt(30), rel=1e-13)
+    assert estimate.covariance[0, 0] == pytest.approx(0.15, rel=1e-12)
+    assert estimate.std[0] == pytest.approx(np.sqrt(0.15), rel=1e-12)
+    assert estimate.forward_solves == 2
+    # The prior is reported as it was given, the iterates in both coordinates.
+    assert estimate.prior.covariance[0, 0] == 0.25
+    np.testing.assert_allclose(np.exp(estimate.transformed_iterates), estimate.iterates)
+    np.testing.assert_allclose(
+        estimate.iterate_std, estimate.iterates * estimate.transformed_iterate_std
+    )
+    # The reported Jacobian is with respect to the parameter, not to its logarithm.
+    assert estimate.prediction.jacobian[0, 0] == pytest.approx(1 / np.sqrt(30))
+    low, high = estimate.interval(0.95)
+    assert low[0] == pytest.approx(np.sqrt(30) * np.exp(-1.959964 * np.sqrt(0.005)), rel=1e-6)
+    assert high[0] == pytest.approx(np.sqrt(30) * np.exp(1.959964 * np.sqrt(0.005)), rel=1e-6)
+
+
+def test_process_noise_is_carried_into_logarithms_at_the_prior():
+    # Q = 0.25 at the prior mean 5 is 0.01 in z: P- = 0.02, K = 0.02/(0.02 + 0.01) = 2/3.
+    prior = Gaussian(np.array([5.0]), np.array([[0.25]]))
+    one_round = PaperFilter(Q=0.25, max_iterations=1, tolerance=1e-300)
+    estimate = one_round(logarithm, prior, np.log([6.0]), 0.01, transform=Log())
+    assert estimate.transformed.mean[0] == pytest.approx(np.log(5) / 3 + 2 * np.log(6) / 3)
+    assert estimate.transformed.covariance[0, 0] == pytest.approx(0.02 / 3)
+
+
+def test_only_the_chosen_parameters_are_logarithms():
+    transform = Log((True, False))
+    m = np.array([2.0, -3.0])
+    z = transform.forward(m)
+    np.testing.assert_allclose(z, [np.log(2), -3.0])
+    np.testing.assert_allclose(transform.inverse(z), m)
+    np.testing.assert_allclose(transform.derivative(z), [2.0, 1.0])
+
+
+@pytest.mark.parametrize("transform", [Identity(), Log(), Log((False, True, True))])
+def test_derivative_is_that_of_the_inverse(transform):
+    z, d = np.array([0.3, -1.2, 2.0]), 1e-6
+    difference = (transform.inverse(z + d) - transform.inverse(z - d)) / (2 * d)
+    np.testing.assert_allclose(transform.derivative(z), difference, rtol=1e-9)
+
+
+def test_both_coordinates_find_the_same_mode_where_the_data_decide():
+    # With a vague prior the answer is the data's, and the Gauss-Newton covariance H'R^-1 H inverse
+    # is the same to first order in either coordinate.
+    def model(m):
+        return Prediction(
+            np.array([m[0] * m[1], m[0] / m[1], m[1] ** 2]),
+            np.array([[m[1], m[0]], [1.0 / m[1], -m[0] / m[1] ** 2], [0.0, 2.0 * m[1]]]),
+        )
+
+    prior = Gaussian.from_variance(np.array([5.0, 3.0]), 1e6)
+    truth = np.array([6.23, 2.09])
+    tight = IteratedFilter(tolerance=1e-9)
+    results = [tight(model, prior, model(truth).y, 1e-4, transform=t) for t in (Identity(), Log())]
+    for estimate in results:
+        assert estimate.converged
+        np.testing.assert_allclose(estimate.mean, truth, rtol=1e-6)
+    np.testing.assert_allclose(results[0].covariance, results[1].covariance, rtol=1e-5)
+
+
+def test_logarithms_keep_iterates_positive_where_the_identity_does_not():
+    # h = 100/m, seen 100 from m0 = 8: the slope -100/64 sends the identity's step below zero.
+    def model(m):
+        if m[0] <= 0.0:
+            return Prediction.failed("a modulus must be positive")
+        return Prediction(100.0 / m, -100.0 / m[:, None] ** 2)
+
+    prior, y = Gaussian(np.array([8.0]), np.array([[100.0]])), np.array([100.0])
+    plain = PaperFilter()(model, prior, y, 0.01)
+    assert plain.reason is Reason.MODEL_FAILED
+    assert "must be positive" in plain.detail
+    # The iterated filter shortens the step instead, or never meets one in logarithms.
+    for transform in (Identity(), Log()):
+        estimate = IteratedFilter()(model, prior, y, 0.01, transform=transform)
+        assert estimate.converged
+        assert np.all(estimate.iterates > 0.0)
+        assert estimate.mean[0] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_an_overflowing_step_is_a_value():
+    # exp of the first full step overflows; the paper's mode cannot go on, and says so.
+    def model(m):
+        return Prediction(np.log(m), 1e-3 * np.diag(1.0 / m))
+
+    prior = Gaussian(np.array([1.0]), np.array([[1e6]]))
+    estimate = PaperFilter(Q=1.0)(model, prior, np.array([5.0]), 1e-6, transform=Log())
+    assert estimate.reason is Reason.MODEL_FAILED
+    assert "not finite" in estimate.detail
+    assert estimate.forward_solves == 1
