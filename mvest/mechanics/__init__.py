@@ -1,1 +1,60 @@
-"""What the physics is: laws, elements, loads, contact, time integration, sensitivities."""
+"""What the physics is: laws, elements, loads, contact, time integration, sensitivities.
+
+Axes. One convention holds for every array here: the element (or face, point, cable) axis first,
+then the quadrature point, then the components; nodal arrays have the node axis first and xyz last.
+Element kernels take and return element arrays; only :mod:`~mvest.mechanics.assembly` knows global
+unknowns. Symmetric tensors are six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame (strains with
+engineering shear). Lengths are mm, times s, masses tonne, forces N, stresses MPa.
+
+What is here, in the order data flows:
+
+* ``law``: transversely isotropic moduli and the law in Biot strain; ``solid``: strains, forces and
+  tangents of all elements of a mesh;
+* ``pressure``, ``cables`` (chordae, annular hinge), ``contact``: what acts on the solid;
+* ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
+* ``solver``: sparse direct solvers; ``integrate``: time steps, Newton's method, sensitivities;
+* ``box``: blocks of cells and outer faces; ``body``: all of it without a valve.
+
+A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):
+
+>>> import itertools, numpy as np
+>>> from mvest.mechanics import TransverselyIsotropic, outer_faces, simulate_body
+>>> nodes = np.indices((9, 9, 3)).reshape(3, -1).T * [2.5, 2.5, 0.65]
+>>> number, axes = np.arange(243).reshape(9, 9, 3), np.eye(3, dtype=int)
+>>> paths = [np.cumsum([0 * axes[0], *axes[list(p)]], 0) for p in itertools.permutations(range(3))]
+>>> tetrahedra = np.array([number[tuple((c + p).T)] for c in np.ndindex(8, 8, 2) for p in paths])
+>>> volume = np.linalg.det(np.diff(nodes[tetrahedra], axis=1))
+>>> tetrahedra[volume < 0] = tetrahedra[volume < 0][:, [0, 1, 3, 2]]
+>>> under = [f for f in outer_faces(tetrahedra, "tet4") if np.all(nodes[f, 2] == 0)]
+>>> rim = np.flatnonzero((nodes[:, :2].min(axis=1) == 0) | (nodes[:, :2].max(axis=1) == 20))
+>>> rubber = TransverselyIsotropic.isotropic(E=2.0, nu=0.45)
+>>> sheet = simulate_body(nodes, tetrahedra, "tet4", material=rubber, fixed_nodes=rim,
+...     pressure_faces=under, pressure=0.016, times=[0.01, 0.02, 0.05, 0.1])
+>>> sheet.reason.value, sheet.frames.shape
+('completed', (5, 243, 3))
+"""
+
+from mvest.mechanics.body import simulate_body
+from mvest.mechanics.box import box, outer_faces
+from mvest.mechanics.integrate import Damping, NewtonSettings, Reason, Simulation, Step, simulate
+from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.system import Factors, Loads, Parameter, System
+
+__all__ = [
+    "BiotLaw",
+    "Damping",
+    "Factors",
+    "Loads",
+    "NewtonSettings",
+    "Parameter",
+    "PoissonReading",
+    "Reason",
+    "Simulation",
+    "Step",
+    "System",
+    "TransverselyIsotropic",
+    "box",
+    "outer_faces",
+    "simulate",
+    "simulate_body",
+]

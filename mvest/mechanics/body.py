@@ -1,0 +1,254 @@
+"""Mechanics without a valve: any clamped solid body under pressure, from plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mvest.elements import FACES, element
+from mvest.errors import GeometryError, InputError, MaterialError
+from mvest.mechanics.integrate import Damping, NewtonSettings, Simulation, Step, simulate
+from mvest.mechanics.law import BiotLaw, TransverselyIsotropic
+from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.system import Loads, Parameter, System
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh import SolidMesh
+
+__all__ = ["simulate_body"]
+
+
+def simulate_body(
+    nodes: ArrayLike,
+    elements: ArrayLike,
+    element_type: str,
+    *,
+    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
+    fixed_nodes: ArrayLike,
+    times: ArrayLike,
+    pressure_faces: ArrayLike | None = None,
+    pressure: Callable[[float], float] | ArrayLike = 0.0,
+    fibre: ArrayLike | None = None,
+    region: ArrayLike | None = None,
+    static: bool = False,
+    density: float = 1.04e-9,
+    damping: Damping | None = None,
+    newton: NewtonSettings | None = None,
+    parameters: Sequence[Parameter] = (),
+    solver: str = "auto",
+) -> Simulation:
+    """Simulate a body that is held at some nodes and pressed on some faces.
+
+    Parameters
+    ----------
+    nodes : array_like
+        ``(n, 3)`` mm.
+    elements : array_like
+        ``(m, k)`` node indices in the order of :mod:`mvest.elements`.
+    element_type : str
+        ``tet4``, ``tet10``, ``hex18``, ``hex27``, ``wedge12`` or ``wedge18``. One layer of ``tet4``
+        is up to thirty times too stiff in bending; prefer the others.
+    material : TransverselyIsotropic or sequence of them
+        One, or one per region.
+    fixed_nodes : array_like
+        ``(h,)`` nodes that do not move.
+    times : array_like
+        ``(s,)`` s, end times of the steps, increasing, > 0.
+    pressure_faces : array_like, optional
+        ``(f, kf)`` nodes of the faces pressed on, normals out of the solid
+        (:func:`mvest.mechanics.box.outer_faces` finds all faces).
+    pressure : float, callable or array_like
+        MPa, positive pushes against the normal: a constant, a function of the time (s), or a table
+        ``(t, 2)`` of times and pressures, linear between its rows and constant outside.
+    fibre : array_like, optional
+        Direction of the fibre: one ``(3,)``, per node ``(n, 3)`` or per element and node
+        ``(m, k, 3)``. May be left out if all materials are isotropic.
+    region : array_like, optional
+        ``(m,)`` material of each element; regions are called ``"0"``, ``"1"``, ...
+    static : bool
+        Equilibrium at each time, without inertia and damping.
+    density : float
+        t/mm^3.
+    damping, newton : optional
+        See :mod:`mvest.mechanics.integrate`; by default the paper's damping of 0.1 1/s and 0.1 s.
+    parameters : sequence of Parameter
+        To differentiate by, for example ``Parameter("E_f.0", 6.23)`` or
+        ``Parameter("pressure_scale", 1.0)``.
+    solver : str
+        ``auto``, ``pardiso`` or ``superlu``.
+
+    Returns
+    -------
+    Simulation
+        All frames ``(1 + completed steps, n, 3)`` mm, the given state first, and the reason why the
+        run ended; a run that does not converge is a result, not an exception.
+
+    Raises
+    ------
+    InputError, GeometryError, MaterialError
+        If an array has a wrong shape, an index out of range or a value that is not finite; if times
+        do not increase; if an element is inverted, or a pressure face belongs to no element or
+        points into the solid; if a material needs a fibre that is not given.
+
+    Examples
+    --------
+    A sheet of one layer of solid-shells, clamped at its rim and inflated:
+
+    >>> import numpy as np
+    >>> from mvest.mechanics import TransverselyIsotropic, box, outer_faces, simulate_body
+    >>> nodes, elements = box("hex18", cells=(6, 6, 1), size=(20.0, 20.0, 1.3))
+    >>> rim = np.flatnonzero(np.any((nodes[:, :2] == 0) | (nodes[:, :2] == 20), axis=1))
+    >>> faces = outer_faces(elements, "hex18")
+    >>> under = faces[np.all(nodes[faces][:, :, 2] == 0, axis=1)]
+    >>> tissue = TransverselyIsotropic(E_f=6.23, E_p=2.35, G=2.09, nu_fp=0.488, nu_pp=0.488)
+    >>> result = simulate_body(nodes, elements, "hex18", material=tissue, fibre=(1, 0, 0),
+    ...     fixed_nodes=rim, pressure_faces=under, pressure=[(0, 0), (0.05, 0.016)],
+    ...     times=np.arange(1, 11) * 0.01)
+    >>> result.converged, result.frames.shape
+    (True, (11, 338, 3))
+    """
+    points, cells = np.asarray(nodes, dtype=float), np.asarray(elements)
+    mesh = _mesh(points, cells, element_type, material, fibre, region, pressure_faces)
+    _check_pressure_faces(mesh)
+    materials = (material,) if isinstance(material, TransverselyIsotropic) else tuple(material)
+    fixed = _fixed(fixed_nodes, len(mesh.nodes))
+    system = System(
+        Solid(mesh, BiotLaw.of(materials), density=density),
+        pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
+        fixed_nodes=fixed,
+    )
+    curve = _pressure_curve(pressure)
+    held = mesh.nodes[fixed]
+    ends = np.asarray(times, dtype=float)
+    if ends.ndim != 1:
+        raise InputError(f"times: shape {ends.shape}, expected (s,)")
+    return simulate(
+        system,
+        lambda t: Loads(pressure=curve(t), fixed=held),
+        [Step(float(t), static) for t in ends],
+        damping=damping,
+        newton=newton,
+        parameters=parameters,
+        solver=linear_solver(solver),
+    )
+
+
+def _mesh(
+    nodes: FloatArray,
+    elements: IntArray,
+    element_type: str,
+    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
+    fibre: ArrayLike | None,
+    region: ArrayLike | None,
+    pressure_faces: ArrayLike | None,
+) -> SolidMesh:
+    materials = (material,) if isinstance(material, TransverselyIsotropic) else tuple(material)
+    if not materials or not all(isinstance(m, TransverselyIsotropic) for m in materials):
+        raise MaterialError("material must be a TransverselyIsotropic or a sequence of them")
+    reference = element(element_type)
+    if elements.ndim != 2 or elements.shape[1] != reference.n_nodes or elements.size == 0:
+        raise InputError(
+            f"elements: shape {elements.shape}, expected (m, {reference.n_nodes}) of {element_type}"
+        )
+    if region is None and len(materials) > 1:
+        raise InputError(f"{len(materials)} materials need the region (m,) of each element")
+    if fibre is None:
+        if not all(_is_isotropic(m) for m in materials):
+            raise InputError("fibre is needed: a material is not isotropic")
+        direction = _any_fibre(nodes, elements, element_type)
+    else:
+        direction = _unit(np.asarray(fibre, dtype=float))
+        if direction.shape == (3,):
+            direction = np.broadcast_to(direction, nodes.shape).copy()
+    width = FACES[reference.face].n_nodes
+    return SolidMesh(
+        nodes,
+        elements,
+        element_type,
+        np.zeros(len(elements), dtype=np.int64) if region is None else np.asarray(region),
+        tuple(str(k) for k in range(len(materials))),
+        direction,
+        np.zeros((0, width), dtype=np.int64)
+        if pressure_faces is None
+        else np.asarray(pressure_faces),
+    )
+
+
+def _is_isotropic(material: TransverselyIsotropic) -> bool:
+    return material == TransverselyIsotropic.isotropic(material.E_f, material.nu_fp)
+
+
+def _any_fibre(nodes: FloatArray, elements: IntArray, element_type: str) -> FloatArray:
+    """Some direction ``(m, k, 3)`` within each layer: along the first reference axis."""
+    reference = element(element_type)
+    if elements.min() < 0 or elements.max() >= len(nodes):
+        raise InputError(f"elements must hold node indices between 0 and {len(nodes) - 1}")
+    along = np.einsum(
+        "mai,qa->mqi", nodes[elements], reference.gradient(reference.node_coordinates)[:, :, 0]
+    )
+    return _unit(along, "the first reference axis of an element")
+
+
+def _unit(direction: FloatArray, what: str = "fibre") -> FloatArray:
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    if not np.all(length > 0) or not np.isfinite(direction).all():
+        raise InputError(f"{what} has a length of zero or is not finite")
+    return np.asarray(direction / length)
+
+
+def _fixed(fixed_nodes: ArrayLike, n: int) -> IntArray:
+    fixed = np.asarray(fixed_nodes)
+    if fixed.size == 0:
+        return np.zeros(0, dtype=np.int64)
+    if fixed.ndim != 1 or not np.issubdtype(fixed.dtype, np.integer):
+        raise InputError(
+            f"fixed_nodes: shape {fixed.shape} of {fixed.dtype}, expected integers (h,)"
+        )
+    if fixed.min() < 0 or fixed.max() >= n:
+        raise InputError(f"fixed_nodes must lie between 0 and {n - 1}")
+    return np.unique(fixed)
+
+
+def _pressure_curve(
+    pressure: Callable[[float], float] | ArrayLike,
+) -> Callable[[float], float]:
+    if callable(pressure):
+        return pressure
+    table = np.asarray(pressure, dtype=float)
+    if not np.isfinite(table).all():
+        raise InputError("pressure is not finite")
+    if table.ndim == 0:
+        constant = float(table)
+        return lambda t: constant
+    if table.ndim != 2 or table.shape[1] != 2 or np.any(np.diff(table[:, 0]) <= 0):
+        raise InputError(
+            f"pressure table: shape {table.shape}, expected (t, 2) with increasing times (s, MPa)"
+        )
+    return lambda t: float(np.interp(t, table[:, 0], table[:, 1]))
+
+
+def _check_pressure_faces(mesh: SolidMesh) -> None:
+    """Each pressure face must be part of an element and point away from it."""
+    faces = mesh.pressure_faces
+    if len(faces) == 0:
+        return
+    corners = FACES[mesh.reference.face].corners
+    # A node with its elements, as pairs sorted by node, so that candidates of a face are few.
+    flat = mesh.elements.ravel()
+    order = np.argsort(flat, kind="stable")
+    start = np.searchsorted(flat[order], np.arange(len(mesh.nodes) + 1))
+    for f, face in enumerate(faces):
+        near = order[start[face[0]] : start[face[0] + 1]] // mesh.elements.shape[1]
+        host = [e for e in near if np.isin(face, mesh.elements[e]).all()]
+        if not host:
+            raise GeometryError(f"pressure face {f} {face.tolist()} is not a face of an element")
+        a, b, c = np.moveaxis(mesh.nodes[face[corners]], 1, 0)
+        normal = np.cross(b - a, c - a).sum(axis=0)
+        inside = mesh.nodes[mesh.elements[host[0]]].mean(axis=0)
+        if normal @ (mesh.nodes[face].mean(axis=0) - inside) <= 0:
+            raise GeometryError(
+                f"pressure face {f} {face.tolist()} points into the solid; reverse its node order"
+            )
