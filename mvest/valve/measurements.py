@@ -1,8 +1,8 @@
-"""Clinical measurements of a valve: leaflets, tenting, papillary tips.
+"""Clinical measurements of a valve: closure as a whole, tenting, leaflets, papillary tips.
 
 Plain arrays in, numbers in mm, mm² or mm³ out. Lengths follow the usual echocardiographic
-definitions; each docstring says which. The annulus is measured in `mvest.valve.annulus`, closure
-(orifice, coaptation) in `mvest.valve.closure` and `mvest.valve.passing_ball`.
+definitions; each docstring says which. The annulus is measured in `mvest.valve.annulus`, the parts
+of closure in `mvest.valve.closure` and `mvest.valve.passing_ball`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,84 @@ import numpy as np
 
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.annulus import AnnulusPlane, checked_loop, unit_vector
-from mvest.valve.closure import project_leaflets
-from mvest.valve.proximity import plane_section
+from mvest.valve.closure import (
+    coaptation_area,
+    coaptation_length,
+    orifice_area,
+    project_leaflets,
+)
+from mvest.valve.passing_ball import largest_passing_ball
+from mvest.valve.proximity import intersecting_triangles, plane_section
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureMeasurements:
+    """How far two leaflets close their annulus.
+
+    Attributes
+    ----------
+    orifice_area
+        mm², open in the line of sight from the atrium.
+    passing_ball_diameter
+        mm, largest ball that passes between the leaflets (their thickness taken off).
+    coaptation_length
+        mm in the middle, the smaller of both leaflets'.
+    coaptation_area
+        mm², mean of both leaflets.
+    contact_distance
+        mm between midsurfaces, up to which they count as touching.
+    intersections
+        Number of pairs of midsurface triangles that pass through each other.
+    """
+
+    orifice_area: float
+    passing_ball_diameter: float
+    coaptation_length: float
+    coaptation_area: float
+    contact_distance: float
+    intersections: int
+
+
+def measure_closure(
+    vertices: FloatArray,
+    triangles: IntArray,
+    region: IntArray,
+    thickness: FloatArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    contact_distance: float,
+    opposing: tuple[int, int] = (0, 1),
+) -> ClosureMeasurements:
+    """Measure the closure of a valve from its midsurface in the current shape.
+
+    Parameters
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm and ``(m, 3)``, normals towards the ventricle.
+    region
+        ``(m,)`` leaflet of each triangle.
+    thickness
+        ``(n,)`` mm.
+    annulus, plane
+        Current annulus ``(k, 3)`` mm in loop order, and its plane.
+    contact_distance
+        mm between midsurfaces that count as touching: thickness plus the contact model's gap.
+    opposing
+        The two regions whose coaptation is measured.
+    """
+    first, second = (triangles[np.asarray(region) == label] for label in opposing)
+    return ClosureMeasurements(
+        orifice_area=orifice_area(vertices, triangles, annulus, plane),
+        passing_ball_diameter=largest_passing_ball(
+            vertices, triangles, annulus, plane, thickness=thickness
+        ).diameter,
+        coaptation_length=coaptation_length(
+            vertices, first, second, plane, contact_distance
+        ).length,
+        coaptation_area=coaptation_area(vertices, first, second, contact_distance),
+        contact_distance=contact_distance,
+        intersections=len(intersecting_triangles(vertices, triangles)),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ class PassingBall:
     Attributes
     ----------
     diameter
-        mm; 0 when no ball wider than one grid step passes. The true diameter is at most
+        mm; 0 when none passes that the grid can see. The true diameter is at most
         ``sqrt(3) * resolution`` larger.
     centre
         ``(3,)`` mm, centre of the ball at the narrowest place of its path.
@@ -164,35 +164,44 @@ def largest_passing_ball(
     annulus: FloatArray,
     plane: AnnulusPlane,
     resolution: float = 0.3,
+    thickness: FloatArray | None = None,
 ) -> PassingBall:
     """Find the largest ball that passes between the leaflets from atrium to ventricle.
 
     Parameters
     ----------
     vertices, triangles
-        Leaflets in their current shape, ``(n, 3)`` mm and ``(m, 3)``, attached to the annulus. A
-        midsurface gives the ball plus one leaflet thickness; give the outer surface of the
-        thickened leaflets for the ball itself.
+        Leaflets in their current shape, ``(n, 3)`` mm and ``(m, 3)``, attached to the annulus:
+        their midsurface with its `thickness`, or their outer surface without.
     annulus
         ``(k, 3)`` mm in loop order.
     plane
         Plane of that annulus.
     resolution
         mm between grid points.
+    thickness
+        ``(n,)`` mm, half of which is taken from the distance to the midsurface.
 
     Returns
     -------
     PassingBall
-        Its diameter is 0 when nothing wider than `resolution` passes: below that a step between
-        two grid points could cross a leaflet unseen.
+        Its diameter is 0 when nothing passes that is wider than `resolution` less the thickness:
+        below that a step between two grid points could cross a leaflet unseen.
 
     Raises
     ------
     GeometryError
-        The resolution is not positive, or the grid would have more than 60 million points.
+        The resolution is not positive, the grid would have more than 60 million points, or the
+        thickness is not one positive number per vertex.
     """
     if not (np.isfinite(resolution) and resolution > 0):
         raise GeometryError(f"resolution = {resolution} mm; give a positive grid step")
+    if thickness is not None:
+        thickness = np.asarray(thickness, dtype=np.float64)
+        if thickness.shape != (len(vertices),) or not (thickness > 0).all():
+            raise GeometryError(
+                f"thickness: shape {thickness.shape}, expected ({len(vertices)},) positive mm"
+            )
     leaflets = plane.coordinates(vertices)
     ring = plane.coordinates(checked_loop(annulus))
     everything = np.concatenate([leaflets[np.unique(triangles)], ring])
@@ -206,25 +215,38 @@ def largest_passing_ball(
         )
     corner = float(np.hypot(*np.abs([low[:2], high[:2]]).max(axis=0))) + margin
     flange, flange_triangles = annulus_flange(ring, corner, 5 * resolution)
-    points = np.concatenate([leaflets, flange])
-    obstacles = np.concatenate([triangles, flange_triangles + len(leaflets)])
-    distance = _distance_field(points, obstacles, low, shape, resolution)
+    half = np.zeros(len(triangles))
+    if thickness is not None:
+        half = 0.5 * thickness[triangles].mean(axis=1)
+    # Leaflets and flange apart: nearest of all is not always what leaves least room. The flange,
+    # as thick as a grid step, cannot be crossed unseen.
+    wall = np.full(len(flange_triangles), 0.5 * resolution)
+    distance = np.minimum(
+        _distance_field(leaflets, triangles, half, low, shape, resolution),
+        _distance_field(flange, flange_triangles, wall, low, shape, resolution),
+    )
+    unseen = max(0.5 * resolution - float(half.min()), 0.0)
     order = np.argsort(-distance.ravel())
     narrowest = int(_bottleneck(distance, order))
     radius = float(distance.ravel()[narrowest])
     where = low + resolution * np.array(np.unravel_index(narrowest, tuple(shape)))
     axes = np.column_stack([plane.anterior, plane.lateral, plane.normal])
     return PassingBall(
-        diameter=2 * radius if radius > 0.5 * resolution else 0.0,
+        diameter=2 * radius if radius > unseen else 0.0,
         centre=plane.origin + axes @ where,
         resolution=resolution,
     )
 
 
 def _distance_field(
-    points: FloatArray, triangles: IntArray, low: FloatArray, shape: IntArray, step: float
+    points: FloatArray,
+    triangles: IntArray,
+    half: FloatArray,
+    low: FloatArray,
+    shape: IntArray,
+    step: float,
 ) -> FloatArray:
-    """Distance (mm) of every grid point to the nearest triangle.
+    """Distance (mm) of every grid point to the nearest triangle, less that triangle's `half`.
 
     Exact near the triangles. Farther away it is the distance to the triangle that is nearest to
     the nearest of those near points: never below the true one, and above it by a fraction of a
@@ -239,5 +261,6 @@ def _distance_field(
     x, y, z = np.nonzero(far)
     triangle = owner[nearest[0][far], nearest[1][far], nearest[2][far]]
     grid = low + step * np.column_stack([x, y, z])
-    distance[far] = paired_distances(grid, points, triangles, triangle)
+    distance[far] = paired_distances(grid, points, triangles, triangle) - half[triangle]
+    distance[~far] -= half[owner[~far]]
     return distance

@@ -6,6 +6,7 @@ from mvest.valve.annulus import annulus_plane, measure_annulus
 from mvest.valve.closure import coaptation_area, coaptation_length, orifice_area
 from mvest.valve.measurements import (
     leaflet_length,
+    measure_closure,
     measure_papillary_tips,
     measure_tenting,
     surface_area,
@@ -165,6 +166,59 @@ def test_coaptation_of_a_wedge(shapes):
     assert coaptation_area(vertices, a, b, 1.3, subdivisions=6) == pytest.approx(
         12 * 1.3 / np.sin(2 * alpha), rel=0.03
     )
+
+
+def test_thickness_narrows_the_hole_and_closes_a_slit(shapes):
+    annulus = shapes.circle(15.0)
+    vertices, triangles = shapes.bands([annulus, shapes.circle(10.0), shapes.circle(5.0)])
+    plane = plane_of(annulus)
+    # The edge of a leaflet 1.2 thick counts as round: 5 mm less 0.6.
+    ball = largest_passing_ball(
+        vertices, triangles, annulus, plane, 0.3, np.full(len(vertices), 1.2)
+    )
+    inscribed = 2 * (5.0 * np.cos(np.pi / 120) - 0.6)
+    assert inscribed - np.sqrt(3) * 0.3 <= ball.diameter <= inscribed + 1e-6
+    vertices, triangles = shapes.bands([annulus, shapes.circle(5.0), shapes.circle(0.5)])
+    thick = np.full(len(vertices), 1.2)
+    assert largest_passing_ball(vertices, triangles, annulus, plane, 0.2).diameter > 0.6
+    assert largest_passing_ball(vertices, triangles, annulus, plane, 0.2, thick).diameter == 0.0
+
+
+@pytest.mark.parametrize("thickness", [np.ones(3), np.full(360, -1.0), np.full(360, np.nan)])
+def test_bad_thickness_is_one_clear_error(shapes, thickness):
+    annulus = shapes.circle(15.0)
+    vertices, triangles = shapes.bands([annulus, shapes.circle(10.0), shapes.circle(5.0)])
+    with pytest.raises(GeometryError, match="thickness"):
+        largest_passing_ball(vertices, triangles, annulus, plane_of(annulus), 0.5, thickness)
+
+
+def test_closure_of_a_slit_valve(shapes):
+    """Two leaves bend down from a square annulus and hang 1.3 mm apart, 8 mm deep."""
+    half, depth, gap = 10.0, 8.0, 1.3
+    roof_a = shapes.plate([gap / 2, -half, 0], [half - gap / 2, 0, 0], [0, 2 * half, 0], 20)
+    wall_a = shapes.plate([gap / 2, -half, 0], [0, 2 * half, 0], [0, 0, depth], 20)
+    roof_p = shapes.plate([-half, -half, 0], [half - gap / 2, 0, 0], [0, 2 * half, 0], 20)
+    wall_p = shapes.plate([-gap / 2, -half, 0], [0, 0, depth], [0, 2 * half, 0], 20)
+    vertices, triangles, parts = shapes.join(roof_a, wall_a, roof_p, wall_p)
+    region = np.repeat([0, 0, 1, 1], [len(part) for part in parts])
+    vertices, number = np.unique(vertices.round(9), axis=0, return_inverse=True)
+    triangles = number.ravel()[triangles]  # roof and wall share the vertices of their edge
+    side = np.linspace(-half, half, 41)[:-1]
+    annulus = np.array(
+        [(x, -half, 0.0) for x in side]
+        + [(half, y, 0.0) for y in side]
+        + [(-x, half, 0.0) for x in side]
+        + [(-half, -y, 0.0) for y in side]
+    )
+    closure = measure_closure(
+        vertices, triangles, region, np.full(len(vertices), 1.2), annulus, plane_of(annulus), 1.4
+    )
+    assert closure.coaptation_length == pytest.approx(8.0, abs=0.05)
+    # Beside the walls, 2 x 8 x 20, nothing of the roofs faces the other leaflet.
+    assert closure.coaptation_area == pytest.approx(8.0 * 20, rel=0.02)
+    assert closure.orifice_area == pytest.approx(gap * 20, rel=0.1)
+    assert closure.passing_ball_diameter <= 0.1
+    assert closure.intersections == 0
 
 
 def test_papillary_tips(shapes):
