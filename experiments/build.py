@@ -1,0 +1,200 @@
+"""From a resolved configuration (plain data) to the objects of the library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.mirror import build
+from mvest.errors import ConfigurationError
+from mvest.estimation import (
+    Filter,
+    Gaussian,
+    Identity,
+    IteratedFilter,
+    Log,
+    PaperFilter,
+    Transform,
+    observation_noise,
+)
+from mvest.model import ClosureModel, MechanicsSettings
+from mvest.study import Case
+from mvest.typing import FloatArray
+from mvest.valve.anatomy import Valve
+from mvest.valve.mesh import SolidMesh
+from mvest.valve.structured import structured_mesh
+from mvest.valve.template import Template, TemplateParameters
+from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
+from mvest.valve.tetrahedralize import TetwildSettings
+
+__all__ = ["Twin", "build_twin"]
+
+Values = Mapping[str, Any]
+OnStep = Callable[[float, int], None]
+
+ENVELOPE_SHARE = 0.05
+"""Envelope of an unstructured mesh over its edge length."""
+
+UNSTRUCTURED_SURFACE = (112, 29)
+"""Vertices of the surface that an unstructured mesh fills, whatever is observed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twin:
+    """A synthetic study: the estimator's case, and apart from it what makes its observation.
+
+    Attributes
+    ----------
+    case : Case
+    model : ClosureModel
+        The estimator's.
+    truth_model : ClosureModel
+        The observation's; an object of its own.
+    truth_values : (p,)
+    valve : Valve
+        The observed surface.
+    variance : float or (f,) mm²
+    frames : tuple of str
+    noise_mm : float
+    """
+
+    case: Case
+    model: ClosureModel
+    truth_model: ClosureModel
+    truth_values: FloatArray
+    valve: Valve
+    variance: float | FloatArray
+    frames: tuple[str, ...]
+    noise_mm: float
+
+
+def build_twin(config: Values) -> Twin:
+    """Everything of a synthetic study.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible; the message names it.
+    """
+    parameters = tuple(config["parameters"])
+    truth = config["truth"]
+    settings = build(MechanicsSettings, config["mechanics"])
+    # What is cheap to refuse is refused before anything is meshed.
+    filter_, transform, prior = build_filter(config["filter"], parameters)
+    variance = _numbers("filter.R", config["filter"]["R"])
+    observation_noise(np.atleast_1d(variance), np.size(variance))
+    values = np.array(truth["values"], dtype=float)
+    _one_each("truth.values", values, parameters)
+    if not truth["dt_factor"] > 0:
+        raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
+
+    template = Template(build(TemplateParameters, config["valve"]))
+    observation = config["observation"]
+    valve = template.valve(observation["columns"], observation["rows"])
+    points = config["mechanics"]["contact_points"]
+    contact_valve = template.valve(points["columns"], points["rows"])
+    element = config["mechanics"]["element"]
+    store = Path(config["paths"]["outputs"]) / "meshes"
+    mesh = build_mesh(template, config["mesh"], element, store)
+    model = ClosureModel(valve, contact_valve, mesh, settings, parameters, dict(config["fixed"]))
+
+    changed = truth_mesh(config["mesh"], truth)
+    other = truth["element"] or element
+    same = changed == dict(config["mesh"]) and other == element
+    protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
+    truth_model = ClosureModel(
+        valve,
+        contact_valve,
+        mesh if same else build_mesh(template, changed, other, store),
+        replace(settings, protocol=protocol),
+        parameters,
+        {**config["fixed"], **truth["fixed"]},
+    )
+    case = Case(parameters, model, prior, filter_, transform, settings.tissue)
+    return Twin(
+        case,
+        model,
+        truth_model,
+        values,
+        valve,
+        variance,
+        tuple(observation["frames"]),
+        observation["noise_mm"],
+    )
+
+
+def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
+    """The estimator's mesh settings with the truth's changes."""
+    if truth["refine"] < 1:
+        raise ConfigurationError(f"truth.refine = {truth['refine']}, expected at least 1")
+    changed = dict(mesh)
+    changed["source"] = truth["source"] or mesh["source"]
+    changed["edge_length"] = mesh["edge_length"] / truth["refine"]
+    for name in ("columns", "rows"):
+        given = truth[name]
+        changed[name] = mesh[name] * truth["refine"] if given is None else given
+    changed["layers"] = mesh["layers"] if truth["layers"] is None else truth["layers"]
+    return changed
+
+
+def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> SolidMesh:
+    """The mesh of a template; an unstructured one is made once and kept in ``store``."""
+    if mesh["source"] == "structured":
+        return structured_mesh(template, element, mesh["columns"], mesh["rows"], mesh["layers"])
+    if mesh["source"] != "tetwild":
+        raise ConfigurationError(
+            f"mesh.source = {mesh['source']!r}, expected structured or tetwild"
+        )
+    if element not in ("tet4", "tet10"):
+        raise ConfigurationError(
+            f"mechanics.element = {element!r}: an unstructured mesh needs tet10 or tet4"
+        )
+    columns, rows = UNSTRUCTURED_SURFACE
+    j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    normals = template.normal(360.0 * i / columns, j / (rows - 1))
+    settings = TetwildSettings(mesh["edge_length"], ENVELOPE_SHARE * mesh["edge_length"])
+    surface = template.valve(columns, rows).surface
+    return tetrahedral_leaflets(surface, settings, element, store, normals)
+
+
+def build_filter(
+    settings: Values, parameters: tuple[str, ...]
+) -> tuple[Filter, Transform, Gaussian]:
+    """The filter, its coordinates, and the prior of the parameters."""
+    mean = np.array(settings["initial"], dtype=float)
+    _one_each("filter.initial", mean, parameters)
+    prior = Gaussian.from_variance(mean, _numbers("filter.P0", settings["P0"]))
+    tolerance, most = settings["tolerance"], settings["max_iterations"]
+    transforms: dict[str, Transform] = {"identity": Identity(), "log": Log()}
+    if settings["transform"] not in transforms:
+        raise ConfigurationError(
+            f"filter.transform = {settings['transform']!r}, expected identity or log"
+        )
+    transform = transforms[settings["transform"]]
+    transform.forward(mean)
+    if settings["mode"] == "paper":
+        Q = _numbers("filter.Q", settings["Q"])
+        Gaussian.from_variance(mean, Q)
+        return PaperFilter(Q, tolerance, most), transform, prior
+    if settings["mode"] == "iterated":
+        return IteratedFilter(tolerance, max_iterations=most), transform, prior
+    raise ConfigurationError(f"filter.mode = {settings['mode']!r}, expected paper or iterated")
+
+
+def _one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:
+    if values.shape != (len(parameters),):
+        raise ConfigurationError(
+            f"{name} has {values.size} values; expected one for each of {', '.join(parameters)}"
+        )
+
+
+def _numbers(name: str, value: Any) -> float | FloatArray:
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} = {value!r}, expected a number or numbers") from None
+    return float(numbers) if numbers.ndim == 0 else numbers

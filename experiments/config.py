@@ -1,0 +1,160 @@
+"""The schema of every configuration, registered with Hydra.
+
+What the library names is taken from the library (``experiments.mirror``); only what a study adds to
+it is written down here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from experiments.mirror import schema
+from mvest.model import MechanicsSettings
+from mvest.provenance import config_hash
+from mvest.valve.template import TemplateParameters
+
+__all__ = ["NOT_THE_RESULT", "hash_of", "register"]
+
+NOT_THE_RESULT = ("hydra", "paths", "tracking")
+"""Parts of a configuration that change no number of the result, left out of its hash."""
+
+
+@dataclass
+class MeshConfig:
+    """The estimator's mesh."""
+
+    source: str = "structured"  # or tetwild: an unstructured mesh of the thickened leaflets
+    columns: int = MISSING  # cells around the valve
+    rows: int = MISSING  # cells from annulus to free edge
+    layers: int = 1  # cells through the thickness
+    edge_length: float = 1.6  # mm, of an unstructured mesh
+
+
+@dataclass
+class ContactPointsConfig:
+    """Where contact is sampled, in material coordinates: the same for every mesh."""
+
+    columns: int = 108
+    rows: int = 48
+
+
+@dataclass
+class FilterConfig:
+    """The filter and what it is told."""
+
+    mode: str = MISSING  # paper or iterated
+    initial: list[float] = MISSING  # prior mean of the parameters
+    P0: Any = MISSING  # variance, variances or matrix
+    Q: Any = 0.01  # the same, added each round of the paper's mode
+    R: Any = 0.01  # mm², one or one for each observed frame
+    transform: str = "identity"  # or log
+    tolerance: float = 1e-4
+    max_iterations: int = 30
+
+
+@dataclass
+class ObservationConfig:
+    """What is seen of the valve."""
+
+    frames: list[str] = field(default_factory=lambda: ["open", "closed"])
+    columns: int = 112
+    rows: int = 29
+    noise_mm: float = 0.0
+
+
+@dataclass
+class TruthConfig:
+    """What the synthetic observation is made from; null means as the estimator's model."""
+
+    values: list[float] = MISSING
+    refine: int = 1  # cells of the truth's mesh per cell of the estimator's, in each direction
+    source: str | None = None
+    columns: int | None = None
+    rows: int | None = None
+    layers: int | None = None
+    element: str | None = None
+    dt_factor: float = 1.0
+    fixed: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class PaperConfig:
+    """What the paper reports for the same experiment."""
+
+    table: str = MISSING
+    estimate: list[float] | None = None  # MPa
+    error_percent: list[float] | None = None
+    moduli_error_percent: list[float] | None = None  # mean and SD over all moduli
+    distance_mm: list[float] | None = None  # mean and SD
+
+
+@dataclass
+class PathsConfig:
+    """Folders, relative to where the command is typed."""
+
+    outputs: str = "outputs"
+    results: str = "results"
+
+
+@dataclass
+class TrackingConfig:
+    """MLflow; null is a local database in the outputs folder."""
+
+    enabled: bool = True
+    uri: str | None = None
+
+
+@dataclass
+class DiscretisationConfig:
+    """What the mechanics are computed on, added to the library's settings."""
+
+    element: str = "hex18"
+    reading: str = "A"  # of the Poisson ratio, for every region
+    contact_points: ContactPointsConfig = field(default_factory=ContactPointsConfig)
+
+
+MechanicsConfig = schema(MechanicsSettings, DiscretisationConfig)
+TemplateConfig = schema(TemplateParameters)
+
+
+@dataclass
+class Config:
+    """A study."""
+
+    name: str = MISSING
+    study: str = "twin"
+    title: str = MISSING
+    row: str = MISSING  # what a table calls this run
+    table: str = "${name}"  # which table in results/ it belongs to
+    publish: bool = False  # whether results/ takes it over if run without overrides
+    paper: PaperConfig | None = None
+    parameters: list[str] = MISSING
+    fixed: dict[str, float] = field(default_factory=dict)
+    valve: TemplateConfig = field(default_factory=TemplateConfig)  # type: ignore[valid-type]
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    mechanics: MechanicsConfig = field(default_factory=MechanicsConfig)  # type: ignore[valid-type]
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    truth: TruthConfig = field(default_factory=TruthConfig)
+    seed: int = 1
+    paths: PathsConfig = field(default_factory=PathsConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+
+def hash_of(config: DictConfig) -> str:
+    """SHA-256 of everything in a configuration that can change the result."""
+    keys = [str(key) for key in config if key not in NOT_THE_RESULT]
+    plain = OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
+    return config_hash(plain)  # type: ignore[arg-type]
+
+
+def register() -> None:
+    """Make the schema and the resolver ``${config_hash:}`` known; may be called again."""
+    ConfigStore.instance().store(name="schema", node=Config)
+    OmegaConf.register_new_resolver(
+        "config_hash", lambda *, _root_: hash_of(_root_)[:16], replace=True
+    )

@@ -1,0 +1,178 @@
+"""One run of one configuration: build, simulate, estimate, write down, log."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from experiments.build import Twin, build_twin
+from experiments.config import NOT_THE_RESULT, hash_of, register
+from experiments.progress import SolveBar
+from experiments.record import make_record, write_fields
+from experiments.tracking import log_run
+from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.model import ClosureModel
+from mvest.provenance import write_json
+from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+from mvest.reporting.publish import publish
+from mvest.reporting.tables import text_table, write_tables
+from mvest.study import StudyResult, estimate, simulate_observation
+
+__all__ = ["RunFailed", "run_job"]
+
+TYPICAL_SOLVES = 6
+"""Forward solves that a filter usually needs; only the progress bar's first guess."""
+
+# Workers of a launcher import this module before they compose their configuration.
+register()
+
+
+class RunFailed(Exception):
+    """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
+
+    def __init__(self, reason: str, folder: Path) -> None:
+        super().__init__(reason, folder)
+        self.reason = reason
+        self.folder = folder
+
+    def __str__(self) -> str:
+        return f"{self.reason} (recorded in {self.folder / 'result.json'})"
+
+
+def run_job(config: DictConfig) -> None:
+    """Run one composed configuration in Hydra's output folder.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible or a file cannot be written.
+    RunFailed
+        If the computation found no estimate; the run is recorded all the same.
+    """
+    started = time.time()
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    values: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    if values["study"] not in STUDIES:
+        raise ConfigurationError(
+            f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
+        )
+    require_writable(folder)
+    record, files = STUDIES[values["study"]](values, hash_of(config), folder, started)
+
+    write_json(folder / "config.json", values)
+    write_json(folder / "result.json", record)
+    tables = write_tables(folder, record["table"], [record])
+    print(text_table([record]))
+    print(f"Written to {folder}")
+    if values["publish"] and record["status"] == "converged":
+        if _as_published(hydra.overrides.task, hydra.sweeper.get("params")):
+            target = Path(values["paths"]["results"])
+            publish(target, _slug(values, hydra), record, folder / "fields.npz")
+            print(f"Results in {target}")
+        else:
+            print(f"{values['paths']['results']} left as it is: this run has overrides")
+    if values["tracking"]["enabled"]:
+        artifacts = [folder / "result.json", folder / "config.json", *tables, *files]
+        try:
+            log_run(record, values, artifacts, started)
+        except MvestError as error:
+            print(f"warning: {error}; the result is in {folder}", file=sys.stderr)
+    if record["status"] != "converged":
+        raise RunFailed(
+            record["reason"] + f" ({record['detail']})" * bool(record["detail"]), folder
+        )
+
+
+def run_twin(
+    config: Mapping[str, Any], config_hash: str, folder: Path, started: float
+) -> tuple[dict[str, Any], list[Path]]:
+    """A synthetic study: the record, and the figures written to ``folder``."""
+    twin = build_twin(config)
+    result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
+    mesh = twin.model.mesh
+    record = make_record(
+        result,
+        config,
+        config_hash=config_hash,
+        meshes={
+            "sha256": mesh.sha256,
+            "nodes": len(mesh.nodes),
+            "elements": len(mesh.elements),
+            "truth_sha256": twin.truth_model.mesh.sha256,
+        },
+        truth_values=twin.truth_values,
+        started=started,
+    )
+    files: list[Path] = []
+    if record["iterates"]:
+        files += save_figure(folder / "iterates", iterates_figure(record), record)
+    if result.fitted is not None:
+        fields = folder / "fields.npz"
+        write_fields(fields, twin.valve.surface, result)
+        files += save_figure(folder / "valve", valve_figure(fields), record)
+    return record, files
+
+
+STUDIES: dict[
+    str,
+    Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]],
+] = {"twin": run_twin}
+"""Kinds of studies that a configuration can name."""
+
+
+def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
+    with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
+        twin.truth_model.on_step = bar.step
+        data = simulate_observation(
+            twin.truth_model,
+            twin.case.parameters,
+            twin.truth_values,
+            frames=twin.frames,
+            variance=twin.variance,
+            noise_mm=twin.noise_mm,
+            rng=rng,
+        )
+    if data.observation is None:
+        return StudyResult.failed(twin.case, data.reason, 0.0)
+    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES) as bar:
+        twin.model.on_step = bar.step
+        result = estimate(twin.case, data.observation)
+    return result.against(data.truth)
+
+
+def _steps(model: ClosureModel) -> Sequence[object]:
+    return model.settings.protocol.steps()
+
+
+def _as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
+    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
+    allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
+    keys = (re.split(r"[=.]", override.lstrip("+~"), maxsplit=1)[0] for override in overrides)
+    return all(key in allowed for key in keys)
+
+
+def _slug(values: Mapping[str, Any], hydra: Any) -> str:
+    """Name of a published record: the experiment's, with its row if it has several."""
+    if str(hydra.mode).endswith("MULTIRUN"):
+        return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
+    return str(values["name"])
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse a folder that cannot be written, before anything is computed."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}") from error

@@ -1,0 +1,106 @@
+"""Configuration schemas made from the library's own frozen dataclasses, and back.
+
+So a setting has one name, one type and one default, those of the library, and a misspelt or wrongly
+typed override is refused by Hydra before anything is built.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+from omegaconf import MISSING
+
+from mvest.errors import ConfigurationError
+
+__all__ = ["build", "schema"]
+
+T = TypeVar("T")
+
+
+def schema(cls: type, *more: type) -> type:
+    """A mutable dataclass that OmegaConf accepts, with the fields of the frozen ``cls``.
+
+    Tuples become lists, nested dataclasses schemas of their own; defaults are kept. ``more`` are
+    mutable dataclasses whose fields are added.
+    """
+    hints = typing.get_type_hints(cls)
+    fields: list[Any] = []
+    for field in dataclasses.fields(cls):
+        kind = _config_type(hints[field.name])
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            fields.append((field.name, kind, dataclasses.field(default=MISSING)))
+            continue
+        default = (
+            field.default_factory()
+            if field.default_factory is not dataclasses.MISSING
+            else field.default
+        )
+        plain = _config_value(default)
+        fields.append((field.name, kind, _field(kind, plain)))
+    return dataclasses.make_dataclass(f"{cls.__name__}Config", fields, bases=more)
+
+
+def _field(kind: Any, plain: Any) -> Any:
+    if isinstance(plain, list):
+        return dataclasses.field(default_factory=lambda: list(plain))
+    if dataclasses.is_dataclass(kind):
+        return dataclasses.field(default_factory=lambda: typing.cast(type, kind)(**plain))
+    if isinstance(plain, dict):
+        return dataclasses.field(default_factory=lambda: dict(plain))
+    return dataclasses.field(default=plain)
+
+
+def _config_type(hint: Any) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return schema(typing.cast(type, hint))
+    if origin is tuple:
+        return list[_config_type(arguments[0])]  # type: ignore[misc]
+    if origin is dict:
+        return dict[str, _config_type(arguments[1])]  # type: ignore[misc]
+    if origin in (types.UnionType, typing.Union):
+        return typing.Optional[_config_type(arguments[0])]  # noqa: UP045
+    return hint
+
+
+def _config_value(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _config_value(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple):
+        return [_config_value(item) for item in value]
+    return value
+
+
+def build(cls: type[T], values: Mapping[str, Any]) -> T:
+    """The frozen ``cls`` from plain data of its schema; what a schema adds is passed over.
+
+    Raises
+    ------
+    ConfigurationError
+        If a field without a default has no value.
+    """
+    hints = typing.get_type_hints(cls)
+    names = [field.name for field in dataclasses.fields(typing.cast(Any, cls))]
+    missing = [name for name in names if values.get(name, MISSING) == MISSING]
+    if missing:
+        raise ConfigurationError(f"{cls.__name__} needs a value for {', '.join(missing)}")
+    return cls(**{name: _value(hints[name], values[name]) for name in names})
+
+
+def _value(hint: Any, value: Any) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if value is None:
+        return None
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value)
+    if origin is tuple and isinstance(value, Sequence):
+        return tuple(_value(arguments[0], item) for item in value)
+    if origin is dict and isinstance(value, Mapping):
+        return {key: _value(arguments[1], item) for key, item in value.items()}
+    if origin in (types.UnionType, typing.Union):
+        return _value(arguments[0], value)
+    return value

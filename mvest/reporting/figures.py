@@ -1,0 +1,161 @@
+"""Figures of a run: how the estimate came about, and the valve open and closed.
+
+Colours are those of Okabe and Ito, which people with colour-blindness can tell apart; every line is
+also told apart by its marker. Nothing touches matplotlib's global state or needs a display.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LightSource, Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+from mpl_toolkits.mplot3d.axes3d import Axes3D  # type: ignore[import-untyped]
+
+from mvest.errors import InputError
+from mvest.reporting.files import provenance_line, write_with
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["iterates_figure", "save_figure", "valve_figure"]
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Okabe and Ito, Color Universal Design (2008)."""
+
+MARKERS = ("o", "s", "^", "D", "v", "P")
+DISTANCE_MAP = "viridis"
+DPI = 200
+
+VIEWS = (("from the atrium", 90.0, -90.0), ("from the side", 12.0, -60.0))
+"""Title, elevation and azimuth in degrees; the atrium is at positive z."""
+
+
+def iterates_figure(record: Mapping[str, Any]) -> Figure:
+    """Each parameter against the iteration, with its band of two standard deviations and the truth.
+
+    Parameters
+    ----------
+    record : mapping
+        A record with at least one iterate.
+    """
+    if not record["iterates"]:
+        raise InputError(f"{record['experiment']}: a run without iterates has nothing to draw")
+    iterates, std = np.array(record["iterates"]), np.array(record["iterate_std"])
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    rounds = np.arange(len(iterates))
+    for k, name in enumerate(record["parameters"]):
+        colour = COLOURS[k % len(COLOURS)]
+        m, s = iterates[:, k], std[:, k]
+        axes.fill_between(rounds, m - 2 * s, m + 2 * s, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(rounds, m, color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
+        if record["truth"] is not None:
+            axes.axhline(record["truth"][k], color=colour, linestyle="--", linewidth=1)
+    axes.set_xlabel("iteration")
+    units = {"MPa" for name in record["parameters"] if name.startswith("E_f.")}
+    axes.set_ylabel(f"modulus [{units.pop()}]" if units else "parameter")
+    axes.set_xticks(rounds if len(rounds) <= 12 else rounds[:: len(rounds) // 8])
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.plot([], [], color="grey", linestyle="--", linewidth=1, label="truth")
+    axes.fill_between([], [], color="grey", alpha=0.2, linewidth=0, label="± 2 SD")
+    axes.legend(frameon=False, fontsize=8)
+    axes.set_title(f"{record['title']}: {record['row']}", fontsize=10)
+    return figure
+
+
+def valve_figure(fields: Path) -> Figure:
+    """The fitted valve open and closed, from the atrium and from the side.
+
+    The closed valve is coloured by the distance of each vertex from where it was observed.
+
+    Parameters
+    ----------
+    fields : Path
+        An ``.npz`` file with ``triangles (m, 3)``, ``region (m,)``, ``fitted (f, n, 3)`` mm with
+        the closed frame last, ``rest (n, 3)`` mm and ``distance (n,)`` mm.
+    """
+    try:
+        with np.load(fields) as data:
+            triangles, region = data["triangles"], data["region"]
+            rest, closed = data["rest"].astype(float), data["fitted"][-1].astype(float)
+            distance = data["distance"]
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{fields}: no fields of a valve ({error})") from error
+    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
+    tissue = np.array([_rgb(COLOURS[r % len(COLOURS)]) for r in region])
+    largest = float(distance.max())
+    norm = Normalize(0.0, largest if largest > 0 else 1.0)
+    shown = ScalarMappable(norm, DISTANCE_MAP)
+    coloured = shown.to_rgba(distance[triangles].mean(axis=1))[:, :3]
+    columns = (("open", rest, tissue), ("closed", closed, coloured))
+    span = (np.minimum(rest.min(0), closed.min(0)), np.maximum(rest.max(0), closed.max(0)))
+    axes: list[Axes3D] = []
+    for row, (view, elevation, azimuth) in enumerate(VIEWS):
+        for column, (frame, points, colours) in enumerate(columns):
+            panel: Axes3D = figure.add_subplot(2, 2, 2 * row + column + 1, projection="3d")
+            _draw(panel, points, triangles, colours, span)
+            panel.view_init(elevation, azimuth)
+            panel.set_title(f"{frame}, {view}", fontsize=10)
+            axes.append(panel)
+    bar = figure.colorbar(shown, ax=[axes[1], axes[3]], shrink=0.6, pad=0.02)
+    bar.set_label("distance, fitted to observed [mm]")
+    return figure
+
+
+def save_figure(base: Path, figure: Figure, record: Mapping[str, Any]) -> list[Path]:
+    """Write ``base.png`` and ``base.pdf`` with the provenance in print and in their metadata.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    line = provenance_line(record)
+    note = figure.supxlabel(line, fontsize=5, color="grey", ha="center")
+    # Without dates, so that the same result gives the same file.
+    metadata = {".png": {"Description": line}, ".pdf": {"Subject": line, "CreationDate": None}}
+    written = []
+    for suffix, entries in metadata.items():
+        path = base.with_name(base.name + suffix)
+        written.append(
+            write_with(
+                path,
+                lambda file, entries=entries: figure.savefig(file, dpi=DPI, metadata=entries),  # type: ignore[misc]
+            )
+        )
+    note.remove()
+    return written
+
+
+def _draw(
+    axes: Axes3D,
+    points: FloatArray,
+    triangles: IntArray,
+    colours: FloatArray,
+    span: tuple[FloatArray, FloatArray],
+) -> None:
+    corners = points[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    light = LightSource(azdeg=225, altdeg=55).direction
+    # Both sides of a leaflet are seen: what faces away is lit as if it faced the light.
+    shade = 0.45 + 0.55 * np.abs(normal @ light)
+    faces = Poly3DCollection(corners, facecolors=colours * shade[:, None], edgecolors="none")
+    faces.set_antialiased(False)
+    axes.add_collection3d(faces)
+    low, high = span
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_zlim(low[2], high[2])
+    axes.set_box_aspect(tuple(high - low), zoom=1.25)
+    axes.set_proj_type("ortho")
+    axes.set_axis_off()
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    return tuple(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))  # type: ignore[return-value]
