@@ -1,0 +1,154 @@
+"""Tangents against differences of the forces, with the observed second-order decay of the error.
+
+Each part separately, then all together. A wrong tangent shows as an error that stops falling; a
+tangent that is right to a per cent would still converge, only slowly, which is why the order and the
+final size are asserted rather than a loose tolerance.
+"""
+
+import numpy as np
+import pytest
+
+from mvest.mechanics.cables import Cables, Hinge
+from mvest.mechanics.law import BiotLaw
+from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.system import Loads, System
+from mvest.valve.embedding import embed
+from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SIDE, block, sandwich
+
+STEPS = (2e-3, 1e-3, 1e-5)
+
+
+def check(residual, tangent_times_direction, x, direction, final=1e-7):
+    """Central differences along `direction` (mm, largest entry 1) approach the tangent as h^2."""
+    errors = []
+    for h in STEPS:
+        difference = (residual(x + h * direction) - residual(x - h * direction)) / (2 * h)
+        size = np.linalg.norm(tangent_times_direction)
+        errors.append(np.linalg.norm(difference - tangent_times_direction) / size)
+    assert errors[2] < final
+    if errors[0] > 1e-8:  # below, the force is linear along the direction and only round-off is left
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
+    return errors
+
+
+def directions(shape, seed=5):
+    d = np.random.default_rng(seed).uniform(-1, 1, shape)
+    return d / np.abs(d).max()
+
+
+def check_system(system, x, loads, *, previous=None, rate=0.0, pairs=None, final=1e-7):
+    solid = system.solid
+    previous = solid.initial_strain() if previous is None else previous
+
+    def residual(at):
+        return system.evaluate(at, loads, pairs, previous, rate, tangent=False).residual.ravel()
+
+    blocks = system.evaluate(x, loads, pairs, previous, rate, tangent=True).blocks
+    matrix = system.pattern.matrix(blocks)
+    d = directions(x.shape)
+    check(residual, matrix @ d.ravel(), x, d, final)
+    return matrix
+
+
+def moved(mesh, amount=0.08, seed=1):
+    """Node positions with a finite rotation, a stretch and noise."""
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    noise = np.random.default_rng(seed).uniform(-1, 1, mesh.nodes.shape)
+    return (mesh.nodes * [1.1, 0.95, 1.05]) @ turn.T + amount * noise
+
+
+@pytest.mark.parametrize("element_type", ELEMENT_NAMES)
+@pytest.mark.parametrize("rate", [0.0, 10.0], ids=["elastic", "damped"])
+@pytest.mark.parametrize("material", ["A", "C"])
+def test_material(element_type, rate, material):
+    mesh = block(element_type, (2, 2, 1), fibre=(0.8, 0.6, 0), distortion=(0.2, 0.2, 0.2))
+    system = System(Solid(mesh, BiotLaw.of((MATERIALS[material],))))
+    previous = 0.05 * directions(system.solid.initial_strain().shape, seed=2)
+    matrix = check_system(system, moved(mesh), Loads(), previous=previous, rate=rate)
+    # The forces derive from an energy of the step, so the tangent is symmetric.
+    assert abs(matrix - matrix.T).max() < 1e-10 * abs(matrix).max()
+
+
+@pytest.mark.parametrize("element_type", ["tet4", "tet10", "hex18"])
+def test_follower_load(element_type):
+    # Forces are quadratic in the positions on a face: central differences are exact.
+    mesh = block(element_type, (2, 2, 1))
+    load = PressureLoad(mesh.pressure_faces, mesh.reference.face)
+    x = moved(mesh)
+    d = directions(x.shape)
+
+    def forces(at):
+        return load.forces(at).ravel()
+
+    product = np.einsum("fab,fb->fa", load.tangents(x), d[load.faces].reshape(len(load.faces), -1))
+    difference = (forces(x + 1e-2 * d) - forces(x - 1e-2 * d)) / 2e-2
+    np.testing.assert_allclose(difference, product.ravel(), atol=1e-12)
+
+
+def test_follower_load_pushes_against_the_normal_and_sums_to_pressure_times_area():
+    mesh = block("hex18", (3, 2, 1), (4.0, 3.0, 2.0))
+    top = mesh.pressure_faces[np.all(mesh.nodes[mesh.pressure_faces][:, :, 2] > 1.9, axis=1)]
+    force = PressureLoad(top, "quad9").forces(mesh.nodes).sum(axis=(0, 1))
+    np.testing.assert_allclose(force, [0, 0, -12.0], atol=1e-12)
+
+
+def soft_block():
+    mesh = block("hex18", (2, 2, 1))
+    law = BiotLaw(np.zeros((1, 6, 6)))  # no stiffness of its own: only what is attached acts
+    return mesh, Solid(mesh, law, enhanced=False)
+
+
+@pytest.mark.parametrize(
+    "rest", [(3.0, 3.0), (7.0, 7.8)], ids=["taut", "slack and within the toe"]
+)
+def test_chords(rest):
+    mesh, solid = soft_block()
+    ends = embed(mesh, np.array([[1.0, 1.0, 1.0], [3.0, 2.0, 1.0]]))
+    tips = np.array([[1.0, 0.0, 9.0], [4.0, 2.0, 8.0]])
+    cables = Cables(ends, np.array([0, 1]), np.array(rest), np.array([16.0, 9.0]), 0.1)
+    system = System(solid, cables=cables)
+    x = moved(mesh)
+    if rest[0] == 7.0:
+        strain = cables.strain(x, tips)
+        assert np.any((strain > 0) & (strain < 0.1)) or np.any(strain < 0)
+    if np.all(cables.strain(x, tips) <= 0):
+        pytest.fail("both cables slack: nothing is tested")
+    check_system(system, x, Loads(tips=tips))
+
+
+def test_hinge():
+    mesh, solid = soft_block()
+    points = embed(mesh, np.array([[0.0, 1.0, 1.0], [0.0, 2.0, 1.0]]))
+    hinge = Hinge(points, np.array([50.0, 20.0]))
+    check_system(System(solid, hinge=hinge), moved(mesh), Loads(hinge=points(mesh.nodes)))
+
+
+def pressed(system, loading, seed=3):
+    """Positions in which the two sheets are bulged into contact, and the candidate pairs."""
+    nodes = system.solid.mesh.nodes
+    bulge = np.sin(np.pi * nodes[:, 0] / SIDE) * np.sin(np.pi * nodes[:, 1] / SIDE)
+    x = nodes.copy()
+    x[:, 2] += np.where(nodes[:, 2] < 1.5, 0.7, -0.75) * bulge
+    x += 0.02 * np.random.default_rng(seed).uniform(-1, 1, x.shape)
+    pairs = system.search_contact(x)
+    if pairs is not None:
+        assert system.contact.active(pairs, system.contact.points(x)) > 50
+    return x, pairs
+
+
+def test_contact():
+    system, loading = sandwich()
+    law = BiotLaw(np.zeros((2, 6, 6)))
+    alone = System(Solid(system.solid.mesh, law, enhanced=False), contact=system.contact)
+    x, pairs = pressed(alone, loading)
+    matrix = check_system(alone, x, Loads(), pairs=pairs)
+    assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
+
+
+@pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge18"])
+def test_all_together(element_type):
+    system, loading = sandwich(element_type=element_type, samples=9)
+    x, pairs = pressed(system, loading)
+    previous = 0.02 * directions(system.solid.initial_strain().shape, seed=4)
+    check_system(system, x, loading(0.06), previous=previous, rate=5.0, pairs=pairs)
