@@ -141,6 +141,6 @@ def sandwich(
 
     def loading(t):
         share = min(t / 0.06, 1.0)
-        return Loads(pressure=0.004 * share, tips=tips + [0, 0, 0.5 * share], hinge=target, fixed=held)
+        return Loads(pressure=0.009 * share, tips=tips + [0, 0, 0.5 * share], hinge=target, fixed=held)
 
     return system, loading

@@ -19,12 +19,13 @@ NAMES = tuple(TRUE)
 STEPS = [Step(t) for t in (0.02, 0.04, 0.06, 0.1, 0.2)] + [Step(1.2, static=True)]
 
 
-def run(values, contact, parameters=()):
+def run(values, parameters=(), contact=True):
     v = dict(zip(NAMES, values, strict=True))
     system, loading = sandwich(
         (v["E_f.lower"], v["E_f.upper"]),
         Factors(v["pressure_scale"], v["chord_stiffness"], v["chord_rest_length"]),
         contact=contact,
+        cells=2,
         samples=11,
     )
     newton = NewtonSettings(tolerance=1e-13, smallest_move=1e-13)
@@ -34,36 +35,43 @@ def run(values, contact, parameters=()):
     return result
 
 
-@pytest.mark.parametrize("contact", [False, True], ids=["cables", "cables and contact"])
-def test_sensitivities_agree_with_central_differences(contact):
-    # Dynamic steps with damping (history of strain, velocity, position), then a static step. The
-    # difference's own error falls as h^2 until round-off, so the right derivative is met to 1e-6 at
-    # the small step and with ratio 16 between steps h and h/4; a missing history or load term leaves
-    # an error that does not fall.
+@pytest.fixture(scope="module")
+def reference():
+    result = run(TRUE.values(), [Parameter(n, TRUE[n]) for n in NAMES])
+    assert min(r.active_contacts for r in result.records[2:]) > 20
+    return result
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sensitivities_agree_with_central_differences(reference, name):
+    # Dynamic steps with damping (history of strain, velocity, position), then a static step, with
+    # cables taut and contact active. The error of central differences falls as h^2, so from h to h/4
+    # its ratio is 16, and the extrapolation (16 D(h/4) - D(h)) / 15 removes it. A missing history or
+    # load term leaves an error that does not fall.
     values = np.array([TRUE[n] for n in NAMES])
-    result = run(values, contact, [Parameter(n, TRUE[n]) for n in NAMES])
-    if contact:
-        assert min(r.active_contacts for r in result.records[2:]) > 20
-    for k, name in enumerate(NAMES):
-        errors = []
-        for relative in (4e-3, 1e-3, 1e-4):
-            h = relative * values * (np.arange(len(NAMES)) == k)
-            ahead, behind = run(values + h, contact).frames, run(values - h, contact).frames
-            difference = (ahead - behind) / (2 * h[k])
-            exact = result.sensitivities[:, k]
-            # Relative to the size of the derivative in each frame after the start.
-            size = np.linalg.norm(exact[1:], axis=(1, 2))
-            assert size.min() > 0
-            errors.append(np.linalg.norm((difference - exact)[1:], axis=(1, 2)) / size)
-        assert errors[2].max() < 1e-6, name
-        ratio = errors[0].max() / errors[1].max()
-        assert ratio == pytest.approx(16, rel=0.25), name
+    k = NAMES.index(name)
+    exact = reference.sensitivities[1:, k]
+    size = np.linalg.norm(exact, axis=(1, 2))
+    assert size.min() > 0
+    differences = []
+    # The chords' stiffness is nearly linear: larger steps keep its error above the round-off.
+    coarse = 1e-2 if name == "chord_stiffness" else 1.6e-3
+    for relative in (coarse, coarse / 4):
+        h = np.zeros(len(NAMES))
+        h[k] = relative * values[k]
+        ahead, behind = run(values + h).frames, run(values - h).frames
+        differences.append((ahead - behind)[1:] / (2 * h[k]))
+    errors = [(np.linalg.norm(d - exact, axis=(1, 2)) / size).max() for d in differences]
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.1)
+    best = (16 * differences[1] - differences[0]) / 15
+    # Relative to the size of the derivative, in every frame after the start.
+    assert (np.linalg.norm(best - exact, axis=(1, 2)) / size).max() < 1e-6
 
 
 def test_sensitivities_do_not_change_the_run_and_have_their_shape():
     values = [TRUE[n] for n in NAMES]
-    plain = run(values, False)
-    both = run(values, False, [Parameter(n, TRUE[n]) for n in NAMES])
+    plain = run(values, contact=False)
+    both = run(values, [Parameter(n, TRUE[n]) for n in NAMES], contact=False)
     np.testing.assert_array_equal(plain.frames, both.frames)
     assert both.sensitivities.shape == (len(STEPS) + 1, len(NAMES), *plain.frames.shape[1:])
     assert plain.sensitivities.shape == (len(STEPS) + 1, 0, *plain.frames.shape[1:])
@@ -76,4 +84,4 @@ def test_sensitivities_do_not_change_the_run_and_have_their_shape():
 )
 def test_an_unknown_parameter_names_the_known_ones(name, message):
     with pytest.raises(InputError, match=message):
-        run(list(TRUE.values()), False, [Parameter(name, 1.0)])
+        run(TRUE.values(), [Parameter(name, 1.0)], contact=False)
