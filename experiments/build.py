@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.mirror import build
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import (
     Filter,
     Gaussian,
@@ -21,6 +21,8 @@ from mvest.estimation import (
     Transform,
     observation_noise,
 )
+from mvest.mechanics.law import PoissonReading
+from mvest.mechanics.solver import linear_solver
 from mvest.model import ClosureModel, MechanicsSettings
 from mvest.study import Case
 from mvest.typing import FloatArray
@@ -35,6 +37,9 @@ __all__ = ["Twin", "build_twin"]
 
 Values = Mapping[str, Any]
 OnStep = Callable[[float, int], None]
+
+FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
+"""Parameters of the whole valve that can be estimated besides the moduli."""
 
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""
@@ -86,9 +91,14 @@ def build_twin(config: Values) -> Twin:
     # What is cheap to refuse is refused before anything is meshed.
     filter_, transform, prior = build_filter(config["filter"], parameters)
     variance = _numbers("filter.R", config["filter"]["R"])
-    observation_noise(np.atleast_1d(variance), np.size(variance))
+    try:
+        observation_noise(np.atleast_1d(variance), np.size(variance))
+    except InputError as error:
+        raise ConfigurationError(f"filter.R = {config['filter']['R']}: {error}") from error
     values = np.array(truth["values"], dtype=float)
     _one_each("truth.values", values, parameters)
+    _require_tissue(settings, parameters, values, prior.mean)
+    linear_solver(settings.solver)
     if not truth["dt_factor"] > 0:
         raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
 
@@ -167,7 +177,7 @@ def build_filter(
     """The filter, its coordinates, and the prior of the parameters."""
     mean = np.array(settings["initial"], dtype=float)
     _one_each("filter.initial", mean, parameters)
-    prior = Gaussian.from_variance(mean, _numbers("filter.P0", settings["P0"]))
+    prior = _gaussian("filter.P0", mean, settings["P0"])
     tolerance, most = settings["tolerance"], settings["max_iterations"]
     transforms: dict[str, Transform] = {"identity": Identity(), "log": Log()}
     if settings["transform"] not in transforms:
@@ -177,8 +187,7 @@ def build_filter(
     transform = transforms[settings["transform"]]
     transform.forward(mean)
     if settings["mode"] == "paper":
-        Q = _numbers("filter.Q", settings["Q"])
-        Gaussian.from_variance(mean, Q)
+        Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
         return PaperFilter(Q, tolerance, most), transform, prior
     if settings["mode"] == "iterated":
         return IteratedFilter(tolerance, max_iterations=most), transform, prior
@@ -190,6 +199,43 @@ def _one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> Non
         raise ConfigurationError(
             f"{name} has {values.size} values; expected one for each of {', '.join(parameters)}"
         )
+
+
+def _gaussian(name: str, mean: FloatArray, variance: Any) -> Gaussian:
+    """Prior with one variance, one for each parameter, or a full covariance."""
+    numbers = _numbers(name, variance)
+    try:
+        return Gaussian.from_variance(mean, numbers)
+    except InputError as error:
+        raise ConfigurationError(f"{name} = {variance}: {error}") from error
+
+
+def _require_tissue(
+    settings: MechanicsSettings, parameters: tuple[str, ...], *points: FloatArray
+) -> None:
+    """Refuse unknowns that the model does not have, and values that no tissue can have."""
+    readings = [reading.value for reading in PoissonReading]
+    for region, tissue in settings.tissue.items():
+        if tissue.reading not in readings:
+            raise ConfigurationError(
+                f"mechanics.tissue.{region}.reading = {tissue.reading!r}, expected one of "
+                f"{', '.join(readings)}"
+            )
+    for k, parameter in enumerate(parameters):
+        kind, _, region = parameter.partition(".")
+        if kind != "E_f":
+            if parameter not in FACTORS:
+                raise ConfigurationError(
+                    f"unknown parameter {parameter!r}; known: E_f.REGION, {', '.join(FACTORS)}"
+                )
+            continue
+        if region not in settings.tissue:
+            raise ConfigurationError(
+                f"parameter {parameter!r}: no tissue is given for the region {region!r}; known: "
+                f"{', '.join(settings.tissue)}"
+            )
+        for values in points:
+            settings.tissue[region].material(float(values[k]))
 
 
 def _numbers(name: str, value: Any) -> float | FloatArray:

@@ -26,7 +26,7 @@ from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
 from mvest.study import StudyResult, estimate, simulate_observation
 
-__all__ = ["RunFailed", "run_job"]
+__all__ = ["FailedRunError", "run_job"]
 
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the progress bar's first guess."""
@@ -35,7 +35,7 @@ TYPICAL_SOLVES = 6
 register()
 
 
-class RunFailed(Exception):
+class FailedRunError(Exception):
     """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
 
     def __init__(self, reason: str, folder: Path) -> None:
@@ -54,7 +54,7 @@ def run_job(config: DictConfig) -> None:
     ------
     MvestError
         If a setting is inadmissible or a file cannot be written.
-    RunFailed
+    FailedRunError
         If the computation found no estimate; the run is recorded all the same.
     """
     started = time.time()
@@ -87,7 +87,7 @@ def run_job(config: DictConfig) -> None:
         except MvestError as error:
             print(f"warning: {error}; the result is in {folder}", file=sys.stderr)
     if record["status"] != "converged":
-        raise RunFailed(
+        raise FailedRunError(
             record["reason"] + f" ({record['detail']})" * bool(record["detail"]), folder
         )
 

@@ -59,7 +59,9 @@ def _config_type(hint: Any) -> Any:
     if dataclasses.is_dataclass(hint):
         return schema(typing.cast(type, hint))
     if origin is tuple:
-        return list[_config_type(arguments[0])]  # type: ignore[misc]
+        # OmegaConf takes 1 for a float, but not within a list of lists.
+        nested = typing.get_origin(arguments[0]) is tuple
+        return list[Any] if nested else list[_config_type(arguments[0])]  # type: ignore[misc]
     if origin is dict:
         return dict[str, _config_type(arguments[1])]  # type: ignore[misc]
     if origin in (types.UnionType, typing.Union):

@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.job import RunFailed, run_job
+from experiments.job import FailedRunError, run_job
 from mvest.errors import MvestError
 
 __all__ = ["main"]
+
+PRIMARY = "In 'config': "
+"""How Hydra begins messages about the primary configuration."""
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 """The folder of the configuration."""
@@ -34,18 +37,18 @@ TRACEBACKS = "HYDRA_FULL_ERROR"
 def main() -> int:
     """Run the application on the command line's arguments; returns the exit status."""
     wants_tracebacks = TRACEBACKS in os.environ
-    # Hydra then lets exceptions through, so that they can be told in one line here.
-    os.environ[TRACEBACKS] = "1"
     ended: list[Exception] = []
 
     def task(config: DictConfig) -> None:
         try:
             run_job(config)
-        except (MvestError, RunFailed) as error:
+        except (MvestError, FailedRunError) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             ended.append(error)
 
+    # Hydra then lets exceptions through, so that they can be told in one line here.
+    os.environ[TRACEBACKS] = "1"
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
@@ -53,7 +56,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("interrupted: nothing of this run was kept", file=sys.stderr)
         return 130
-    except RunFailed as error:
+    except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
     except (MvestError, HydraException, OmegaConfBaseException, OSError) as error:
@@ -61,27 +64,39 @@ def main() -> int:
             raise
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
+    finally:
+        if not wants_tracebacks:
+            del os.environ[TRACEBACKS]
     return 0
 
 
 def explain(error: BaseException) -> str:
     """One line that says what is wrong and, where it can be told, what would be right."""
-    if isinstance(error, OSError):
-        place = f" {error.filename}" if error.filename else ""
-        return f"cannot write{place}: {error.strerror or error}"
+    if isinstance(error, OSError) and not isinstance(error, HydraException):
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    own = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if isinstance(error, MvestError):
+        return own[0]
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {own[0]}"
     causes = [error]
     while (cause := causes[-1].__cause__) is not None:
         causes.append(cause)
     lines = [line.strip() for e in reversed(causes) for line in str(e).splitlines() if line.strip()]
     text = lines[0] if lines else type(error).__name__
-    full_key = next((line for line in lines if line.startswith("full_key:")), None)
+    listed = [k for k, line in enumerate(lines) if line.startswith("Available options")]
+    if listed:
+        choices = takewhile(
+            lambda line: not line.startswith("Config search path"), lines[listed[0] + 1 :]
+        )
+        known = ", ".join(choices)
+        return f"{text.removeprefix(PRIMARY)}; known: {known}"
     if isinstance(causes[-1], OmegaConfBaseException):
+        full_key = next((line for line in lines if line.startswith("full_key:")), None)
         if full_key is not None:
             text = f"{full_key.removeprefix('full_key:').strip()}: {text}"
-        text += _nearest(causes[-1])
-    elif "available" in " ".join(lines).lower():
-        text = re.sub(r"\s+", " ", " ".join(lines[: lines.index(text) + 8]))
-    return text
+        return text + _nearest(causes[-1])
+    return ": ".join(own[:2]) or type(error).__name__
 
 
 def _nearest(error: BaseException) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.errors import InputError, MvestError
+from mvest.errors import InputError, MaterialError
 from mvest.estimation import (
     Estimate,
     Filter,
@@ -65,9 +65,7 @@ class Observation:
     variance: FloatArray
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.frames if name not in FRAMES]
-        if not self.frames or unknown or len(set(self.frames)) != len(self.frames):
-            raise InputError(f"observed frames {list(self.frames)}, expected some of {FRAMES}")
+        require_frames(self.frames)
         positions = np.array(self.positions, dtype=np.float64)
         if positions.ndim != 3 or positions.shape[0] != len(self.frames) or positions.shape[2] != 3:
             raise InputError(
@@ -93,6 +91,12 @@ class Observation:
     def R(self) -> FloatArray:
         """Variances ``(3 f n,)`` in mm² of the stacked coordinates."""
         return np.repeat(self.variance, self.positions[0].size)
+
+
+def require_frames(frames: Sequence[str]) -> None:
+    """Raise InputError unless ``frames`` are different frames that a model predicts."""
+    if not frames or not set(frames) <= set(FRAMES) or len(set(frames)) != len(frames):
+        raise InputError(f"observed frames {list(frames)}, expected some of {list(FRAMES)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,17 +139,22 @@ class ObservedFrames:
         """Predict the observed frames of parameters ``m (p,)``."""
         try:
             prediction = self.model(m)
-        except MvestError as error:
+        except MaterialError as error:
             return Prediction.failed(str(error))
         if not prediction.converged:
             return prediction
-        size = len(prediction.y) // len(FRAMES)
-        rows = [slice(size * FRAMES.index(f), size * (FRAMES.index(f) + 1)) for f in self.frames]
         return Prediction(
-            np.concatenate([prediction.y[r] for r in rows]),
-            np.concatenate([prediction.jacobian[r] for r in rows]),
+            _selected(prediction.y, self.frames),
+            _selected(prediction.jacobian, self.frames),
             reason=prediction.reason,
         )
+
+
+def _selected(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:
+    """Rows of the named frames out of all ``FRAMES``."""
+    size = len(stacked) // len(FRAMES)
+    starts = [size * FRAMES.index(frame) for frame in frames]
+    return np.concatenate([stacked[start : start + size] for start in starts])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -344,7 +353,7 @@ def simulate_observation(
     Raises
     ------
     InputError
-        On inadmissible noise, frames or numbers of values.
+        On inadmissible noise, frames or values.
     """
     if not (np.isfinite(noise_mm) and noise_mm >= 0.0):
         raise InputError(f"noise of {noise_mm} mm, expected >= 0")
@@ -355,10 +364,11 @@ def simulate_observation(
             f"{', '.join(parameters)}"
         )
     require_finite(values, "the true values")
-    prediction = ObservedFrames(model, tuple(frames))(values)
+    require_frames(frames)
+    prediction = model(values)
     if not prediction.converged:
         return TwinData(None, None, f"no synthetic observation: {prediction.reason}")
-    positions = prediction.y.reshape(len(frames), -1, 3)
+    positions = _selected(prediction.y, frames).reshape(len(frames), -1, 3)
     noise = noise_mm * rng.standard_normal(positions.shape) if noise_mm else 0.0
     observation = Observation(tuple(frames), positions + noise, np.asarray(variance))
     return TwinData(observation, Truth(tuple(parameters), values, positions), prediction.reason)

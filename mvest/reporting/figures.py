@@ -88,8 +88,12 @@ def valve_figure(fields: Path) -> Figure:
         raise InputError(f"{fields}: no fields of a valve ({error})") from error
     figure = Figure(figsize=(8.4, 6.4), layout="constrained")
     tissue = np.array([_rgb(COLOURS[r % len(COLOURS)]) for r in region])
-    largest = float(distance.max())
-    norm = Normalize(0.0, largest if largest > 0 else 1.0)
+    unit, factor = next(
+        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * distance.max() >= 0.1),
+        ("nm", 1e6),
+    )
+    distance = factor * distance
+    norm = Normalize(0.0, max(float(distance.max()), 1e-3))
     shown = ScalarMappable(norm, DISTANCE_MAP)
     coloured = shown.to_rgba(distance[triangles].mean(axis=1))[:, :3]
     columns = (("open", rest, tissue), ("closed", closed, coloured))
@@ -103,7 +107,7 @@ def valve_figure(fields: Path) -> Figure:
             panel.set_title(f"{frame}, {view}", fontsize=10)
             axes.append(panel)
     bar = figure.colorbar(shown, ax=[axes[1], axes[3]], shrink=0.6, pad=0.02)
-    bar.set_label("distance, fitted to observed [mm]")
+    bar.set_label(f"distance, fitted to observed [{unit}]")
     return figure
 
 
@@ -144,7 +148,7 @@ def _draw(
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     light = LightSource(azdeg=225, altdeg=55).direction
     # Both sides of a leaflet are seen: what faces away is lit as if it faced the light.
-    shade = 0.45 + 0.55 * np.abs(normal @ light)
+    shade = 0.6 + 0.4 * np.abs(normal @ light)
     faces = Poly3DCollection(corners, facecolors=colours * shade[:, None], edgecolors="none")
     faces.set_antialiased(False)
     axes.add_collection3d(faces)
