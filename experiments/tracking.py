@@ -50,9 +50,7 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> tuple[MlflowC
     MvestError
         If the store cannot be opened.
     """
-    from mlflow.exceptions import MlflowException
     from mlflow.tracking import MlflowClient
-    from sqlalchemy.exc import SQLAlchemyError
 
     _quieten()
 
@@ -67,7 +65,7 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> tuple[MlflowC
         if found is not None:
             return client, found.experiment_id
         return client, client.create_experiment(experiment, artifact_location=artifacts)
-    except (MlflowException, SQLAlchemyError, OSError) as error:
+    except Exception as error:  # whatever the driver of the store raises
         raise MvestError(f"tracking store {place}: {_first_line(error)}") from error
 
 
@@ -96,7 +94,6 @@ def log_run(
         config["tracking"]["uri"], Path(config["paths"]["outputs"]), record["experiment"]
     )
     from mlflow.entities import Metric, Param, RunTag
-    from mlflow.exceptions import MlflowException
 
     provenance = record["provenance"]
     begin = int(1000 * started)
@@ -124,7 +121,7 @@ def log_run(
             client.log_artifact(run_id, str(file))
         finished = record["status"] == "converged"
         client.set_terminated(run_id, "FINISHED" if finished else "FAILED", end_time=end)
-    except (MlflowException, OSError) as error:
+    except Exception as error:  # whatever the driver of the store raises
         raise MvestError(f"not logged to MLflow: {_first_line(error)}") from error
 
 

@@ -14,8 +14,6 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
-from mpl_toolkits.mplot3d.axes3d import Axes3D  # type: ignore[import-untyped]
 
 from mvest.errors import InputError
 from mvest.reporting.files import provenance_line, write_with
@@ -98,10 +96,10 @@ def valve_figure(fields: Path) -> Figure:
     coloured = shown.to_rgba(distance[triangles].mean(axis=1))[:, :3]
     columns = (("open", rest, tissue), ("closed", closed, coloured))
     span = (np.minimum(rest.min(0), closed.min(0)), np.maximum(rest.max(0), closed.max(0)))
-    axes: list[Axes3D] = []
+    axes = []
     for row, (view, elevation, azimuth) in enumerate(VIEWS):
         for column, (frame, points, colours) in enumerate(columns):
-            panel: Axes3D = figure.add_subplot(2, 2, 2 * row + column + 1, projection="3d")
+            panel = figure.add_subplot(2, 2, 2 * row + column + 1, projection="3d")
             _draw(panel, points, triangles, colours, span)
             panel.view_init(elevation, azimuth)
             panel.set_title(f"{frame}, {view}", fontsize=10)
@@ -137,7 +135,7 @@ def save_figure(base: Path, figure: Figure, record: Mapping[str, Any]) -> list[P
 
 
 def _draw(
-    axes: Axes3D,
+    axes: Any,
     points: FloatArray,
     triangles: IntArray,
     colours: FloatArray,
@@ -149,14 +147,16 @@ def _draw(
     light = LightSource(azdeg=225, altdeg=55).direction
     # Both sides of a leaflet are seen: what faces away is lit as if it faced the light.
     shade = 0.6 + 0.4 * np.abs(normal @ light)
-    faces = Poly3DCollection(corners, facecolors=colours * shade[:, None], edgecolors="none")
-    faces.set_antialiased(False)
-    axes.add_collection3d(faces)
+    # The midsurface folds over itself seen from above; its own triangles are drawn, none are made.
+    faces = axes.plot_trisurf(*points.T, triangles=triangles, shade=False, antialiased=False)
+    faces.set_facecolor(colours * shade[:, None])
+    faces.set_edgecolor("none")
+    faces.set_rasterized(True)
     low, high = span
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
-    axes.set_box_aspect(tuple(high - low), zoom=1.25)
+    axes.set_box_aspect(tuple(high - low), zoom=1.45)
     axes.set_proj_type("ortho")
     axes.set_axis_off()
 
