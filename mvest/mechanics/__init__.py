@@ -27,9 +27,9 @@ A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at 
 >>> tetrahedra[volume < 0] = tetrahedra[volume < 0][:, [0, 1, 3, 2]]
 >>> under = [f for f in outer_faces(tetrahedra, "tet4") if np.all(nodes[f, 2] == 0)]
 >>> rim = np.flatnonzero((nodes[:, :2].min(axis=1) == 0) | (nodes[:, :2].max(axis=1) == 20))
->>> rubber = TransverselyIsotropic.isotropic(E=2.0, nu=0.45)
->>> sheet = simulate_body(nodes, tetrahedra, "tet4", material=rubber, fixed_nodes=rim,
-...     pressure_faces=under, pressure=0.016, times=[0.01, 0.02, 0.05, 0.1])
+>>> sheet = simulate_body(nodes, tetrahedra, "tet4", fixed_nodes=rim, pressure_faces=under,
+...     material=TransverselyIsotropic.isotropic(E=2.0, nu=0.45), pressure=0.016,
+...     times=[0.01, 0.02, 0.05, 0.1])
 >>> sheet.reason.value, sheet.frames.shape
 ('completed', (5, 243, 3))
 """

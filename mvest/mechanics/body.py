@@ -111,9 +111,9 @@ def simulate_body(
     (True, (11, 338, 3))
     """
     points, cells = np.asarray(nodes, dtype=float), np.asarray(elements)
-    mesh = _mesh(points, cells, element_type, material, fibre, region, pressure_faces)
+    materials = _materials(material)
+    mesh = _mesh(points, cells, element_type, materials, fibre, region, pressure_faces)
     _check_pressure_faces(mesh)
-    materials = (material,) if isinstance(material, TransverselyIsotropic) else tuple(material)
     fixed = _fixed(fixed_nodes, len(mesh.nodes))
     system = System(
         Solid(mesh, BiotLaw.of(materials), density=density),
@@ -140,19 +140,20 @@ def _mesh(
     nodes: FloatArray,
     elements: IntArray,
     element_type: str,
-    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
+    materials: tuple[TransverselyIsotropic, ...],
     fibre: ArrayLike | None,
     region: ArrayLike | None,
     pressure_faces: ArrayLike | None,
 ) -> SolidMesh:
-    materials = (material,) if isinstance(material, TransverselyIsotropic) else tuple(material)
-    if not materials or not all(isinstance(m, TransverselyIsotropic) for m in materials):
-        raise MaterialError("material must be a TransverselyIsotropic or a sequence of them")
     reference = element(element_type)
+    if nodes.ndim != 2 or nodes.shape[1] != 3 or not np.isfinite(nodes).all():
+        raise InputError(f"nodes: shape {nodes.shape}, expected finite (n, 3) mm")
     if elements.ndim != 2 or elements.shape[1] != reference.n_nodes or elements.size == 0:
         raise InputError(
             f"elements: shape {elements.shape}, expected (m, {reference.n_nodes}) of {element_type}"
         )
+    if not np.issubdtype(elements.dtype, np.integer):
+        raise InputError(f"elements: {elements.dtype}, expected integers")
     if region is None and len(materials) > 1:
         raise InputError(f"{len(materials)} materials need the region (m,) of each element")
     if fibre is None:
@@ -175,6 +176,15 @@ def _mesh(
         if pressure_faces is None
         else np.asarray(pressure_faces),
     )
+
+
+def _materials(
+    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
+) -> tuple[TransverselyIsotropic, ...]:
+    given = tuple(material) if isinstance(material, Sequence) else (material,)
+    if not given or not all(isinstance(m, TransverselyIsotropic) for m in given):
+        raise MaterialError("material must be a TransverselyIsotropic or a sequence of them")
+    return given
 
 
 def _is_isotropic(material: TransverselyIsotropic) -> bool:

@@ -108,7 +108,9 @@ def sandwich(
         np.concatenate([faces[level < 0.01], faces[level > 0.99] + n]),
     )  # fmt: skip
     law = BiotLaw.of(
-        tuple(TransverselyIsotropic.from_ratio(e, 1.5, 0.45, PoissonReading.LITERAL) for e in moduli)
+        tuple(
+            TransverselyIsotropic.from_ratio(e, 1.5, 0.45, PoissonReading.LITERAL) for e in moduli
+        )
     )
     line = np.linspace(0, SIDE, samples)
     plane = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -141,6 +143,8 @@ def sandwich(
 
     def loading(t):
         share = min(t / 0.06, 1.0)
-        return Loads(pressure=0.009 * share, tips=tips + [0, 0, 0.5 * share], hinge=target, fixed=held)
+        return Loads(
+            pressure=0.009 * share, tips=tips + [0, 0, 0.5 * share], hinge=target, fixed=held
+        )
 
     return system, loading

@@ -96,9 +96,7 @@ def stretched(mesh, material, stress):
     corners = [int(np.argmin(mesh.nodes @ d)) for d in ([1, 1, 1], [-3, 1, 1], [1, -3, 1])]
     points = point_masses(len(mesh.nodes))
     hold = type(points)(points.nodes[corners], points.weights[corners], points.host[corners])
-    system = System(
-        Solid(mesh, BiotLaw.of((material,))), hinge=Hinge(hold, np.full(3, 1e-9))
-    )
+    system = System(Solid(mesh, BiotLaw.of((material,))), hinge=Hinge(hold, np.full(3, 1e-9)))
     result = simulate(
         system,
         lambda t: Loads(body_force=loads, hinge=mesh.nodes[corners]),
@@ -142,9 +140,7 @@ def test_tension_along_the_fibre_recovers_E_f_and_nu_fp(element_type, angle, rea
 def test_tension_across_the_fibre_recovers_E_p(element_type, reading):
     # T_22 = E_p (lambda - 1); contraction nu_pp across and nu_fp E_p / E_f along the fibre.
     material = MATERIALS[reading]
-    strain = principal(
-        stretched(block(element_type, (2, 2, 1)), material, np.diag([0, 0.3, 0.0]))
-    )
+    strain = principal(stretched(block(element_type, (2, 2, 1)), material, np.diag([0, 0.3, 0.0])))
     assert 0.3 / strain[1, 1] == pytest.approx(material.E_p, rel=1e-6)
     assert -strain[2, 2] / strain[1, 1] == pytest.approx(material.nu_pp, rel=1e-6)
     assert -strain[0, 0] / strain[1, 1] == pytest.approx(0.488 / 2.651, rel=1e-6)
@@ -233,9 +229,7 @@ def test_the_term_of_the_non_commuting_stretch_is_there():
     green = np.array([0.1, -0.05, 0.0, 0.0, 0.0, 0.2])
     for name, present in (("A", True), ("isotropic", False)):
         law = BiotLaw.of((MATERIALS[name],))
-        s, _ = law.response(
-            green[None, None], np.zeros(1, dtype=int), np.zeros((1, 1, 6)), 0.0
-        )
+        s, _ = law.response(green[None, None], np.zeros(1, dtype=int), np.zeros((1, 1, 6)), 0.0)
         s = s[0, 0]
         e = law.strain(green[None, None])[0, 0]
         u = np.eye(3) + 0.5 * np.array(

@@ -27,7 +27,9 @@ def check(residual, tangent_times_direction, x, direction, final=1e-7):
         size = np.linalg.norm(tangent_times_direction)
         errors.append(np.linalg.norm(difference - tangent_times_direction) / size)
     assert errors[2] < final
-    if errors[0] > 1e-8:  # below, the force is linear along the direction and only round-off is left
+    if (
+        errors[0] > 1e-8
+    ):  # below, the force is linear along the direction and only round-off is left
         assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
     return errors
 
@@ -99,9 +101,7 @@ def soft_block():
     return mesh, Solid(mesh, law, enhanced=False)
 
 
-@pytest.mark.parametrize(
-    "rest", [(3.0, 3.0), (7.0, 7.8)], ids=["taut", "slack and within the toe"]
-)
+@pytest.mark.parametrize("rest", [(3.0, 3.0), (7.0, 7.8)], ids=["taut", "slack and within the toe"])
 def test_chords(rest):
     mesh, solid = soft_block()
     ends = embed(mesh, np.array([[1.0, 1.0, 1.0], [3.0, 2.0, 1.0]]))

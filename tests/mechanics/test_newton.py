@@ -1,0 +1,163 @@
+"""Newton's method: quadratic where it converges, a value with a reason where it does not."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.mechanics import (
+    BiotLaw,
+    Damping,
+    Loads,
+    NewtonSettings,
+    Parameter,
+    Reason,
+    Step,
+    System,
+    box,
+    outer_faces,
+    simulate,
+    simulate_body,
+)
+from mvest.mechanics.solid import Solid
+from tests.mechanics.bodies import MATERIALS, block, sandwich
+
+
+def sheet(element_type="hex18", **changes):
+    nodes, elements = box(element_type, (4, 4, 1), (20.0, 20.0, 1.3))
+    faces = outer_faces(elements, element_type)
+    settings = {
+        "material": MATERIALS["A"],
+        "fibre": (0.8, 0.6, 0.0),
+        "fixed_nodes": np.flatnonzero(np.any((nodes[:, :2] == 0) | (nodes[:, :2] == 20), axis=1)),
+        "pressure_faces": faces[np.all(nodes[faces][:, :, 2] == 0, axis=1)],
+        "pressure": [(0.0, 0.0), (0.05, 0.016)],
+        "times": [0.02, 0.04, 0.06],
+    }
+    return simulate_body(nodes, elements, element_type, **(settings | changes))
+
+
+def assert_quadratic(residuals):
+    """Two iterations together at least cube the residual, down to round-off.
+
+    Quadratic convergence squares it twice; membrane and bending take turns, so that single
+    iterations may gain less. A tangent wrong by more than about half a per cent fails: linear convergence with
+    rate q needs q^2 r < 5 r^3. Below 2e-10 the elimination of the enhanced strains is felt.
+    """
+    r = residuals
+    small = [k for k in range(1, len(r) - 2) if r[k] < 5e-2]
+    for k in small:
+        assert r[k + 2] < 5 * r[k] ** 3 + 2e-10
+    return len(small)
+
+
+@pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge12"])
+@pytest.mark.parametrize("static", [False, True])
+def test_newton_converges_quadratically(element_type, static):
+    # Without the load stiffness, the rotation derivative or the Schur complement of the enhanced
+    # strain convergence is linear.
+    result = sheet(element_type, static=static, newton=NewtonSettings(tolerance=1e-9))
+    assert result.converged
+    assert all(len(record.residuals) <= 7 for record in result.records)
+    assert sum(assert_quadratic(record.residuals) for record in result.records) >= 2
+
+
+def test_newton_converges_quadratically_with_contact():
+    system, loading = sandwich(cells=2, samples=11)
+    steps = [Step(t) for t in (0.02, 0.04, 0.06, 0.1)]
+    result = simulate(system, loading, steps)
+    assert result.converged
+    assert result.records[-1].active_contacts > 20
+    assert sum(assert_quadratic(record.residuals) for record in result.records) >= 4
+
+
+def test_a_run_that_cannot_converge_is_a_value():
+    result = sheet(
+        newton=NewtonSettings(max_iterations=1, max_halvings=0),
+        parameters=[Parameter("E_f.0", 6.23)],
+    )
+    assert not result.converged
+    assert result.reason is Reason.NO_CONVERGENCE
+    assert "did not converge" in result.reason.value
+    # Only the given state: no geometry that was not reached.
+    assert result.frames.shape[0] == len(result.times) == len(result.sensitivities) == 1
+    assert np.all(result.sensitivities == 0)
+
+
+def test_a_failure_on_the_way_keeps_the_steps_before_it():
+    result = sheet(
+        pressure=[(0.0, 0.0), (0.03, 0.001), (0.04, 50.0)],
+        times=[0.01, 0.02, 0.03, 0.04],
+        newton=NewtonSettings(max_iterations=6, max_halvings=1),
+    )
+    assert result.reason is Reason.NO_CONVERGENCE
+    assert result.times.tolist() == [0.0, 0.01, 0.02, 0.03]
+    assert len(result.frames) == 4
+
+
+def test_loads_that_are_not_numbers_end_the_run_with_a_reason():
+    result = sheet(pressure=lambda t: 0.01 if t < 0.03 else float("nan"))
+    assert not result.converged
+    assert result.times.tolist() == [0.0, 0.02]
+    assert np.isfinite(result.frames).all()
+
+
+def test_a_body_without_support_has_no_static_equilibrium():
+    # Six rigid motions without stiffness: the loads are not in balance, so there is no solution.
+    result = sheet(static=True, fixed_nodes=[], newton=NewtonSettings(max_iterations=5))
+    assert not result.converged
+    assert len(result.frames) == 1
+
+
+def test_failing_steps_are_halved_and_the_frames_stay_at_the_asked_times():
+    settings = NewtonSettings(max_iterations=4, max_halvings=8)
+    times = [0.03, 0.06]
+    result = sheet(times=times, pressure=[(0.0, 0.0), (0.06, 0.1)], newton=settings)
+    assert result.converged
+    assert max(r.halvings for r in result.records) > 0
+    assert result.times.tolist() == [0.0, *times]
+    # The substeps fill the steps without gap or overlap.
+    assert sum(r.dt for r in result.records) == pytest.approx(0.06, rel=1e-12)
+    np.testing.assert_allclose(np.cumsum([r.dt for r in result.records])[-1], result.times[-1])
+
+
+def test_single_solve_takes_one_linear_solve_per_step():
+    # Near the converged run, but not on it.
+    single = sheet(newton=NewtonSettings(single_solve=True))
+    exact = sheet()
+    assert single.converged
+    assert all(len(r.residuals) == 2 for r in single.records)
+    distance = np.abs(single.frames[-1] - exact.frames[-1]).max()
+    assert 1e-6 < distance < 0.5
+
+
+def test_progress_is_reported_after_each_step():
+    mesh = block("hex18", (2, 1, 1))
+    system = System(Solid(mesh, BiotLaw.of((MATERIALS["A"],))), fixed_nodes=np.arange(3))
+    seen = []
+    simulate(
+        system,
+        lambda t: Loads(fixed=mesh.nodes[:3]),
+        [Step(0.1), Step(0.2)],
+        on_step=lambda t, n: seen.append((t, n)),
+    )
+    assert [t for t, _ in seen] == [0.1, 0.2]
+
+
+@pytest.mark.parametrize("times", [[], [0.0], [0.1, 0.1], [0.2, 0.1], [-1.0], [0.1, float("nan")]])
+def test_times_must_increase_from_zero(times):
+    with pytest.raises(InputError, match="time steps must increase"):
+        sheet(times=times)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"tolerance": 0.0}, {"max_iterations": 0}, {"max_halvings": -1}]
+)
+def test_inadmissible_newton_settings(settings):
+    with pytest.raises(InputError, match="Newton settings"):
+        NewtonSettings(**settings)
+
+
+@pytest.mark.parametrize("settings", [{"alpha": -1.0}, {"beta": float("nan")}])
+def test_inadmissible_damping(settings):
+    with pytest.raises(InputError, match="damping"):
+        Damping(**settings)

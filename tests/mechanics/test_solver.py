@@ -1,0 +1,104 @@
+"""Linear solvers: the same result whichever is installed, for one and for many right-hand sides."""
+
+import builtins
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from mvest.errors import InputError
+from mvest.mechanics.solver import LinearSolver, SuperLUSolver, linear_solver
+from tests.mechanics.bodies import sandwich
+
+
+def available():
+    try:
+        return [linear_solver("pardiso").name, "superlu"]
+    except InputError:
+        return ["superlu"]
+
+
+@pytest.fixture(scope="module")
+def tangent():
+    """Tangent of two sheets under follower pressure (not symmetric) and a right-hand side."""
+    system, loading = sandwich(cells=2, contact=False)
+    x = system.solid.mesh.nodes + 0.01 * np.sin(np.arange(3 * system.n)).reshape(-1, 3)
+    strain = system.solid.initial_strain()
+    blocks = system.evaluate(x, loading(0.06), None, strain, 0.0, tangent=True).blocks
+    matrix = system.matrix(blocks, 0.0)
+    assert abs(matrix - matrix.T).max() > 1e-6
+    return matrix, np.random.default_rng(0).normal(size=(matrix.shape[0], 4))
+
+
+@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("columns", [None, 1, 2, 4])
+def test_solutions_solve(tangent, name, columns):
+    matrix, right = tangent
+    right = right[:, 0] if columns is None else right[:, :columns]
+    before = right.copy()
+    solver: LinearSolver = linear_solver(name)
+    solver.factorize(matrix)
+    for _ in range(2):  # the factor serves again, and the right-hand side is left alone
+        solution = solver.solve(right)
+        assert solution.shape == right.shape
+        np.testing.assert_allclose(matrix @ solution, right, atol=1e-9)
+    np.testing.assert_array_equal(right, before)
+
+
+@pytest.mark.parametrize("name", available())
+def test_a_factor_is_renewed_with_the_matrix(tangent, name):
+    matrix, right = tangent
+    solver = linear_solver(name)
+    solver.factorize(matrix)
+    solver.factorize(2 * matrix)  # the same pattern
+    np.testing.assert_allclose(matrix @ solver.solve(right), 0.5 * right, atol=1e-9)
+    other = sparse.diags_array(np.arange(1.0, 8.0)).tocsr()  # another pattern and size
+    solver.factorize(other)
+    np.testing.assert_allclose(solver.solve(np.ones(7)), 1 / np.arange(1.0, 8.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", available())
+def test_a_row_major_slice_is_a_right_hand_side_as_well(tangent, name):
+    matrix, right = tangent
+    solver = linear_solver(name)
+    solver.factorize(matrix)
+    wide = np.ascontiguousarray(np.hstack([right, right]))
+    np.testing.assert_allclose(
+        solver.solve(wide[:, ::2]), solver.solve(wide[:, ::2].copy(order="F")), atol=1e-12
+    )
+
+
+def test_all_solvers_agree(tangent):
+    matrix, right = tangent
+    results = []
+    for name in available():
+        solver = linear_solver(name)
+        solver.factorize(matrix)
+        results.append(solver.solve(right))
+    for other in results[1:]:
+        np.testing.assert_allclose(other, results[0], atol=1e-9 * np.abs(results[0]).max())
+
+
+@pytest.mark.parametrize("name", available())
+def test_solving_before_factorising_is_an_error(name):
+    with pytest.raises(InputError, match="before factorize"):
+        linear_solver(name).solve(np.ones(3))
+
+
+def test_unknown_solver():
+    with pytest.raises(InputError, match="known: auto, pardiso, superlu"):
+        linear_solver("umfpack")
+
+
+def test_without_pardiso_auto_falls_back_and_asking_for_it_says_what_is_missing(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name == "pypardiso":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    assert isinstance(linear_solver("auto"), SuperLUSolver)
+    with pytest.raises(InputError, match="needs the package pypardiso"):
+        linear_solver("pardiso")
