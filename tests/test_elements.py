@@ -88,7 +88,7 @@ def test_outside_measures_the_distance_in_reference_coordinates(name):
     corners = e.node_coordinates[np.abs(e.node_coordinates - 0.5).min(axis=1) > 0.4]
     corners = corners[np.isin(np.abs(corners), [0.0, 1.0]).all(axis=1)]
     assert np.abs(e.outside(corners[np.abs(corners).max(axis=1) > 0])).max() < 1e-15
-    assert np.all(e.outside(e.centre + [[0, 0, 3.0]]) > 0)
+    assert np.all(e.outside(e.centre + np.array([[0, 0, 3.0]])) > 0)
 
 
 @pytest.mark.parametrize("name", ["hex18", "wedge12", "hex27"])
@@ -104,10 +104,10 @@ def test_enhanced_modes_do_no_work_on_a_constant_stress(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_outer_faces_enclose_the_volume(name):
-    # Divergence theorem: integral of z n_z over the closed surface is the volume. Of layered elements
-    # only top and bottom are faces, but on a block these are the ones with n_z != 0.
+    # Divergence theorem: integral of z n_z over the closed surface is the volume. Of layered
+    # elements only top and bottom are faces, but on a block these are the ones with n_z != 0.
     nodes, elements = box(name, (2, 3, 2), (2.0, 3.0, 1.5))
-    nodes = nodes + [0.3, -0.2, 0.4]
+    nodes += np.array([0.3, -0.2, 0.4])
     faces = outer_faces(elements, name)
     face = FACES[ELEMENTS[name].face]
     x = nodes[faces]
@@ -138,5 +138,5 @@ def test_top_face_is_the_face_at_zeta_one(name):
 
 
 def test_an_unknown_element_names_the_known_ones():
-    with pytest.raises(InputError, match="hex20.*known elements: tet4, tet10"):
+    with pytest.raises(InputError, match=r"hex20.*known elements: tet4, tet10"):
         element("hex20")

@@ -99,7 +99,7 @@ def sandwich(
     faces = outer_faces(cells_of_one, element_type)
     level = one[faces][:, :, 2].mean(axis=1)
     n = len(one)
-    nodes = np.concatenate([one, one + [0, 0, GAP]])
+    nodes = np.concatenate([one, one + np.array([0, 0, GAP])])
     elements = np.concatenate([cells_of_one, cells_of_one + n])
     region = np.repeat([0, 1], len(cells_of_one))
     mesh = SolidMesh(
@@ -144,7 +144,10 @@ def sandwich(
     def loading(t):
         share = min(t / 0.06, 1.0)
         return Loads(
-            pressure=0.009 * share, tips=tips + [0, 0, 0.5 * share], hinge=target, fixed=held
+            pressure=0.009 * share,
+            tips=tips + np.array([0, 0, 0.5 * share]),
+            hinge=target,
+            fixed=held,
         )
 
     return system, loading

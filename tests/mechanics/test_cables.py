@@ -32,7 +32,8 @@ def test_slope_is_the_derivative_of_the_force():
 @pytest.mark.parametrize("end", [0.0, TOE])
 def test_force_is_twice_continuously_differentiable_at_both_ends_of_the_toe(end):
     # The jump of a function over a gap 2h falls as h if the function is continuous; for the third
-    # derivative it does not. Slope: jump 0; curvature, by one-sided differences of the slope: jump 0.
+    # derivative it does not. Slope: jump 0; curvature, by one-sided differences of the slope: jump
+    # 0.
     for h in (1e-5, 1e-6):
         force, slope = cable_force(np.array([end - h, end, end + h]), TOE)
         assert abs(force[2] - force[0]) < 2.1 * h

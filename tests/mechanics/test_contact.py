@@ -44,7 +44,7 @@ def pair(distance):
     return contact, contact.search(y), y
 
 
-# -- the law ----------------------------------------------------------------------------------------
+# -- the law ---------------------------------------------------------------------------------------
 def pressure_between_sheets(distance, spacing):
     """Force per area on a point above a large regular sheet of points, at an arbitrary offset."""
     n = int(np.ceil((H + 0.5) / spacing))
@@ -78,7 +78,7 @@ def test_no_pressure_beyond_activation():
     assert pressure_between_sheets(H + 0.01, 0.2) == 0.0
 
 
-# -- smoothness -------------------------------------------------------------------------------------
+# -- smoothness ------------------------------------------------------------------------------------
 def test_force_vanishes_with_the_third_order_at_activation():
     # phi = p / (2 pi r) with p ~ (h - r)^4, so phi' ~ (h - r)^3: the force and its first two
     # derivatives are continuous at activation (C3 in the energy). Order by a log-log fit.
@@ -96,7 +96,7 @@ def test_the_energy_of_a_pair_grows_without_bound_at_the_barrier():
     assert energy[3] / energy[2] == pytest.approx(100, rel=0.01)
 
 
-# -- forces and Hessian -----------------------------------------------------------------------------
+# -- forces and Hessian ----------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def cloud():
     """Two rough sheets of points in contact, each point its own host."""
@@ -167,7 +167,7 @@ def test_contact_does_not_know_directions(cloud):
     )
 
 
-# -- the stress-free state --------------------------------------------------------------------------
+# -- the stress-free state -------------------------------------------------------------------------
 @pytest.mark.parametrize("spacing", [0.3, 0.7, 1.5])
 def test_a_sheet_at_rest_exerts_no_force(spacing):
     line = spacing * np.arange(8)
@@ -187,7 +187,7 @@ def test_sheets_that_are_close_at_rest_exert_no_force():
     assert np.all(contact.forces(contact.search(rest), rest) == 0)
 
 
-# -- search and passing -----------------------------------------------------------------------------
+# -- search and passing ----------------------------------------------------------------------------
 def test_the_search_finds_all_pairs_that_can_become_active_before_it_is_stale():
     random = np.random.default_rng(8)
     y = random.uniform(0, 6, (150, 3))
@@ -197,7 +197,7 @@ def test_the_search_finds_all_pairs_that_can_become_active_before_it_is_stale():
     step = random.normal(size=y.shape)
     moved = y + 0.299 * step / np.linalg.norm(step, axis=1, keepdims=True)
     assert not contact.stale(pairs, moved)
-    assert contact.stale(pairs, y + [0.31, 0, 0])
+    assert contact.stale(pairs, y + np.array([0.31, 0, 0]))
     fresh = contact.search(moved)
     assert contact.active(pairs, moved) == contact.active(fresh, moved)
     np.testing.assert_allclose(

@@ -15,7 +15,7 @@ READING_A, READING_C = PoissonReading.LITERAL, PoissonReading.NEARLY_INCOMPRESSI
 ANTERIOR, POSTERIOR = (6.23, 2.35, 2.09), (2.09, 1.89, 0.70)
 
 
-# -- admissibility ----------------------------------------------------------------------------------
+# -- admissibility ---------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("E_f", "ratio", "reading", "bulk"),
     [
@@ -78,7 +78,7 @@ def test_inadmissible_isotropic_ratio(nu):
         TransverselyIsotropic.isotropic(1.0, nu)
 
 
-# -- the moduli come back ---------------------------------------------------------------------------
+# -- the moduli come back --------------------------------------------------------------------------
 def stretched(mesh, material, stress):
     """Deformation gradient of a body under the nominal stress P ``(3, 3)`` on its whole surface.
 
@@ -168,9 +168,9 @@ def mean_stress(mesh, material, f):
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
 @pytest.mark.parametrize("plane", [(0, 1), (0, 2), (1, 2)])
 def test_shear_recovers_G(element_type, plane):
-    # Pure shear U = I + g/2 (e_i e_j + e_j e_i): the Biot strain is g/2 off the diagonal, the stress
-    # G g commutes with U, so P_ij = G g exactly. Simple shear F = I + g e_i e_j gives the same up to
-    # the square of g (its rotation and normal strains are of higher order).
+    # Pure shear U = I + g/2 (e_i e_j + e_j e_i): the Biot strain is g/2 off the diagonal, the
+    # stress G g commutes with U, so P_ij = G g exactly. Simple shear F = I + g e_i e_j gives the
+    # same up to the square of g (its rotation and normal strains are of higher order).
     material, mesh = MATERIALS["A"], block(element_type, (2, 2, 1), distortion=(0.2, 0.2, 0))
     i, j = plane
     expected = material.G if i == 0 else material.E_p / (2 * (1 + material.nu_pp))
@@ -187,7 +187,7 @@ def test_shear_recovers_G(element_type, plane):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.05)
 
 
-# -- energy, stress, tangent of the law itself ------------------------------------------------------
+# -- energy, stress, tangent of the law itself -----------------------------------------------------
 def energy(law, green):
     e = law.strain(green)
     return 0.5 * np.einsum("eqi,ij,eqj->eq", e, law.stiffness[0], e)
@@ -224,8 +224,9 @@ def test_biot_strain_is_the_square_root_of_the_deformation():
 
 
 def test_the_term_of_the_non_commuting_stretch_is_there():
-    # The usual corotational force drops the part of S that comes from U and C : e not commuting. For
-    # a shear of the aligned anisotropic law that part is not small; for the isotropic law it is zero.
+    # The usual corotational force drops the part of S that comes from U and C : e not commuting.
+    # For a shear of the aligned anisotropic law that part is not small; for the isotropic law it is
+    # zero.
     green = np.array([0.1, -0.05, 0.0, 0.0, 0.0, 0.2])
     for name, present in (("A", True), ("isotropic", False)):
         law = BiotLaw.of((MATERIALS[name],))

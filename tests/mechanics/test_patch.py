@@ -38,9 +38,10 @@ def patch(mesh, material):
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
 @pytest.mark.parametrize("material", MATERIALS)
 def test_affine_displacement_is_reproduced_on_a_distorted_mesh(element_type, material):
-    # Inner nodes solved for from the boundary must lie on the affine map, and the stress be constant.
-    # Layered elements keep the fibre within the layer, so only tetrahedra and the isotropic law admit
-    # an arbitrary distortion; the others are distorted in the plane, with the fibre turned in it.
+    # Inner nodes solved for from the boundary must lie on the affine map, and the stress be
+    # constant. Layered elements keep the fibre within the layer, so only tetrahedra and the
+    # isotropic law admit an arbitrary distortion; the others are distorted in the plane, with the
+    # fibre turned in it.
     tetrahedra = element_type.startswith("tet")
     fibre = (0.7, 0.5, 0.4) if tetrahedra else (0.8, 0.6, 0.0)
     across = 0.25 if tetrahedra or material == "isotropic" else 0.0
@@ -78,8 +79,9 @@ def test_rigid_rotation_of_a_deformed_body_turns_its_forces(element_type):
 
 @pytest.mark.parametrize("element_type", ELEMENT_NAMES)
 def test_rigid_rotation_between_two_steps_dissipates_nothing(element_type):
-    # Damping acts on the rate of the Biot strain, which a rotation of the deformed body leaves alone:
-    # with the strain of the start of the step as history the damped force is the elastic one.
+    # Damping acts on the rate of the Biot strain, which a rotation of the deformed body leaves
+    # alone: with the strain of the start of the step as history the damped force is the elastic
+    # one.
     mesh = block(element_type, fibre=(0.8, 0.6, 0))
     solid = Solid(mesh, BiotLaw.of((MATERIALS["A"],)))
     x = mesh.nodes @ AFFINE.T

@@ -45,9 +45,9 @@ def reference():
 @pytest.mark.parametrize("name", NAMES)
 def test_sensitivities_agree_with_central_differences(reference, name):
     # Dynamic steps with damping (history of strain, velocity, position), then a static step, with
-    # cables taut and contact active. The error of central differences falls as h^2, so from h to h/4
-    # its ratio is 16, and the extrapolation (16 D(h/4) - D(h)) / 15 removes it. A missing history or
-    # load term leaves an error that does not fall.
+    # cables taut and contact active. The error of central differences falls as h^2, so from h to
+    # h/4 its ratio is 16, and the extrapolation (16 D(h/4) - D(h)) / 15 removes it. A missing
+    # history or load term leaves an error that does not fall.
     values = np.array([TRUE[n] for n in NAMES])
     k = NAMES.index(name)
     exact = reference.sensitivities[1:, k]

@@ -1,8 +1,8 @@
 """Tangents against differences of the forces, with the observed second-order decay of the error.
 
 Each part separately, then all together. A wrong tangent shows as an error that stops falling; a
-tangent that is right to a per cent would still converge, only slowly, which is why the order and the
-final size are asserted rather than a loose tolerance.
+tangent that is right to a per cent would still converge, only slowly, which is why the order and
+the final size are asserted rather than a loose tolerance.
 """
 
 import numpy as np
