@@ -10,3 +10,6 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 IntArray: TypeAlias = NDArray[np.int64]
 """Array of indices or counts."""
+
+BoolArray: TypeAlias = NDArray[np.bool_]
+"""Array of truth values."""

@@ -34,28 +34,40 @@ class Pattern:
     keys: IntArray
 
     @classmethod
-    def of(cls, n: int, groups: list[tuple[IntArray, IntArray]]) -> Pattern:
-        """Pattern that holds all groups; a group is ``(rows (g, r), columns (g, c))``.
+    def of(
+        cls, n: int, groups: list[IntArray], coupled: tuple[IntArray, IntArray] | None = None
+    ) -> Pattern:
+        """Pattern in which every group couples all its nodes with each other.
 
-        The pattern is symmetric and contains the diagonal.
+        Parameters
+        ----------
+        n : int
+            Number of nodes.
+        groups : list of ndarray
+            ``(g, k)`` nodes of each group.
+        coupled : tuple of ndarray, optional
+            ``(pairs (p, 2), group (g, k))``: rows of the second array that are coupled with each
+            other.
         """
-        keys = [np.arange(n, dtype=np.int64) * (n + 1)]
-        for rows, columns in groups:
-            key = np.unique(rows[:, :, None] * n + columns[:, None, :])
-            keys.append(key)
-            keys.append((key % n) * n + key // n)
-        return cls(n, np.unique(np.concatenate(keys)))
+        total = sparse.identity(n, format="csr", dtype=np.int32)
+        for nodes in groups:
+            incidence = _incidence(n, nodes)
+            total = total + incidence.T @ incidence
+        if coupled is not None and len(coupled[0]):
+            pairs, nodes = coupled
+            incidence = _incidence(n, nodes)
+            one = np.ones(len(pairs), dtype=np.int32)
+            both = sparse.csr_matrix((one, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes),) * 2)
+            total = total + incidence.T @ ((both + both.T) @ incidence)
+        total = total.tocsr()
+        total.sort_indices()
+        rows = np.repeat(np.arange(n, dtype=np.int64), np.diff(total.indptr))
+        return cls(n, rows * n + total.indices)
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Positions ``(g, r, c)`` of the blocks that couple ``rows (g, r)`` and ``columns (g, c)``."""
         key = rows[:, :, None] * self.n + columns[:, None, :]
         return np.searchsorted(self.keys, key)
-
-    def holds(self, rows: IntArray, columns: IntArray) -> bool:
-        """Whether all blocks of the groups are in the pattern."""
-        key = (rows[:, :, None] * self.n + columns[:, None, :]).ravel()
-        at = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
-        return bool(np.array_equal(self.keys[at], key))
 
     @property
     def diagonal(self) -> IntArray:
@@ -72,6 +84,13 @@ class Pattern:
         pointer = np.searchsorted(rows, np.arange(self.n + 1))
         size = 3 * self.n
         return sparse.bsr_matrix((blocks, columns, pointer), shape=(size, size)).tocsr()
+
+
+def _incidence(n: int, nodes: IntArray) -> sparse.csr_matrix:
+    """Incidence ``(g, n)`` of groups and nodes."""
+    rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    ones = np.ones(nodes.size, dtype=np.int32)
+    return sparse.csr_matrix((ones, (rows, nodes.ravel())), shape=(len(nodes), n))
 
 
 @nb.njit(cache=True)

@@ -347,6 +347,10 @@ class _Stepper:
         pairs = system.search_contact(x)
 
         def evaluate(at: FloatArray, tangent: bool) -> Evaluation:
+            nonlocal pairs
+            contact = system.contact
+            if contact is not None and pairs is not None and contact.stale(pairs, contact.points(at)):
+                pairs = system.search_contact(at)
             result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=tangent)
             inertial = mass_factor * mass * at - push
             result.residual += inertial
@@ -365,7 +369,10 @@ class _Stepper:
                 return _Solved(x, current, residuals, pairs)
             try:
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
-                d = -self.solver.solve(current.residual.ravel()).reshape(-1, 3)
+                # A forcing term of the size of the residual keeps the convergence quadratic
+                # (Dembo, Eisenstat and Steihaug 1982, SIAM J. Numer. Anal. 19:400).
+                forcing = min(1e-2, max(1e-9, residuals[-1]))
+                d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
                 raise _Failure(Reason.SINGULAR) from error
             if not np.isfinite(d).all():
@@ -374,13 +381,6 @@ class _Stepper:
                 # The factor of the converged state is kept for the sensitivities.
                 return _Solved(x, current, residuals, pairs)
             x, current = self._line_search(x, d, current, pairs, evaluate)
-            if system.contact is not None and pairs is not None:
-                y = system.contact.points(x)
-                if system.contact.stale(pairs, y):
-                    pairs = system.search_contact(x)
-                    current = evaluate(x, True)
-            if current.blocks is None:
-                current = evaluate(x, True)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
                 assert current.blocks is not None
@@ -401,10 +401,7 @@ class _Stepper:
         factor = min(1.0, self.newton.largest_move / max(float(np.abs(d).max()), 1e-300))
         if contact is not None and pairs is not None:
             y, dy = contact.points(x), contact.points(d)
-            factor = min(factor, contact.largest_step(pairs, y, factor * dy) * factor)
-            # Points outside the candidate list must not reach each other within the step.
-            moved = float(np.linalg.norm(dy, axis=1).max())
-            factor = min(factor, contact.skin / max(moved, 1e-300))
+            factor *= contact.largest_step(pairs, y, factor * dy)
         if self.newton.single_solve:
             return x + factor * d, evaluate(x + factor * d, True)
         norm = float(np.linalg.norm(current.residual))

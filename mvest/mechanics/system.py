@@ -23,6 +23,9 @@ from mvest.typing import FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
 
+CONTACT_MARGIN = 0.3
+"""mm before activation at which a pair of elements enters the sparsity pattern."""
+
 _NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 
 
@@ -130,31 +133,26 @@ class System:
             self.fixed_nodes.min() < 0 or self.fixed_nodes.max() >= self.n
         ):
             raise InputError(f"fixed_nodes must lie between 0 and {self.n - 1}")
-        self._contact_groups: set[tuple[int, int]] = set()
-        self._build_pattern()
+        self._slots: dict[tuple[int, int], int] = {}
+        self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     # -- sparsity -----------------------------------------------------------------------------------
-    def _static_groups(self) -> list[tuple[IntArray, IntArray]]:
-        elements = self.solid.mesh.elements
-        groups = [(elements, elements)]
+    def _static_groups(self) -> list[IntArray]:
+        groups = [self.solid.mesh.elements]
         if self.pressure is not None:
-            groups.append((self.pressure.faces, self.pressure.faces))
+            groups.append(self.pressure.faces)
         for part in (
             self.cables.patches if self.cables else None,
             self.hinge.points if self.hinge else None,
         ):
             if part is not None:
-                groups.append((part.nodes, part.nodes))
+                groups.append(part.nodes)
         return groups
 
-    def _build_pattern(self) -> None:
-        groups = self._static_groups()
-        if self.contact is not None and self._contact_groups:
-            hosts = np.array(sorted(self._contact_groups))
-            elements = self.solid.mesh.elements
-            groups.append((elements[hosts[:, 0]], elements[hosts[:, 1]]))
-        self.pattern = Pattern.of(self.n, groups)
+    def _build_pattern(self, hosts: IntArray) -> None:
+        """Pattern with contact between the pairs of elements ``hosts (g, 2)``."""
         elements = self.solid.mesh.elements
+        self.pattern = Pattern.of(self.n, self._static_groups(), (hosts, elements))
         self._at_elements = self.pattern.positions(elements, elements)
         if self.pressure is not None:
             self._at_faces = self.pattern.positions(self.pressure.faces, self.pressure.faces)
@@ -164,27 +162,33 @@ class System:
         if self.hinge is not None:
             nodes = self.hinge.points.nodes
             self._at_hinge = self.pattern.positions(nodes, nodes)
-        if self.contact is not None:
-            nodes = self.contact.points.nodes
-            self._at_points = self.pattern.positions(nodes, nodes)
+        first, second = elements[hosts[:, 0]], elements[hosts[:, 1]]
+        self._forward = self.pattern.positions(first, second)
+        self._backward = self.pattern.positions(second, first)
         self._at_diagonal = self.pattern.diagonal
         self._csr_order: IntArray | None = None
         self._matrix: sparse.csr_matrix | None = None
 
     def search_contact(self, x: FloatArray) -> ContactPairs | None:
-        """Candidate pairs at nodal positions ``x``; extends the sparsity pattern where needed."""
-        if self.contact is None:
-            return None
-        pairs = self.contact.search(self.contact.points(x))
-        new = {(int(a), int(b)) for a, b in pairs.hosts} - self._contact_groups
-        if new:
-            self._contact_groups |= new
-            self._build_pattern()
-        elements = self.solid.mesh.elements
-        a, b = elements[pairs.hosts[:, 0]], elements[pairs.hosts[:, 1]]
-        self._forward = self.pattern.positions(a, b)
-        self._backward = self.pattern.positions(b, a)
-        return pairs
+        """Candidate pairs at nodal positions ``x``."""
+        return None if self.contact is None else self.contact.search(self.contact.points(x))
+
+    def _contact_slots(self, pairs: ContactPairs, y: FloatArray) -> IntArray:
+        """Where the groups of ``pairs`` lie in the contact positions; renews the pattern if needed.
+
+        The pattern holds the groups that touch and those that are about to, and nothing else:
+        entries that are always zero would fill the factor.
+        """
+        assert self.contact is not None
+        hosts = list(map(tuple, pairs.hosts.tolist()))
+        touching = self.contact.touching(pairs, y)
+        if any(t and h not in self._slots for h, t in zip(hosts, touching, strict=True)):
+            near = self.contact.touching(pairs, y, CONTACT_MARGIN)
+            groups = pairs.hosts[near]
+            self._slots = {h: k for k, h in enumerate(map(tuple, groups.tolist()))}
+            self._build_pattern(groups)
+        slots = [self._slots.get(h, -1) if t else -1 for h, t in zip(hosts, touching, strict=True)]
+        return np.array(slots, dtype=np.int64)
 
     # -- evaluation ---------------------------------------------------------------------------------
     def evaluate(
@@ -203,7 +207,10 @@ class System:
         add_forces(residual, self.solid.mesh.elements, self.solid.forces(state))
         scale = float(np.linalg.norm(residual))
         blocks = None
+        slots = None
         if tangent:
+            if self.contact is not None and pairs is not None:
+                slots = self._contact_slots(pairs, self.contact.points(x))
             blocks = self.pattern.zeros()
             scatter_matrices(blocks, self._at_elements, self.solid.tangents(state))
         p = self.factors.pressure * loads.pressure
@@ -234,9 +241,9 @@ class System:
             y = points(x)
             force = self.contact.forces(pairs, y)
             add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
-            if blocks is not None:
+            if blocks is not None and slots is not None:
                 self.contact.add_tangent(
-                    pairs, y, blocks, self._forward, self._backward, self._at_points
+                    pairs, y, blocks, slots, self._forward, self._backward, self._at_elements
                 )
         return Evaluation(residual, scale, state, blocks)
 

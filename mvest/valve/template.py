@@ -41,7 +41,7 @@ class ChordLayout:
     marginal_s : float
     marginal_stiffness, basal_stiffness : float
         Axial stiffness EA, N.
-    slack : float
+    marginal_slack, basal_slack : float
         Rest length over the distance to the intended closed position; never below the open length.
     toe_strain : float
     """
@@ -51,7 +51,8 @@ class ChordLayout:
     marginal_s: float = 0.97
     marginal_stiffness: float = 16.0
     basal_stiffness: float = 16.0
-    slack: float = 0.91
+    marginal_slack: float = 0.97
+    basal_slack: float = 1.0
     toe_strain: float = 0.02
 
 
@@ -77,6 +78,8 @@ class TemplateParameters:
         Depth of the leaflets' belly over their length.
     edge_half_width : float
         Half width of the open free edge between the commissures.
+    edge_exponent : float
+        Shape of the open free edge: 1 gives half ellipses, 2 parabolas that meet at an angle.
     edge_y : float
         y of the free edge at the commissures.
     edge_anterior, edge_posterior : float
@@ -88,9 +91,9 @@ class TemplateParameters:
         Thickness at the free edge over that of the annular half.
     ap_contraction, commissural_contraction : float
         Shares by which the annulus shrinks until the valve is closed.
-    closed_sag, closed_half_width, closed_z : float
-        Intended coaptation line: ``y = edge_y - sag (1 - (x / half_width)^2)``, from which the rest
-        lengths of the chordae follow.
+    closed_sag, closed_half_width, closed_z, closed_drop : float
+        Intended coaptation line, from which the rest lengths of the chordae follow:
+        ``y = edge_y - sag (1 - u^2)``, ``z = closed_z - drop u^2`` with ``u = x / half_width``.
     fibre_turn : float
         Share of the anterior leaflet's angle at each commissure over which its fibres turn from
         parallel to perpendicular to the annulus.
@@ -101,16 +104,17 @@ class TemplateParameters:
     saddle: float = 6.5
     flattening: float = 0.08
     commissure_angle: float = 19.6
-    length_anterior: float = 24.4
-    length_posterior: float = 17.4
-    length_commissure: float = 10.0
+    length_anterior: float = 24.0
+    length_posterior: float = 18.8
+    length_commissure: float = 11.0
     exponent_anterior: float = 1.2
     exponent_posterior: float = 1.2
     bulge: float = 0.04
-    edge_half_width: float = 15.2
+    edge_half_width: float = 15.5
+    edge_exponent: float = 2.0
     edge_y: float = 1.83
-    edge_anterior: float = 4.5
-    edge_posterior: float = 9.0
+    edge_anterior: float = 6.5
+    edge_posterior: float = 10.5
     tips: tuple[float, float, float] = (16.0, -0.24, -25.0)
     thickness_anterior: float = 1.32
     thickness_posterior: float = 1.26
@@ -119,7 +123,8 @@ class TemplateParameters:
     commissural_contraction: float = 0.008
     closed_sag: float = 7.19
     closed_half_width: float = 13.0
-    closed_z: float = -8.0
+    closed_z: float = -11.3
+    closed_drop: float = 3.0
     fibre_turn: float = 0.23
     chordae: ChordLayout = ChordLayout()
 
@@ -205,18 +210,22 @@ class Template:
         ):
             part = (angle >= low - 1e-12) & (angle <= high + 1e-12)
             a = angle[part]
-            speed = np.hypot(p.edge_half_width * np.sin(a), depth * np.cos(a))
+            sine, q = np.abs(np.sin(a)), p.edge_exponent
+            speed = np.hypot(
+                p.edge_half_width * sine, depth * q * sine ** (q - 1) * np.cos(a)
+            )
             arc = np.concatenate([[0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(a))])
             phi[part] = np.rad2deg(low) + 180.0 * arc / arc[-1]
         return phi, angle
 
     def _edge_xy(self, phi: FloatArray) -> FloatArray:
-        """Open free edge ``(k, 2)``: two half ellipses that share their vertices."""
+        """Open free edge ``(k, 2)``: two arcs ``(a cos, b sin^q)`` that share their ends."""
         p = self.parameters
         angle = np.interp(np.mod(phi, 360.0), *self._edge_table)
         sine = np.sin(angle)
-        depth = np.where(sine > 0, p.edge_anterior, p.edge_posterior)
-        return np.stack([p.edge_half_width * np.cos(angle), p.edge_y + depth * sine], axis=-1)
+        depth = np.where(sine > 0, p.edge_anterior, -p.edge_posterior)
+        y = p.edge_y + depth * np.abs(sine) ** p.edge_exponent
+        return np.stack([p.edge_half_width * np.cos(angle), y], axis=-1)
 
     def position(self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0) -> FloatArray:
         """Reference positions ``(k, 3)`` mm of material points."""
@@ -306,7 +315,8 @@ class Template:
         tips = self.papillary_tips[tip]
         open_length = np.linalg.norm(insertion - tips, axis=1)
         target = self._closed_position(phi, s, insertion)
-        rest = np.maximum(layout.slack * np.linalg.norm(target - tips, axis=1), open_length)
+        slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
+        rest = np.maximum(slack * np.linalg.norm(target - tips, axis=1), open_length)
         stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
         return Chordae(
             tip, insertion, family, ("marginal", "basal"), rest, stiffness, layout.toe_strain
@@ -315,9 +325,10 @@ class Template:
     def _closed_position(self, phi: FloatArray, s: FloatArray, rest: FloatArray) -> FloatArray:
         """Intended closed positions: the coaptation line at the free edge, the annulus at s = 0."""
         p = self.parameters
-        x = rest[:, 0] * p.closed_half_width / p.edge_half_width
-        y = p.edge_y - p.closed_sag * (1 - np.minimum(np.abs(x) / p.closed_half_width, 1.0) ** 2)
-        edge = np.stack([x, y, np.full_like(x, p.closed_z)], axis=-1)
+        u = np.clip(rest[:, 0] / p.edge_half_width, -1.0, 1.0)
+        y = p.edge_y - p.closed_sag * (1 - u**2)
+        z = p.closed_z - p.closed_drop * u**2
+        edge = np.stack([u * p.closed_half_width, y, z], axis=-1)
         return (1 - s)[:, None] * self.annulus(phi) + s[:, None] * edge
 
     def motion(self, phi: FloatArray) -> Motion:
