@@ -31,7 +31,7 @@ class MeshConfig:
     columns: int = MISSING  # cells around the valve
     rows: int = MISSING  # cells from annulus to free edge
     layers: int = 1  # cells through the thickness
-    edge_length: float = 1.6  # mm, of an unstructured mesh
+    edge_length: float = 2.5  # mm, of an unstructured mesh
 
 
 @dataclass

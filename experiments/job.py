@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.build import Twin, build_twin
 from experiments.config import NOT_THE_RESULT, hash_of, register
 from experiments.progress import SolveBar
-from experiments.record import make_record, write_fields
+from experiments.record import make_record, measure_frames, write_fields
 from experiments.tracking import log_run
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.model import ClosureModel
@@ -99,6 +99,11 @@ def run_twin(
     twin = build_twin(config)
     result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
     mesh = twin.model.mesh
+    closure = None
+    if result.fitted is not None:
+        thickness = float(twin.valve.surface.thickness.mean())
+        reach = twin.model.settings.contact.activation_distance * thickness
+        closure = measure_frames(twin.valve, result, reach)
     record = make_record(
         result,
         config,
@@ -109,6 +114,7 @@ def run_twin(
             "elements": len(mesh.elements),
             "truth_sha256": twin.truth_model.mesh.sha256,
         },
+        closure=closure,
         truth_values=twin.truth_values,
         started=started,
     )

@@ -5,17 +5,21 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, MvestError
 from mvest.provenance import provenance
 from mvest.study import StudyResult
 from mvest.typing import FloatArray
+from mvest.valve.anatomy import LeafletSurface, Valve
+from mvest.valve.annulus import annulus_plane
+from mvest.valve.measurements import measure_closure
 
-__all__ = ["make_record", "write_fields"]
+__all__ = ["make_record", "measure_frames", "write_fields"]
 
 SCHEMA = 1
 """Version of the layout of ``result.json``."""
@@ -29,10 +33,11 @@ def make_record(
     *,
     config_hash: str,
     meshes: Mapping[str, Any],
+    closure: Mapping[str, Any] | None,
     truth_values: FloatArray | None,
     started: float,
 ) -> dict[str, Any]:
-    """Plain data of a finished run, failed or not; see the README for its fields.
+    """Plain data of a finished run, failed or not.
 
     Values that do not exist are None. Lists of parameters are in the order of ``parameters``;
     relative errors are signed parts of the truth.
@@ -68,6 +73,7 @@ def make_record(
         "moduli_error_percent": _moduli_error(result),
         "distance_mm": _spread(result.distance),
         "distance_to_truth_mm": _spread(result.distance_to_truth),
+        "closure": None if closure is None else dict(closure),
         "iterations": 0 if filtered is None else filtered.iterations,
         "forward_solves": 0 if filtered is None else filtered.forward_solves,
         "seconds": result.seconds,
@@ -94,7 +100,51 @@ def make_record(
     }
 
 
-def write_fields(path: Path, surface: Any, result: StudyResult) -> None:
+def measure_frames(valve: Valve, result: StudyResult, contact_distance: float) -> dict[str, Any]:
+    """Orifice, passing ball, coaptation and intersections of each fitted frame.
+
+    Parameters
+    ----------
+    valve : Valve
+        The observed surface; its first two regions face each other.
+    result : StudyResult
+        With fitted frames.
+    contact_distance : float
+        mm between midsurfaces, up to which they count as touching.
+
+    Returns
+    -------
+    dict
+        Frame -> measurements in mm and mm², or the reason why they could not be taken.
+    """
+    assert result.observation is not None
+    assert result.fitted is not None
+    surface = valve.surface
+    first = np.unique(surface.triangles[surface.region == 0])
+    measured: dict[str, Any] = {}
+    for frame, points in zip(result.observation.frames, result.fitted, strict=True):
+        annulus = points[valve.annulus]
+        anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
+        try:
+            plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
+            found = measure_closure(
+                points,
+                surface.triangles,
+                surface.region,
+                surface.thickness,
+                annulus,
+                plane,
+                contact_distance,
+            )
+        except MvestError as error:
+            # An estimate is not lost because the valve's shape defies a measurement.
+            measured[frame] = {"reason": str(error)}
+        else:
+            measured[frame] = asdict(found)
+    return measured
+
+
+def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> None:
     """Write the observed and the fitted frames as compressed arrays, whole or not at all.
 
     Raises

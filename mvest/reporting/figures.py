@@ -156,7 +156,7 @@ def _draw(
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
-    axes.set_box_aspect(tuple(high - low), zoom=1.45)
+    axes.set_box_aspect(tuple(high - low), zoom=1.2)
     axes.set_proj_type("ortho")
     axes.set_axis_off()
 

@@ -57,6 +57,7 @@ def _row(record: Record) -> dict[str, Any]:
         row[f"estimate {name}{_unit(name)}"] = _at(record["estimate"], k)
         row[f"std {name}{_unit(name)}"] = _at(record["std"], k)
         row[f"error {name} [%]"] = None if errors is None else 100.0 * abs(errors[k])
+    closed = (record["closure"] or {}).get("closed", {})
     moduli, distance = record["moduli_error_percent"] or {}, record["distance_mm"] or {}
     model = record["model"]
     row |= {
@@ -65,6 +66,9 @@ def _row(record: Record) -> dict[str, Any]:
         "distance mean [mm]": distance.get("mean"),
         "distance SD [mm]": distance.get("std"),
         "distance max [mm]": distance.get("max"),
+        "orifice, closed [mm²]": closed.get("orifice_area"),
+        "passing ball, closed [mm]": closed.get("passing_ball_diameter"),
+        "coaptation [mm]": closed.get("coaptation_length"),
         "element": model["element"],
         "cells": " x ".join(str(n) for n in model["cells"]),
         "nodes": record["mesh"]["nodes"],

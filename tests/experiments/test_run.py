@@ -65,6 +65,9 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert set(record["distance_mm"]) == {"mean", "std", "max"}
     assert max(abs(error) for error in record["relative_error"]) < 1e-4
     assert len(record["moduli"]) == 6
+    assert (
+        record["closure"]["open"]["orifice_area"] > record["closure"]["closed"]["orifice_area"] > 0
+    )
     provenance = record["provenance"]
     assert {"git", "config_hash", "mesh_hash", "seed", "versions", "threads"} <= set(provenance)
     assert provenance["config_hash"].startswith(folder.name)
@@ -254,6 +257,28 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     capsys.readouterr()
     again = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
     assert again == kept
+
+
+@pytest.mark.slow
+def test_an_experiment_of_several_runs_keeps_a_record_of_each(
+    run, tmp_path, instead_of_closing
+) -> None:
+    instead_of_closing(shrinking)
+    status, _, err = run(
+        "experiment=mesh_independence",
+        "hydra/launcher=basic",
+        "tracking.enabled=false",
+        "paths.results=published",
+    )
+    assert status == 0, err
+    kept = sorted(path.name for path in (tmp_path / "published" / "records").iterdir())
+    assert kept == [
+        "mesh-independence-hex18-structured-24-x-3.json",
+        "mesh-independence-hex18-structured-36-x-4.json",
+        "mesh-independence-hex18-structured-54-x-6.json",
+    ]
+    table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
+    assert table.count("hex18 structured") == 3
 
 
 def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:

@@ -29,6 +29,10 @@ RECORD: dict[str, Any] = {
     "moduli_error_percent": {"mean": 0.0056, "std": 0.0008, "max": 0.0064},
     "distance_mm": {"mean": 0.0004, "std": 0.0003, "max": 0.002},
     "distance_to_truth_mm": {"mean": 0.0004, "std": 0.0003, "max": 0.002},
+    "closure": {
+        "open": {"orifice_area": 310.0, "passing_ball_diameter": 16.0, "coaptation_length": 0.0},
+        "closed": {"orifice_area": 1.2, "passing_ball_diameter": 0.5, "coaptation_length": 6.0},
+    },
     "iterations": 3,
     "forward_solves": 4,
     "seconds": 61.2,
@@ -63,7 +67,15 @@ def record(**changes: Any) -> dict[str, Any]:
 def failed_record(**changes: Any) -> dict[str, Any]:
     """The record of a run whose model gave up."""
     nothing = dict.fromkeys(
-        ("estimate", "std", "relative_error", "moduli_error_percent", "distance_mm", "iterates")
+        (
+            "estimate",
+            "std",
+            "relative_error",
+            "moduli_error_percent",
+            "distance_mm",
+            "iterates",
+            "closure",
+        )
     )
     return record(
         **nothing,
