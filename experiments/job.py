@@ -31,6 +31,11 @@ __all__ = ["FailedRunError", "run_job"]
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the progress bar's first guess."""
 
+LOCKING = (
+    "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
+    "belong to the mesh, not to the tissue"
+)
+
 # Workers of a launcher import this module before they compose their configuration.
 register()
 
@@ -97,6 +102,8 @@ def run_twin(
 ) -> tuple[dict[str, Any], list[Path]]:
     """A synthetic study: the record, and the figures written to ``folder``."""
     twin = build_twin(config)
+    if twin.model.mesh.element_type == "tet4":
+        print(LOCKING, file=sys.stderr)
     result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
     mesh = twin.model.mesh
     closure = None

@@ -214,6 +214,13 @@ def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_clo
     assert record["iterates"] == [[5.0, 3.0]]
 
 
+def test_the_papers_element_says_what_is_wrong_with_it(run, instead_of_closing) -> None:
+    instead_of_closing(shrinking)
+    status, _, err = run("experiment=debug", "mechanics.element=tet4", "tracking.enabled=false")
+    assert status == 0
+    assert err.startswith("note: linear tetrahedra")
+
+
 def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing) -> None:
     def interrupted(m, rest):
         raise KeyboardInterrupt
