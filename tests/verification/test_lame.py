@@ -26,7 +26,7 @@ def lame(x):
 
 
 def error(element_type, n):
-    """Relative L2 error of the displacement on a sixth of the sphere (one face of a cube, blown up).
+    """Relative L2 error of the displacement on a sixth of the sphere (a blown-up cube face).
 
     The four cut faces carry the exact displacement; the inner face is loaded, the outer one free.
     """

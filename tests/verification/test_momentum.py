@@ -19,7 +19,7 @@ def flight(n_steps):
     mesh = block("hex18", (2, 1, 1), (6.0, 3.0, 1.5), fibre=(0.8, 0.6, 0))
     solid = Solid(mesh, BiotLaw.of((MATERIALS["A"],)))
     centre = solid.lumped_mass @ mesh.nodes / solid.lumped_mass.sum()
-    velocity = np.cross(OMEGA, mesh.nodes - centre) + [200.0, -50.0, 30.0]
+    velocity = np.cross(OMEGA, mesh.nodes - centre) + np.array([200.0, -50.0, 30.0])
     dt = DURATION / n_steps
     result = simulate(
         System(solid),
@@ -45,9 +45,9 @@ def test_linear_momentum_is_conserved_exactly():
 
 
 def test_angular_momentum_drifts_as_backward_euler_predicts():
-    # L' = x' x M v' with no torque of the internal forces gives L' - L = dt sum v' x M v. For a spin
-    # the velocities of two steps enclose the angle omega dt: dL / L = -(omega dt)^2 per step, over
-    # the duration -omega^2 T dt: the drift is of the first order, with this constant.
+    # L' = x' x M v' with no torque of the internal forces gives L' - L = dt sum v' x M v. For a
+    # spin the velocities of two steps enclose the angle omega dt: dL / L = -(omega dt)^2 per step,
+    # over the duration -omega^2 T dt: the drift is of the first order, with this constant.
     drifts, sizes = [], (20, 40, 80)
     for n in sizes:
         mass, x, v = flight(n)
