@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact, ContactSettings
@@ -27,7 +28,7 @@ from mvest.mechanics.integrate import (
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
-from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.system import Factors, Loads, Parameter, System
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa
@@ -94,7 +95,7 @@ class ClosureProtocol:
     ramp: float = 0.3
     dt: float = 0.02
     growth: float = 1.5
-    end: float = 3.0
+    end: float = 0.5
     equilibrium: bool = True
 
     def __post_init__(self) -> None:
@@ -177,15 +178,7 @@ def build_system(
         Region -> E_f, MPa.
     factors : Factors, optional
     """
-    materials = []
-    for region in mesh.region_names:
-        if region not in settings.tissue or region not in moduli:
-            raise InputError(
-                f"region {region!r} of the mesh has no tissue or modulus; given are "
-                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(moduli))}"
-            )
-        materials.append(settings.tissue[region].material(moduli[region]))
-    solid = Solid(mesh, BiotLaw.of(tuple(materials)), density=settings.density)
+    solid = Solid(mesh, material_law(mesh, settings, moduli), density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
     chordae = valve.chordae
@@ -212,6 +205,29 @@ def build_system(
         hinge=_support(mesh, contact_valve, settings),
         factors=factors,
     )
+
+
+def material_law(
+    mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]
+) -> BiotLaw:
+    """The law of the mesh with one modulus E_f (MPa) per region.
+
+    Raises
+    ------
+    InputError
+        If a region has no tissue or no modulus.
+    MaterialError
+        If a modulus is inadmissible.
+    """
+    materials = []
+    for region in mesh.region_names:
+        if region not in settings.tissue or region not in moduli:
+            raise InputError(
+                f"region {region!r} of the mesh has no tissue or modulus; given are "
+                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(moduli))}"
+            )
+        materials.append(settings.tissue[region].material(moduli[region]))
+    return BiotLaw.of(tuple(materials))
 
 
 def _patches(
@@ -300,7 +316,7 @@ class ClosureResult:
     simulation: Simulation
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(eq=False)
 class ClosureModel:
     """Predicted positions of the observed vertices as a function of the parameters.
 
@@ -328,8 +344,17 @@ class ClosureModel:
     fixed: dict[str, float] = field(default_factory=dict)
     on_step: Callable[[float, int], None] | None = None
 
+    _system: System | None = field(default=None, init=False, repr=False)
+    _solver: LinearSolver | None = field(default=None, init=False, repr=False)
+
     def close(self, m: FloatArray, *, sensitivities: bool = True) -> ClosureResult:
-        """Run the closure with parameters ``m (p,)``."""
+        """Run the closure with parameters ``m (p,)``.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
         values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
         moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
         factors = Factors(
@@ -337,39 +362,49 @@ class ClosureModel:
             values.get("chord_stiffness", 1.0),
             values.get("chord_rest_length", 1.0),
         )
-        system = build_system(
-            self.valve, self.contact_valve, self.mesh, self.settings, moduli, factors
-        )
-        loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
-        parameters = [Parameter(n, values[n]) for n in self.names] if sensitivities else []
+        if self._system is None or self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+            self._system = build_system(
+                self.valve, self.contact_valve, self.mesh, self.settings, moduli
+            )
+        system = self._system
+        system.retune(material_law(self.mesh, self.settings, moduli), factors)
         simulation = simulate(
             system,
-            loading,
+            boundary_loading(system, self.valve, self.contact_valve, self.settings),
             self.settings.protocol.steps(),
             damping=self.settings.damping,
             newton=self.settings.newton,
-            parameters=parameters,
-            solver=linear_solver(self.settings.solver),
+            parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
+            final_only=True,
+            solver=self._solver,
             on_step=self.on_step,
         )
         return ClosureResult(system, simulation)
 
-    def observed(self, result: ClosureResult) -> Embedding:
+    @cached_property
+    def observed(self) -> Embedding:
         """The observed vertices embedded in the mesh."""
         return embed(self.mesh, self.valve.surface.vertices)
 
     def __call__(self, m: FloatArray) -> Prediction:
-        """Positions of the observed vertices in the open and the closed frame, and their Jacobian."""
-        result = self.close(m)
-        points = self.observed(result)
-        simulation = result.simulation
-        open_, closed = points(simulation.frames[0]), points(simulation.frames[-1])
-        derivative = np.stack([points(dx) for dx in simulation.sensitivities[-1]], axis=-1)
+        """Positions of the observed vertices in the open and the closed frame, and their Jacobian.
+
+        Inadmissible moduli and closures that do not converge are failed predictions, not errors.
+        """
+        try:
+            simulation = self.close(m).simulation
+        except MaterialError as error:
+            return Prediction.failed(str(error))
+        if not simulation.converged:
+            return Prediction.failed(f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)")
+        open_, closed = self.observed(simulation.frames[0]), self.observed(simulation.frames[-1])
+        derivative = np.stack([self.observed(dx) for dx in simulation.sensitivities[-1]], axis=-1)
         y = np.concatenate([open_.ravel(), closed.ravel()])
         jacobian = np.concatenate(
             [np.zeros((open_.size, len(self.names))), derivative.reshape(-1, len(self.names))]
         )
-        return Prediction(y, jacobian, simulation.converged, simulation.reason.value)
+        return Prediction(y, jacobian)
 
 
 def with_protocol(settings: MechanicsSettings, **changes: float) -> MechanicsSettings:

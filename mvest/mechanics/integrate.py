@@ -174,6 +174,7 @@ class _State:
     dx: FloatArray  # (p, n, 3)
     dv: FloatArray
     d_strain: FloatArray  # (p, e, q, 6)
+    dt: float = 0.0  # of the step that led here
 
 
 @dataclass(slots=True, eq=False)
@@ -197,6 +198,7 @@ def simulate(
     damping: Damping | None = None,
     newton: NewtonSettings | None = None,
     parameters: Sequence[Parameter] = (),
+    final_only: bool = False,
     solver: LinearSolver | None = None,
     initial_velocity: FloatArray | None = None,
     on_step: Callable[[float, int], None] | None = None,
@@ -214,6 +216,9 @@ def simulate(
         Defaults: the paper's damping, converged Newton, the fastest available solver.
     parameters : sequence of Parameter
         To differentiate by.
+    final_only : bool
+        Only the derivatives of the last frame are wanted; those of the others may be zero. If the
+        last step is static, nothing before it needs differentiating: an equilibrium has no history.
     initial_velocity : ndarray, optional
         ``(n, 3)`` mm/s.
     on_step : callable, optional
@@ -247,9 +252,13 @@ def simulate(
         np.zeros((n_p, *strain0.shape)),
     )
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
+    if final_only and steps[-1].static:
+        stepper.differentiate = False
     frames, sensitivities, done, records = [x0], [state.dx], [0.0], []
     reason = Reason.COMPLETED
     for step in steps:
+        if step is steps[-1]:
+            stepper.differentiate = True
         try:
             state = stepper.advance(state, done[-1], step, records)
         except _Failure as failure:
@@ -283,6 +292,7 @@ class _Stepper:
         self.newton = newton
         self.parameters = parameters
         self.solver = solver
+        self.differentiate = True
 
     def advance(
         self, state: _State, start: float, step: Step, records: list[StepRecord]
@@ -324,27 +334,42 @@ class _Stepper:
         push = inertia * mass * (state.x / dt + state.v) / dt + (
             inertia * self.damping.alpha * mass * state.x / dt
         )
-        solved = self._newton(state, loads, rate, mass_factor, push)
+        # The first guess continues the motion, but no farther than the last step went.
+        advance = 0.0 if static else min(dt, state.dt)
+        solved = self._newton(state, loads, rate, mass_factor, push, advance)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
             raise _Failure(Reason.INTERSECTION)
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
-        new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain)
-        if self.parameters:
+        new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, dt)
+        if self.parameters and self.differentiate:
             self._differentiate(state, new, solved, loads, rate, dt, static)
         return new, solved
 
     def _newton(
-        self, state: _State, loads: Loads, rate: float, mass_factor: float, push: FloatArray
+        self,
+        state: _State,
+        loads: Loads,
+        rate: float,
+        mass_factor: float,
+        push: FloatArray,
+        advance: float,
     ) -> _Solved:
         system, newton = self.system, self.newton
         mass = system.solid.lumped_mass[:, None]
         fixed = system.fixed_nodes
         x = state.x.copy()
+        pairs = system.search_contact(x)
+        if advance:
+            move = advance * state.v
+            factor = min(1.0, newton.largest_move / max(float(np.abs(move).max()), 1e-300))
+            if system.contact is not None and pairs is not None:
+                y, dy = system.contact.points(x), system.contact.points(factor * move)
+                factor *= system.contact.largest_step(pairs, y, dy)
+            x += factor * move
         if fixed.size:
             x[fixed] = loads.fixed
-        pairs = system.search_contact(x)
 
         def evaluate(at: FloatArray, tangent: bool) -> Evaluation:
             nonlocal pairs
@@ -365,7 +390,7 @@ class _Stepper:
                 raise _Failure(Reason.NO_CONVERGENCE)
             assert current.blocks is not None
             converged = residuals[-1] <= newton.tolerance
-            if converged and not self.parameters:
+            if converged and not (self.parameters and self.differentiate):
                 return _Solved(x, current, residuals, pairs)
             try:
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))

@@ -112,7 +112,11 @@ class Solid:
             self.modes = np.zeros((*self.volumes.shape, 6, 0))
         self.n_modes = self.modes.shape[3]
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
-        self._alpha = np.zeros((len(mesh.elements), self.n_modes))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the enhanced parameters that the next evaluation would start from."""
+        self._alpha = np.zeros((len(self.mesh.elements), self.n_modes))
 
     def initial_strain(self) -> FloatArray:
         """Strain measure of the reference state, zeros ``(e, q, 6)``."""

@@ -18,7 +18,7 @@ from mvest.mechanics.assembly import Pattern, add_forces, scatter_blocks, scatte
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact, ContactPairs
 from mvest.mechanics.pressure import PressureLoad
-from mvest.mechanics.solid import Solid, SolidState
+from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
@@ -135,6 +135,12 @@ class System:
             raise InputError(f"fixed_nodes must lie between 0 and {self.n - 1}")
         self._slots: dict[tuple[int, int], int] = {}
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
+
+    def retune(self, law: Law, factors: Factors) -> None:
+        """Exchange the law and the factors; everything that depends on the geometry stays."""
+        self.solid.law = law
+        self.solid.reset()
+        self.factors = factors
 
     # -- sparsity -----------------------------------------------------------------------------------
     def _static_groups(self) -> list[IntArray]:

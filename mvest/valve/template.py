@@ -42,18 +42,21 @@ class ChordLayout:
     marginal_stiffness, basal_stiffness : float
         Axial stiffness EA, N.
     marginal_slack, basal_slack : float
-        Rest length over the distance to the intended closed position; never below the open length.
+        Rest length over the distance to the intended closed position.
+    open_slack : float
+        Rest length over the open length, at least.
     toe_strain : float
     """
 
-    marginal_phi: tuple[float, ...] = tuple(np.linspace(-87.0, 88.0, 12).round(3).tolist())
+    marginal_phi: tuple[float, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
     basal: tuple[tuple[float, float], ...] = ((-60.0, 0.5), (50.0, 0.55), (75.0, 0.55))
     marginal_s: float = 0.97
-    marginal_stiffness: float = 16.0
+    marginal_stiffness: float = 20.0
     basal_stiffness: float = 16.0
-    marginal_slack: float = 0.97
-    basal_slack: float = 1.0
-    toe_strain: float = 0.02
+    marginal_slack: float = 0.985
+    basal_slack: float = 1.03
+    open_slack: float = 1.035
+    toe_strain: float = 0.015
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,8 +126,8 @@ class TemplateParameters:
     commissural_contraction: float = 0.008
     closed_sag: float = 7.19
     closed_half_width: float = 13.0
-    closed_z: float = -11.3
-    closed_drop: float = 3.0
+    closed_z: float = -10.9
+    closed_drop: float = 3.4
     fibre_turn: float = 0.23
     chordae: ChordLayout = ChordLayout()
 
@@ -316,7 +319,7 @@ class Template:
         open_length = np.linalg.norm(insertion - tips, axis=1)
         target = self._closed_position(phi, s, insertion)
         slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
-        rest = np.maximum(slack * np.linalg.norm(target - tips, axis=1), open_length)
+        rest = np.maximum(slack * np.linalg.norm(target - tips, axis=1), layout.open_slack * open_length)
         stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
         return Chordae(
             tip, insertion, family, ("marginal", "basal"), rest, stiffness, layout.toe_strain
