@@ -41,8 +41,8 @@ def assert_quadratic(residuals):
 
     Quadratic convergence squares it twice; membrane and bending take turns, so that single
     iterations may gain less. A tangent wrong by more than about half a per cent fails: linear
-    convergence with rate q needs q^2 r < 5 r^3. Below 2e-10 the elimination of the enhanced strains is
-    felt.
+    convergence with rate q needs q^2 r < 5 r^3. Below 2e-10 the elimination of the enhanced
+    strains is felt.
     """
     r = residuals
     small = [k for k in range(1, len(r) - 2) if r[k] < 5e-2]
