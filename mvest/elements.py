@@ -121,7 +121,8 @@ def _triangle6(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Six-node triangle: values ``(q, 6)`` and derivatives ``(q, 6, 2)``."""
     z = 1 - x - y
     value = np.stack(
-        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z], axis=-1
+        [z * (2 * z - 1), x * (2 * x - 1), y * (2 * y - 1), 4 * z * x, 4 * x * y, 4 * y * z],
+        axis=-1,
     )
     o = np.zeros_like(x)
     d_x = np.stack([1 - 4 * z, 4 * x - 1, o, 4 * (z - x), 4 * y, -4 * y], axis=-1)
@@ -260,7 +261,10 @@ def _tetrahedron(name: str, order: int) -> Element:
     if order == 1:
         points, weights, nodes = np.full((1, 3), 0.25), np.array([1 / 6]), corners
     else:
-        a, b = 0.585410196624969, 0.138196601125011  # degree 2, four points (Hammer and Stroud 1956)
+        a, b = (
+            0.585410196624969,
+            0.138196601125011,
+        )  # degree 2, four points (Hammer and Stroud 1956)
         points = np.array([[b, b, b], [a, b, b], [b, a, b], [b, b, a]])
         weights = np.full(4, 1 / 24)
         nodes = np.vstack([corners, 0.5 * (corners[edges[:, 0]] + corners[edges[:, 1]])])
@@ -298,18 +302,31 @@ def _faces() -> dict[str, Face]:
         ),
         np.tile(w3, 3) * np.repeat(w3, 3),
         np.array(
-            [t for j in (0, 1) for i in (0, 1) for n in [i + 3 * j]
-             for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])]
+            [
+                t
+                for j in (0, 1)
+                for i in (0, 1)
+                for n in [i + 3 * j]
+                for t in ([n, n + 1, n + 4], [n, n + 4, n + 3])
+            ]
         ),
     )
     value, derivative = _triangle6(_TRIANGLE_POINTS[:, 0], _TRIANGLE_POINTS[:, 1])
     tri6 = Face(
-        "tri6", 6, value, derivative, _TRIANGLE_WEIGHTS,
+        "tri6",
+        6,
+        value,
+        derivative,
+        _TRIANGLE_WEIGHTS,
         np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
     )
     third = np.full((1, 3), 1 / 3)
     tri3 = Face(
-        "tri3", 3, third, np.array([[[-1.0, -1], [1, 0], [0, 1]]]), np.array([0.5]),
+        "tri3",
+        3,
+        third,
+        np.array([[[-1.0, -1], [1, 0], [0, 1]]]),
+        np.array([0.5]),
         np.array([[0, 1, 2]]),
     )
     return {f.name: f for f in (quad9, tri6, tri3)}
@@ -340,4 +357,6 @@ def element(name: str) -> Element:
     try:
         return ELEMENTS[name]
     except KeyError:
-        raise InputError(f"unknown element {name!r}; known elements: {', '.join(ELEMENTS)}") from None
+        raise InputError(
+            f"unknown element {name!r}; known elements: {', '.join(ELEMENTS)}"
+        ) from None

@@ -8,7 +8,7 @@ their Jacobian.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -207,9 +207,7 @@ def build_system(
     )
 
 
-def material_law(
-    mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]
-) -> BiotLaw:
+def material_law(mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]) -> BiotLaw:
     """The law of the mesh with one modulus E_f (MPa) per region.
 
     Raises
@@ -230,9 +228,7 @@ def material_law(
     return BiotLaw.of(tuple(materials))
 
 
-def _patches(
-    points: Embedding, valve: Valve, radius: float, insertion: FloatArray
-) -> Embedding:
+def _patches(points: Embedding, valve: Valve, radius: float, insertion: FloatArray) -> Embedding:
     """Leaflet ends of the chordae: averages over material points within ``radius`` mm.
 
     Weights ``area (1 - (d / radius)^2)^2``, of fixed physical size whatever the mesh.
@@ -332,6 +328,11 @@ class ClosureModel:
         Names of the parameters (see :class:`mvest.mechanics.system.Parameter`).
     fixed : dict
         Values of the parameters that are not estimated.
+    continuation : bool
+        Whether closures after the first start from the last closed state and go straight to the new
+        equilibrium (where the protocol ends in one), instead of closing the open valve again. A
+        closure that fails so is repeated from the open valve. The closed state is the same as long
+        as there is one only, which the gate (:mod:`mvest.gate`) examines.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -342,8 +343,10 @@ class ClosureModel:
     settings: MechanicsSettings
     names: tuple[str, ...]
     fixed: dict[str, float] = field(default_factory=dict)
+    continuation: bool = False
     on_step: Callable[[float, int], None] | None = None
 
+    _closed: FloatArray | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
     _solver: LinearSolver | None = field(default=None, init=False, repr=False)
 
@@ -369,17 +372,29 @@ class ClosureModel:
             )
         system = self._system
         system.retune(material_law(self.mesh, self.settings, moduli), factors)
-        simulation = simulate(
-            system,
-            boundary_loading(system, self.valve, self.contact_valve, self.settings),
-            self.settings.protocol.steps(),
-            damping=self.settings.damping,
-            newton=self.settings.newton,
-            parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
-            final_only=True,
-            solver=self._solver,
-            on_step=self.on_step,
-        )
+        steps = self.settings.protocol.steps()
+
+        def run(steps: Sequence[Step], start: FloatArray | None) -> Simulation:
+            return simulate(
+                system,
+                boundary_loading(system, self.valve, self.contact_valve, self.settings),
+                steps,
+                damping=self.settings.damping,
+                newton=self.settings.newton,
+                parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
+                final_only=True,
+                solver=self._solver,
+                initial_positions=start,
+                on_step=self.on_step,
+            )
+
+        simulation = None
+        if self.continuation and self._closed is not None and steps[-1].static:
+            simulation = run(steps[-1:], self._closed)
+        if simulation is None or not simulation.converged:
+            simulation = run(steps, None)
+        if simulation.converged:
+            self._closed = simulation.frames[-1]
         return ClosureResult(system, simulation)
 
     @cached_property
@@ -397,8 +412,10 @@ class ClosureModel:
         except MaterialError as error:
             return Prediction.failed(str(error))
         if not simulation.converged:
-            return Prediction.failed(f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)")
-        open_, closed = self.observed(simulation.frames[0]), self.observed(simulation.frames[-1])
+            return Prediction.failed(
+                f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
+            )
+        open_, closed = self.observed(self.mesh.nodes), self.observed(simulation.frames[-1])
         derivative = np.stack([self.observed(dx) for dx in simulation.sensitivities[-1]], axis=-1)
         y = np.concatenate([open_.ravel(), closed.ravel()])
         jacobian = np.concatenate(

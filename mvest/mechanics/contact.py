@@ -196,7 +196,12 @@ class Contact:
     def forces(self, pairs: ContactPairs, y: FloatArray) -> FloatArray:
         """Energy derivative ``(k, 3)`` N by the positions of the points."""
         return _forces(
-            y, pairs.first, pairs.second, pairs.reach, pairs.reference, self.areas,
+            y,
+            pairs.first,
+            pairs.second,
+            pairs.reach,
+            pairs.reference,
+            self.areas,
             self.settings.reference_pressure,
         )
 
@@ -236,14 +241,28 @@ class Contact:
             ``(e, w, w)`` positions of the blocks of each host element with itself.
         """
         _add_tangent(
-            y, pairs.first, pairs.second, pairs.reach, pairs.reference, pairs.start, self.areas,
-            self.settings.reference_pressure, self.points.weights, self.points.host, data,
-            slot, forward, backward, own,
+            y,
+            pairs.first,
+            pairs.second,
+            pairs.reach,
+            pairs.reference,
+            pairs.start,
+            self.areas,
+            self.settings.reference_pressure,
+            self.points.weights,
+            self.points.host,
+            data,
+            slot,
+            forward,
+            backward,
+            own,
         )
 
     def largest_step(self, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> float:
         """Largest factor <= 1 on the move ``dy (k, 3)`` that takes no sheet through another."""
-        factor = float(_largest_step(y, dy, pairs.first, pairs.second, pairs.reach, pairs.reference))
+        factor = float(
+            _largest_step(y, dy, pairs.first, pairs.second, pairs.reach, pairs.reference)
+        )
         if factor * float(np.max(np.abs(dy), initial=0.0)) < HARMLESS:
             return factor
         start, end = np.asfortranarray(y), np.asfortranarray(y + factor * dy)

@@ -201,6 +201,7 @@ def simulate(
     final_only: bool = False,
     solver: LinearSolver | None = None,
     initial_velocity: FloatArray | None = None,
+    initial_positions: FloatArray | None = None,
     on_step: Callable[[float, int], None] | None = None,
 ) -> Simulation:
     """Integrate ``system`` over ``steps``.
@@ -221,6 +222,9 @@ def simulate(
         last step is static, nothing before it needs differentiating: an equilibrium has no history.
     initial_velocity : ndarray, optional
         ``(n, 3)`` mm/s.
+    initial_positions : ndarray, optional
+        ``(n, 3)`` mm where the first Newton iteration starts; default the reference positions. Only
+        for runs of static steps, whose result does not depend on it unless equilibria are several.
     on_step : callable, optional
         Called with (time, Newton iterations so far) after each step, for progress.
 
@@ -238,10 +242,16 @@ def simulate(
     newton = newton or NewtonSettings()
     solver = solver or linear_solver()
     times = np.array([s.time for s in steps], dtype=float)
-    if len(times) == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times, prepend=0.0) <= 0):
+    if (
+        len(times) == 0
+        or not np.all(np.isfinite(times))
+        or np.any(np.diff(times, prepend=0.0) <= 0)
+    ):
         raise InputError("time steps must increase strictly from 0; a step of size 0 is not a step")
     n, n_p = system.n, len(parameters)
-    x0 = system.solid.mesh.nodes.copy()
+    if initial_positions is not None and not all(step.static for step in steps):
+        raise InputError("initial positions are for runs of static steps only")
+    x0 = np.array(system.solid.mesh.nodes if initial_positions is None else initial_positions)
     strain0 = system.solid.initial_strain()
     state = _State(
         x0,
@@ -294,9 +304,7 @@ class _Stepper:
         self.solver = solver
         self.differentiate = True
 
-    def advance(
-        self, state: _State, start: float, step: Step, records: list[StepRecord]
-    ) -> _State:
+    def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
         """State at ``step.time``; halves the step where it fails."""
         pending = [(step.time, 0)]
         time = start
@@ -374,7 +382,11 @@ class _Stepper:
         def evaluate(at: FloatArray, tangent: bool) -> Evaluation:
             nonlocal pairs
             contact = system.contact
-            if contact is not None and pairs is not None and contact.stale(pairs, contact.points(at)):
+            if (
+                contact is not None
+                and pairs is not None
+                and contact.stale(pairs, contact.points(at))
+            ):
                 pairs = system.search_contact(at)
             result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=tangent)
             inertial = mass_factor * mass * at - push

@@ -172,9 +172,7 @@ class BiotLaw:
         """
         return _response(green, region, self.stiffness, previous, rate)
 
-    def stress_of_region(
-        self, stress: FloatArray, region: IntArray, which: int
-    ) -> FloatArray:
+    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
         """``dS / d(log E_f)`` of region ``which``: S there, since S is linear in the scale of C."""
         return np.where((region == which)[:, None, None], stress, 0.0)
 
@@ -237,7 +235,9 @@ def _stretch(green: FloatArray, q: FloatArray, lam: FloatArray, u: FloatArray) -
         lam[i] = np.sqrt(max(a[i, i], 1e-6))
     for i in range(3):
         for j in range(3):
-            u[i, j] = q[i, 0] * lam[0] * q[j, 0] + q[i, 1] * lam[1] * q[j, 1] + q[i, 2] * lam[2] * q[j, 2]
+            u[i, j] = (
+                q[i, 0] * lam[0] * q[j, 0] + q[i, 1] * lam[1] * q[j, 1] + q[i, 2] * lam[2] * q[j, 2]
+            )
 
 
 @nb.njit(cache=True)

@@ -168,9 +168,7 @@ class Solid:
             )
         return _forces(self.gradients, self.volumes, state.deformation, d_stress)
 
-    def green_change(
-        self, state: SolidState, dx: FloatArray, d_stress: FloatArray
-    ) -> FloatArray:
+    def green_change(self, state: SolidState, dx: FloatArray, d_stress: FloatArray) -> FloatArray:
         """Total change of the Green-Lagrange strain ``(e, q, 6)``.
 
         Parameters
@@ -410,7 +408,9 @@ def _tangents(
             for q in range(n_q):
                 m_q = np.ascontiguousarray(modes[e, q])
                 k_am += np.dot(m_q.T, db[6 * q : 6 * q + 6])
-                k_mm += volumes[e, q] * np.dot(m_q.T, np.dot(np.ascontiguousarray(tangent[e, q]), m_q))
+                k_mm += volumes[e, q] * np.dot(
+                    m_q.T, np.dot(np.ascontiguousarray(tangent[e, q]), m_q)
+                )
             k -= np.dot(k_am.T, np.linalg.solve(k_mm, k_am))
         out[e] = k
     return out

@@ -6,6 +6,7 @@ everywhere else. Both factorise the same matrix and agree to round-off; a test c
 
 from __future__ import annotations
 
+import sys
 from typing import Protocol
 
 import numpy as np
@@ -136,7 +137,7 @@ class PardisoSolver:
         return np.asarray(solution)
 
     def __del__(self) -> None:
-        if getattr(self, "_matrix", None) is not None:
+        if getattr(self, "_matrix", None) is not None and not sys.is_finalizing():
             self._solver.free_memory(everything=True)
 
 

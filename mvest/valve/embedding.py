@@ -102,9 +102,7 @@ def embed(
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InputError(f"points to embed: shape {points.shape}, expected finite (k, 3)")
     reference = mesh.reference
-    centre = np.einsum(
-        "a,mai->mi", reference.shape(reference.centre)[0], mesh.nodes[mesh.elements]
-    )
+    centre = np.einsum("a,mai->mi", reference.shape(reference.centre)[0], mesh.nodes[mesh.elements])
     n_try = min(candidates, len(mesh.elements))
     _, near = cKDTree(centre).query(points, k=n_try)
     near = near.reshape(len(points), n_try)

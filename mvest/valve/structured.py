@@ -83,7 +83,9 @@ def _bricks(template: Template, element: str, columns: int, rows: int, layers: i
     return SolidMesh(nodes, elements, element, region, REGIONS, fibre, top)
 
 
-def _tetrahedra(template: Template, element: str, columns: int, rows: int, layers: int) -> SolidMesh:
+def _tetrahedra(
+    template: Template, element: str, columns: int, rows: int, layers: int
+) -> SolidMesh:
     # Everything on the twice finer parameter grid, so that midside nodes lie on the exact surface.
     n_phi, n_s, n_z = 2 * columns, 2 * rows + 1, 2 * layers + 1
     cz, cj, ci = (v.ravel() for v in np.meshgrid(np.arange(layers), np.arange(rows), np.arange(columns), indexing="ij"))  # fmt: skip
@@ -94,15 +96,15 @@ def _tetrahedra(template: Template, element: str, columns: int, rows: int, layer
     tets = []
     # Two prisms per cell; corners ordered so that the ranks increase towards larger i + j.
     for triangle in ([(0, 0), (1, 1), (1, 0)], [(0, 0), (0, 1), (1, 1)]):
-        prism = np.stack(
-            [corner(a, b, dk) for dk in (0, 1) for a, b in triangle], axis=1
-        )
+        prism = np.stack([corner(a, b, dk) for dk in (0, 1) for a, b in triangle], axis=1)
         tets.append(prism[:, _ranked(triangle)])
     corners = np.concatenate(tets).reshape(-1, 4, 3)
     region = _region(columns, np.tile(np.repeat(ci, 3), 2))
     a, b, c, d = (corners[:, q] for q in range(4))
     pairs = [(a, b), (b, c), (a, c), (a, d), (b, d), (c, d)]
-    grid = np.stack([a, b, c, d] + ([(p + q) // 2 for p, q in pairs] if element == "tet10" else []), 1)
+    grid = np.stack(
+        [a, b, c, d] + ([(p + q) // 2 for p, q in pairs] if element == "tet10" else []), 1
+    )
     number = (grid[..., 2] * n_s + grid[..., 1]) * n_phi + grid[..., 0] % n_phi
     used, elements = np.unique(number, return_inverse=True)
     elements = elements.reshape(number.shape)
@@ -112,9 +114,7 @@ def _tetrahedra(template: Template, element: str, columns: int, rows: int, layer
     volume = np.linalg.det(nodes[elements[:, 1:4]] - nodes[elements[:, :1]])
     elements = _turned(elements, volume < 0)
     grid = np.where((volume < 0)[:, None, None], grid[:, _swap(grid.shape[1])], grid)
-    fibre = _element_fibre(
-        template, 360.0 * grid[..., 0] / n_phi, grid[..., 1] / (n_s - 1), region
-    )
+    fibre = _element_fibre(template, 360.0 * grid[..., 0] / n_phi, grid[..., 1] / (n_s - 1), region)
     faces = _top_faces(elements, nodes, at_k == n_z - 1)
     return SolidMesh(nodes, elements, element, region, REGIONS, fibre, faces)
 

@@ -190,8 +190,12 @@ class Template:
         """Leaflet length ``(k,)``."""
         p = self.parameters
         sine = np.sin(np.deg2rad(phi))
-        rise_a = (p.length_anterior - p.length_commissure) * np.maximum(sine, 0) ** p.exponent_anterior
-        rise_p = (p.length_posterior - p.length_commissure) * np.maximum(-sine, 0) ** p.exponent_posterior
+        rise_a = (p.length_anterior - p.length_commissure) * np.maximum(
+            sine, 0
+        ) ** p.exponent_anterior
+        rise_p = (p.length_posterior - p.length_commissure) * np.maximum(
+            -sine, 0
+        ) ** p.exponent_posterior
         return p.length_commissure + rise_a + rise_p
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
@@ -214,9 +218,7 @@ class Template:
             part = (angle >= low - 1e-12) & (angle <= high + 1e-12)
             a = angle[part]
             sine, q = np.abs(np.sin(a)), p.edge_exponent
-            speed = np.hypot(
-                p.edge_half_width * sine, depth * q * sine ** (q - 1) * np.cos(a)
-            )
+            speed = np.hypot(p.edge_half_width * sine, depth * q * sine ** (q - 1) * np.cos(a))
             arc = np.concatenate([[0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(a))])
             phi[part] = np.rad2deg(low) + 180.0 * arc / arc[-1]
         return phi, angle
@@ -230,7 +232,9 @@ class Template:
         y = p.edge_y + depth * np.abs(sine) ** p.edge_exponent
         return np.stack([p.edge_half_width * np.cos(angle), y], axis=-1)
 
-    def position(self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0) -> FloatArray:
+    def position(
+        self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
+    ) -> FloatArray:
         """Reference positions ``(k, 3)`` mm of material points."""
         phi, s = np.broadcast_arrays(np.asarray(phi, float), np.asarray(s, float))
         middle = self._midsurface(phi, s)
@@ -319,7 +323,9 @@ class Template:
         open_length = np.linalg.norm(insertion - tips, axis=1)
         target = self._closed_position(phi, s, insertion)
         slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
-        rest = np.maximum(slack * np.linalg.norm(target - tips, axis=1), layout.open_slack * open_length)
+        rest = np.maximum(
+            slack * np.linalg.norm(target - tips, axis=1), layout.open_slack * open_length
+        )
         stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
         return Chordae(
             tip, insertion, family, ("marginal", "basal"), rest, stiffness, layout.toe_strain
