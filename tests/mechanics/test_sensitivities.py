@@ -19,17 +19,23 @@ NAMES = tuple(TRUE)
 STEPS = [Step(t) for t in (0.02, 0.04, 0.06, 0.1, 0.2)] + [Step(1.2, static=True)]
 
 
-def run(values, parameters=(), contact=True):
+NEWTON = NewtonSettings(tolerance=1e-13, smallest_move=1e-13)
+
+
+def system_of(values, contact=True):
     v = dict(zip(NAMES, values, strict=True))
-    system, loading = sandwich(
+    return sandwich(
         (v["E_f.lower"], v["E_f.upper"]),
         Factors(v["pressure_scale"], v["chord_stiffness"], v["chord_rest_length"]),
         contact=contact,
         cells=2,
         samples=11,
     )
-    newton = NewtonSettings(tolerance=1e-13, smallest_move=1e-13)
-    result = simulate(system, loading, STEPS, newton=newton, parameters=parameters)
+
+
+def run(values, parameters=(), contact=True):
+    system, loading = system_of(values, contact)
+    result = simulate(system, loading, STEPS, newton=NEWTON, parameters=parameters)
     assert result.converged
     assert all(r.halvings == 0 for r in result.records)
     return result
@@ -85,3 +91,33 @@ def test_sensitivities_do_not_change_the_run_and_have_their_shape():
 def test_an_unknown_parameter_names_the_known_ones(name, message):
     with pytest.raises(InputError, match=message):
         run(TRUE.values(), [Parameter(name, 1.0)], contact=False)
+
+
+def test_derivatives_of_the_last_frame_alone_are_the_same(reference):
+    # An equilibrium has no history, so that nothing before the last, static step needs to be
+    # differentiated.
+    system, loading = system_of(TRUE.values())
+    result = simulate(
+        system,
+        loading,
+        STEPS,
+        newton=NEWTON,
+        parameters=[Parameter(n, TRUE[n]) for n in NAMES],
+        final_only=True,
+    )
+    np.testing.assert_allclose(result.frames[-1], reference.frames[-1], atol=1e-9)
+    size = np.abs(reference.sensitivities[-1]).max(axis=(1, 2), keepdims=True)
+    difference = result.sensitivities[-1] - reference.sensitivities[-1]
+    assert np.abs(difference / size).max() < 1e-7
+
+
+def test_a_system_given_other_moduli_and_factors_is_the_system_made_with_them():
+    other = {**TRUE, "E_f.upper": 0.8, "pressure_scale": 0.9, "chord_rest_length": 0.99}
+    fresh = run(other.values())
+    used, loading = system_of(TRUE.values())
+    first = simulate(used, loading, STEPS[:2], newton=NEWTON)
+    assert first.converged
+    wanted, _ = system_of(other.values())
+    used.retune(wanted.solid.law, wanted.factors)
+    again = simulate(used, loading, STEPS, newton=NEWTON)
+    np.testing.assert_allclose(again.frames, fresh.frames, atol=1e-9)
