@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.mirror import build
+from experiments.truth import StoredModel, truth_key
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import (
     Filter,
@@ -17,6 +18,7 @@ from mvest.estimation import (
     Identity,
     IteratedFilter,
     Log,
+    ObservationModel,
     PaperFilter,
     Transform,
     observation_noise,
@@ -33,7 +35,7 @@ from mvest.valve.template import Template, TemplateParameters
 from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
 from mvest.valve.tetrahedralize import TetwildSettings
 
-__all__ = ["Twin", "build_twin"]
+__all__ = ["Twin", "build_mesh", "build_twin", "mechanics_of", "template_of"]
 
 Values = Mapping[str, Any]
 OnStep = Callable[[float, int], None]
@@ -59,6 +61,8 @@ class Twin:
         The estimator's.
     truth_model : ClosureModel
         The observation's; an object of its own.
+    source : ObservationModel
+        ``truth_model`` behind its store on disk.
     truth_values : (p,)
     valve : Valve
         The observed surface.
@@ -70,6 +74,7 @@ class Twin:
     case: Case
     model: ClosureModel
     truth_model: ClosureModel
+    source: ObservationModel
     truth_values: FloatArray
     valve: Valve
     variance: float | FloatArray
@@ -87,7 +92,7 @@ def build_twin(config: Values) -> Twin:
     """
     parameters = tuple(config["parameters"])
     truth = config["truth"]
-    settings = build(MechanicsSettings, config["mechanics"])
+    settings = mechanics_of(config)
     # What is cheap to refuse is refused before anything is meshed.
     filter_, transform, prior = build_filter(config["filter"], parameters)
     variance = _numbers("filter.R", config["filter"]["R"])
@@ -102,7 +107,7 @@ def build_twin(config: Values) -> Twin:
     if not truth["dt_factor"] > 0:
         raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
 
-    template = Template(build(TemplateParameters, config["valve"]))
+    template = template_of(config)
     observation = config["observation"]
     valve = template.valve(observation["columns"], observation["rows"])
     points = config["mechanics"]["contact_points"]
@@ -110,7 +115,15 @@ def build_twin(config: Values) -> Twin:
     element = config["mechanics"]["element"]
     store = Path(config["paths"]["outputs"]) / "meshes"
     mesh = build_mesh(template, config["mesh"], element, store)
-    model = ClosureModel(valve, contact_valve, mesh, settings, parameters, dict(config["fixed"]))
+    model = ClosureModel(
+        valve,
+        contact_valve,
+        mesh,
+        settings,
+        parameters,
+        dict(config["fixed"]),
+        continuation=config["continuation"],
+    )
 
     changed = truth_mesh(config["mesh"], truth)
     other = truth["element"] or element
@@ -124,17 +137,39 @@ def build_twin(config: Values) -> Twin:
         parameters,
         {**config["fixed"], **truth["fixed"]},
     )
+    described = {
+        "valve": config["valve"],
+        "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
+        "mesh": changed if changed["source"] == "tetwild" else _cells(changed),
+        "element": other,
+        "dt_factor": truth["dt_factor"],
+        "fixed": truth_model.fixed,
+        "observed": [observation["columns"], observation["rows"]],
+        "parameters": list(parameters),
+    }
+    folder = Path(config["paths"]["outputs"]) / "truth"
     case = Case(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
         case,
         model,
         truth_model,
+        StoredModel(truth_model, folder, truth_key(described)),
         values,
         valve,
         variance,
         tuple(observation["frames"]),
         observation["noise_mm"],
     )
+
+
+def template_of(config: Values) -> Template:
+    """The configured anatomy."""
+    return Template(build(TemplateParameters, config["valve"]))
+
+
+def mechanics_of(config: Values) -> MechanicsSettings:
+    """The configured mechanics."""
+    return build(MechanicsSettings, config["mechanics"])
 
 
 def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
@@ -149,6 +184,11 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
         changed[name] = mesh[name] * truth["refine"] if given is None else given
     changed["layers"] = mesh["layers"] if truth["layers"] is None else truth["layers"]
     return changed
+
+
+def _cells(mesh: Values) -> dict[str, Any]:
+    """What decides a structured mesh besides its element."""
+    return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
 
 
 def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> SolidMesh:

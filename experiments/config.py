@@ -38,8 +38,8 @@ class MeshConfig:
 class ContactPointsConfig:
     """Where contact is sampled, in material coordinates: the same for every mesh."""
 
-    columns: int = 108
-    rows: int = 48
+    columns: int = 144
+    rows: int = 32
 
 
 @dataclass
@@ -140,6 +140,8 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)
+    continuation: bool = True  # later closures start from the last closed state
+    confirm: bool = True  # close the fitted valve anew from the open state
     seed: int = 1
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -6,6 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,19 @@ from omegaconf import DictConfig, OmegaConf
 
 from experiments.build import Twin, build_twin
 from experiments.config import NOT_THE_RESULT, hash_of, register
+from experiments.gate import run_closure_study, run_gate_study
 from experiments.progress import SolveBar
 from experiments.record import make_record, measure_frames, write_fields
 from experiments.tracking import log_run
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.model import ClosureModel
 from mvest.provenance import write_json
+from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
-from mvest.study import StudyResult, estimate, simulate_observation
+from mvest.study import ObservedFrames, StudyResult, estimate, simulate_observation
 
 __all__ = ["FailedRunError", "run_job"]
 
@@ -71,17 +75,18 @@ def run_job(config: DictConfig) -> None:
             f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
         )
     require_writable(folder)
-    record, files = STUDIES[values["study"]](values, hash_of(config), folder, started)
+    kind = STUDIES[values["study"]]
+    record, files = kind.run(values, hash_of(config), folder, started)
 
     write_json(folder / "config.json", values)
     write_json(folder / "result.json", record)
-    tables = write_tables(folder, record["table"], [record])
-    print(text_table([record]))
+    tables = kind.tables(folder, record)
+    print(kind.text(record))
     print(f"Written to {folder}")
     if values["publish"] and record["status"] == "converged":
         if _as_published(hydra.overrides.task, hydra.sweeper.get("params")):
             target = Path(values["paths"]["results"])
-            publish(target, _slug(values, hydra), record, folder / "fields.npz")
+            kind.publish(target, _slug(values, hydra), record, folder)
             print(f"Results in {target}")
         else:
             print(f"{values['paths']['results']} left as it is: this run has overrides")
@@ -105,6 +110,7 @@ def run_twin(
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
     result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
+    confirmed = _confirm(twin, result) if config["confirm"] else None
     mesh = twin.model.mesh
     closure = None
     if result.fitted is not None:
@@ -125,6 +131,9 @@ def run_twin(
         truth_values=twin.truth_values,
         started=started,
     )
+    record["confirmed_mm"] = confirmed
+    if confirmed is not None:
+        record["forward_solves"] += 1
     files: list[Path] = []
     if record["iterates"]:
         files += save_figure(folder / "iterates", iterates_figure(record), record)
@@ -135,10 +144,48 @@ def run_twin(
     return record, files
 
 
-STUDIES: dict[
-    str,
-    Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]],
-] = {"twin": run_twin}
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A kind of study: how it is run, told, tabulated and published.
+
+    Attributes
+    ----------
+    run : callable
+        (configuration, its hash, output folder, start time) -> record and the files written.
+    text : callable
+        record -> text for the terminal.
+    tables : callable
+        (folder, record) -> table files written there.
+    publish : callable
+        (results folder, name, record, output folder) -> files written.
+    """
+
+    run: Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]]
+    text: Callable[[Mapping[str, Any]], str]
+    tables: Callable[[Path, Mapping[str, Any]], list[Path]]
+    publish: Callable[[Path, str, Mapping[str, Any], Path], list[Path]]
+
+
+STUDIES: dict[str, Study] = {
+    "twin": Study(
+        run_twin,
+        lambda record: text_table([record]),
+        lambda folder, record: write_tables(folder, record["table"], [record]),
+        lambda results, name, record, folder: publish(results, name, record, folder / "fields.npz"),
+    ),
+    "closure": Study(
+        run_closure_study,
+        closure_text,
+        write_closure_tables,
+        lambda results, _, record, folder: publish_closure(results, record, folder),
+    ),
+    "gate": Study(
+        run_gate_study,
+        gate_text,
+        write_gate_tables,
+        lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+}
 """Kinds of studies that a configuration can name."""
 
 
@@ -146,7 +193,7 @@ def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
     with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
         twin.truth_model.on_step = bar.step
         data = simulate_observation(
-            twin.truth_model,
+            twin.source,
             twin.case.parameters,
             twin.truth_values,
             frames=twin.frames,
@@ -160,6 +207,25 @@ def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
         twin.model.on_step = bar.step
         result = estimate(twin.case, data.observation)
     return result.against(data.truth)
+
+
+def _confirm(twin: Twin, result: StudyResult) -> float | None:
+    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
+
+    None where closures were not continued, so that there is nothing to confirm, or where the new
+    closure failed.
+    """
+    if result.estimate is None or result.fitted is None or not twin.model.continuation:
+        return None
+    twin.model.continuation = False
+    with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
+        twin.model.on_step = bar.step
+        anew = ObservedFrames(twin.model, twin.frames)(result.estimate)
+    twin.model.continuation = True
+    if not anew.converged:
+        return None
+    last = anew.y.reshape(result.fitted.shape)[-1]
+    return float(np.linalg.norm(last - result.fitted[-1], axis=1).max())
 
 
 def _steps(model: ClosureModel) -> Sequence[object]:

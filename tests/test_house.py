@@ -37,6 +37,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),
     "mvest.estimation": LEAVES,
     "mvest.model": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
+    "mvest.gate": (*LEAVES, "mvest.model"),
+    "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
     "mvest.study": (
         *LEAVES,
         "mvest.provenance",

@@ -1,0 +1,203 @@
+"""The recorded donor valve: a table of its closures, and pictures of them on one scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from mvest.errors import InputError
+from mvest.provenance import write_json
+from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
+from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["donor_figure", "donor_text", "publish_donor", "write_donor_tables"]
+
+Record = Mapping[str, Any]
+
+PLAIN = np.array([0.82, 0.80, 0.76])
+"""Colour of the recorded valve, which has no distance from itself."""
+LIGHT = np.array([0.30, 0.50, 0.81])
+MISSING = "–"
+
+
+def donor_figure(fields: Path) -> Figure:
+    """The closed valve as recorded, with generic moduli and fitted, from two sides.
+
+    Parameters
+    ----------
+    fields : Path
+        An ``.npz`` file with ``triangles (m, 3)``, ``recorded``, ``generic`` and ``fitted``
+        ``(n, 3)`` mm, and ``annulus`` and ``free_edge`` vertices in loop order.
+    """
+    try:
+        with np.load(fields, allow_pickle=False) as data:
+            triangles, loops = data["triangles"], (data["annulus"], data["free_edge"])
+            shapes = {k: data[k].astype(float) for k in ("recorded", "generic", "fitted")}
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{fields}: no fields of a recorded valve ({error})") from error
+    distance = {
+        name: np.linalg.norm(points - shapes["recorded"], axis=1) for name, points in shapes.items()
+    }
+    norm = Normalize(0.0, max(float(np.max(list(distance.values()))), 1e-3))
+    scale = ScalarMappable(norm, DISTANCE_MAP)
+    everything = np.concatenate(list(shapes.values()))
+    span = everything.min(axis=0), everything.max(axis=0)
+    figure = Figure(figsize=(11.0, 7.2), layout="constrained")
+    panels = []
+    for row, (view, elevation, azimuth) in enumerate(VIEWS):
+        for column, (name, points) in enumerate(shapes.items()):
+            axes = figure.add_subplot(2, 3, 3 * row + column + 1, projection="3d")
+            colours = np.tile(PLAIN, (len(triangles), 1))
+            if name != "recorded":
+                colours = scale.to_rgba(distance[name][triangles].mean(axis=1))[:, :3]
+            _draw(axes, points, triangles, colours, loops, span)
+            axes.view_init(elevation, azimuth)
+            mean = "" if name == "recorded" else f", mean {distance[name].mean():.2f} mm"
+            axes.set_title(f"{name}{mean}\n{view}", fontsize=10)
+            panels.append(axes)
+    bar = figure.colorbar(scale, ax=panels, shrink=0.6, pad=0.02)
+    bar.set_label("distance from the recording [mm]")
+    return figure
+
+
+def _draw(
+    axes: Any,
+    points: FloatArray,
+    triangles: IntArray,
+    colours: FloatArray,
+    loops: tuple[IntArray, ...],
+    span: tuple[FloatArray, FloatArray],
+) -> None:
+    corner = points[triangles]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    shade = 0.55 + 0.45 * np.abs(normal @ LIGHT)
+    faces = Poly3DCollection(corner, facecolors=np.clip(colours * shade[:, None], 0, 1))
+    faces.set_edgecolor("none")
+    faces.set_rasterized(True)
+    axes.add_collection3d(faces)
+    for loop, colour in zip(loops, ("black", "0.35"), strict=True):
+        ring = points[np.append(loop, loop[0])]
+        axes.plot(*ring.T, color=colour, linewidth=1.0)
+    low, high = span
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_zlim(low[2], high[2])
+    axes.set_box_aspect(tuple(high - low), zoom=1.25)
+    axes.set_proj_type("ortho")
+    axes.set_axis_off()
+
+
+def _frame(record: Record) -> pd.DataFrame:
+    """One row for each closure: the generic one, then the fit from each start."""
+    rows = []
+    for row in record["rows"]:
+        plain: dict[str, Any] = {"closure": row["closure"]}
+        for key in ("start", "estimate", "std"):
+            values = row[key] or [None] * len(record["parameters"])
+            plain |= {
+                f"{key} {name} [MPa]": value
+                for name, value in zip(record["parameters"], values, strict=True)
+            }
+        distance = row["distance_mm"] or {}
+        for part in ("mean", "median", "rms", "max", *record["regions"]):
+            plain[f"distance {part} [mm]"] = distance.get(part)
+        for key in ("iterations", "forward_solves", "seconds", "reason"):
+            plain[key.replace("_", " ")] = row[key]
+        rows.append(plain)
+    return pd.DataFrame(rows)
+
+
+def _readable(record: Record) -> str:
+    """Markdown of the table, with the words that go with it."""
+    names = [name.partition(".")[2] for name in record["parameters"]]
+    head = [
+        "closure",
+        *(f"E {name} [MPa]" for name in names),
+        "mean [mm]",
+        "median [mm]",
+        "rms [mm]",
+        "max [mm]",
+        "forward solves",
+        "time [s]",
+        "ended",
+    ]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for row in record["rows"]:
+        values = row["estimate"] or row["start"]
+        std = row["std"] or [None] * len(names)
+        cells = [row["closure"]]
+        cells += [
+            f"{v:.3g}" if s is None else f"{v:.3g} ± {s:.2g}"
+            for v, s in zip(values, std, strict=True)
+        ]
+        distance = row["distance_mm"] or {}
+        for part in ("mean", "median", "rms", "max"):
+            cells.append(f"{distance[part]:.2f}" if part in distance else MISSING)
+        cells += [str(row["forward_solves"]), f"{row['seconds']:.0f}", row["reason"].split(":")[0]]
+        lines.append("| " + " | ".join(cells) + " |")
+    summary = record["summary"]
+    spread = summary["largest_difference_between_starts"]
+    lines += ["", record["claim"], "", f"Data: {record['data']['citation']}."]
+    facts = [
+        f"Mean motion of the leaflets between the open and the recorded closed frame: "
+        f"{summary['recorded_motion_mm']:.2f} mm."
+    ]
+    if spread is not None:
+        facts.append(
+            f"Largest relative difference between the moduli from the {summary['starts']} starts: "
+            f"{100 * spread:.2g} %."
+        )
+    if summary["closer_than_generic"] is not None:
+        verdict = "nearer to" if summary["closer_than_generic"] else "NOT nearer to"
+        facts.append(
+            f"The fitted closure is {verdict} the recording than the generic one: mean distance "
+            f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm."
+        )
+    return "\n".join([*lines, "", " ".join(facts)])
+
+
+def donor_text(record: Record) -> str:
+    """The table for the terminal."""
+    return _readable(record)
+
+
+def write_donor_tables(folder: Path, record: Record) -> list[Path]:
+    """Write ``donor.csv`` and ``donor.md``; returns their paths.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    line = provenance_line(record)
+    table = _frame(record).to_csv(index=False, float_format="%.6g")
+    title = f"# {record['title']}"
+    text = f"{title}\n\n{_readable(record)}\n\n<sub>{line}</sub>\n"
+    note = f"# {record['claim']}\n# data: {record['data']['citation']}\n# {line}\n"
+    return [
+        write_text(folder / "donor.csv", note + table),
+        write_text(folder / "donor.md", text),
+    ]
+
+
+def publish_donor(results: Path, record: Record, fields: Path) -> list[Path]:
+    """Keep the record, and write its table and its picture into the results."""
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {results}: {error.strerror}") from error
+    write_json(results / "donor.json", record)
+    return [
+        *write_donor_tables(results, record),
+        *save_figure(results / "donor", donor_figure(fields), record),
+    ]
