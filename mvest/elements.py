@@ -2,8 +2,8 @@
 
 Conventions
 -----------
-* Reference coordinates are ``(xi, eta, zeta)``. Bricks live on ``[-1, 1]^3``; tetrahedra on the unit
-  simplex; wedges on unit triangle ``x [-1, 1]``.
+* Reference coordinates are ``(xi, eta, zeta)``. Bricks live on ``[-1, 1]^3``; tetrahedra on the
+  unit simplex; wedges on unit triangle ``x [-1, 1]``.
 * ``zeta`` is the thickness direction of every layered element. By convention of the valve meshes it
   runs from the atrial (-1) to the ventricular (+1) face.
 * Node orders. Bricks are tensor products with ``xi`` fastest: node ``i + 3 j + 9 k`` sits at
@@ -213,8 +213,8 @@ def _wedge(name: str, thickness_order: int) -> Element:
     points = np.array([[*t, z] for z in g2 for t in _TRIANGLE_POINTS])
     weights = np.array([wt * wz for wz in w2 for wt in _TRIANGLE_WEIGHTS])
     zetas = (-1.0, 1.0) if thickness_order == 1 else (-1.0, 0.0, 1.0)
-    plane_nodes = [[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]]
-    nodes = np.array([[*p, z] for z in zetas for p in plane_nodes], dtype=float)
+    plane_nodes = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
+    nodes = np.array([[*p, z] for z in zetas for p in plane_nodes], dtype=np.float64)
     return Element(
         name=name,
         n_nodes=len(nodes),

@@ -1,9 +1,10 @@
 """Is the closed valve one state? A gate that every anatomy is asked to pass.
 
-An estimate is worth what the closed valve is worth: if a smaller time step, a finer mesh or a slightly
-different modulus sends the leaflets into another pleat, the moduli fitted to that state mean nothing.
-The gate closes the valve under variations that must not matter and compares the closed surfaces, and
-under changed moduli, where the change must be what the exact derivative predicts.
+An estimate is worth what the closed valve is worth: if a smaller time step, a finer mesh or a
+slightly different modulus sends the leaflets into another pleat, the moduli fitted to that state
+mean nothing. The gate closes the valve under variations that must not matter and compares the
+closed surfaces, and under changed moduli, where the change must be what the exact derivative
+predicts.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The joint of valve and mechanics: moduli in, geometry of the leaflets and its derivative out.
 
-``build_system`` hangs everything that acts on a valve into a solid mesh. All of it is defined in the
-reference frame and embedded, so the same valve gives the same loads, contact and observations in every
-mesh. ``ClosureModel`` is what a filter sees: a function from parameters to predicted positions and
-their Jacobian.
+``build_system`` hangs everything that acts on a valve into a solid mesh. All of it is defined in
+the reference frame and embedded, so the same valve gives the same loads, contact and observations
+in every mesh. ``ClosureModel`` is what a filter sees: a function from parameters to predicted
+positions and their Jacobian.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -145,10 +146,10 @@ class MechanicsSettings:
     """
 
     tissue: dict[str, TissueSettings]
-    protocol: ClosureProtocol = ClosureProtocol()
-    damping: Damping = Damping()
-    newton: NewtonSettings = NewtonSettings()
-    contact: ContactSettings = ContactSettings()
+    protocol: ClosureProtocol = field(default_factory=ClosureProtocol)
+    damping: Damping = field(default_factory=Damping)
+    newton: NewtonSettings = field(default_factory=NewtonSettings)
+    contact: ContactSettings = field(default_factory=ContactSettings)
     density: float = 1.04e-9
     support: str = "hinge"
     support_stiffness: float = 50.0
@@ -424,6 +425,6 @@ class ClosureModel:
         return Prediction(y, jacobian)
 
 
-def with_protocol(settings: MechanicsSettings, **changes: float) -> MechanicsSettings:
+def with_protocol(settings: MechanicsSettings, **changes: Any) -> MechanicsSettings:
     """Settings with some values of the protocol changed."""
     return replace(settings, protocol=replace(settings.protocol, **changes))

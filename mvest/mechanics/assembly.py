@@ -1,8 +1,9 @@
 """Where element arrays become global: the sparsity pattern and the scatter into it.
 
-Everything that adds stiffness does so as dense node-pair blocks: a group couples a list of row nodes
-with a list of column nodes, and its tangent is ``(rows, columns, 3, 3)``. The pattern is kept at node
-level (block rows of 3x3), so positions are looked up once and the scatter is a plain indexed addition.
+Everything that adds stiffness does so as dense node-pair blocks: a group couples a list of row
+nodes with a list of column nodes, and its tangent is ``(rows, columns, 3, 3)``. The pattern is kept
+at node level (block rows of 3x3), so positions are looked up once and the scatter is a plain
+indexed addition.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class Pattern:
         return cls(n, rows * n + total.indices)
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
-        """Positions ``(g, r, c)`` of the blocks that couple ``rows (g, r)`` and ``columns (g, c)``."""
+        """Positions ``(g, r, c)`` of the blocks coupling ``rows (g, r)`` and ``columns (g, c)``."""
         key = rows[:, :, None] * self.n + columns[:, None, :]
         return np.searchsorted(self.keys, key)
 

@@ -1,7 +1,7 @@
 r"""Chordae as tension-only cables, and the elastic hinge that holds the annulus.
 
-A cable runs from a prescribed papillary tip to a patch of the leaflet (a weighted average of material
-points). With strain :math:`e = L/L_0 - 1` and toe strain :math:`e_t` its force is
+A cable runs from a prescribed papillary tip to a patch of the leaflet (a weighted average of
+material points). With strain :math:`e = L/L_0 - 1` and toe strain :math:`e_t` its force is
 
 .. math::
     N(e) = EA \begin{cases} 0 & e \le 0 \\
@@ -98,8 +98,9 @@ class Cables:
 class Hinge:
     """Elastic support of material points: ``k |x - target|^2 / 2`` per point.
 
-    With thickness-averaged points it is a hinge (rotation about the annulus stays free); with points
-    on both faces it is a clamp. The stiffness is chosen so high that the support moves by micrometres.
+    With thickness-averaged points it is a hinge (rotation about the annulus stays free); with
+    points on both faces it is a clamp. The stiffness is chosen so high that the support moves by
+    micrometres.
 
     Parameters
     ----------

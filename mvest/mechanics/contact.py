@@ -6,8 +6,8 @@ material points of the midsurface and needs no projections, normals or facets: w
 
 .. math:: \Pi = \sum_{i<j} a_i a_j \, \varphi_{ij}(|x_i - x_j|) ,
 
-a quadrature of a double surface integral, as smooth in the positions as :math:`\varphi` is. The kernel
-is derived from the law that one wants: two parallel sheets at distance d with the potential
+a quadrature of a double surface integral, as smooth in the positions as :math:`\varphi` is. The
+kernel is derived from the law that one wants: two parallel sheets at distance d with the potential
 :math:`\varphi` press on each other with :math:`p(d) = 2 \pi d \varphi(d)` (differentiate
 :math:`2\pi\int_d^h \varphi(r) r dr`, the energy per area). Hence
 
@@ -17,21 +17,23 @@ is derived from the law that one wants: two parallel sheets at distance d with t
     \quad (r_b < r < h), \qquad 0 \quad (r \ge h),
 
 three times continuously differentiable at the activation distance h. The contact pressure is
-:math:`p_0` exactly at the midsurface distance :math:`r_0`, and a barrier at :math:`r_b` keeps any two
-points apart however concentrated the load (a free edge pressed into the other leaflet). Because the
-sheets stay a thickness apart, the sum over points spaced by s approaches the integral exponentially,
-with an error of the order :math:`e^{-2\pi r_0/s}` (Poisson summation), so the points' pattern is not
-felt.
+:math:`p_0` exactly at the midsurface distance :math:`r_0`, and a barrier at :math:`r_b` keeps any
+two points apart however concentrated the load (a free edge pressed into the other leaflet). Because
+the sheets stay a thickness apart, the sum over points spaced by s approaches the integral
+exponentially, with an error of the order :math:`e^{-2\pi r_0/s}` (Poisson summation), so the
+points' pattern is not felt.
 
 Distances scale with the local thickness t (mean of the two points): :math:`r_0 = c_0 t`,
-:math:`h = c_h t`, :math:`r_b = 0.85 r_0`; with :math:`r_b \ge t` the thick leaflets cannot overlap. Neighbours on the same sheet must not repel each other: the reach of a pair is
-shortened to ``NEIGHBOUR * D`` where D is its distance at rest, so that no pair is active in the
-stress-free state and the same rule serves pleats, commissures and leaflets alike.
+:math:`h = c_h t`, :math:`r_b = 0.85 r_0`; with :math:`r_b \ge t` the thick leaflets cannot overlap.
+Neighbours on the same sheet must not repel each other: the reach of a pair is shortened to
+``NEIGHBOUR * D`` where D is its distance at rest, so that no pair is active in the stress-free
+state and the same rule serves pleats, commissures and leaflets alike.
 
 No passing: no Newton step takes the triangulated midsurface samples through each other (continuous
-collision detection along the step, Li et al. 2020, ACM Trans. Graph. 39(4):49, by the IPC toolkit), nor
-does it take from a known pair more than three quarters of its distance to the barrier. So the leaflets can never
-change sides. Every accepted time step is checked for intersecting triangles besides.
+collision detection along the step, Li et al. 2020, ACM Trans. Graph. 39(4):49, by the IPC toolkit),
+nor does it take from a known pair more than three quarters of its distance to the barrier. So the
+leaflets can never change sides. Every accepted time step is checked for intersecting triangles
+besides.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ from mvest.valve.embedding import Embedding
 __all__ = ["Contact", "ContactPairs", "ContactSettings"]
 
 NEIGHBOUR = 0.8
-"""Reach of a pair over its rest distance, at most: contact within a sheet starts at 20 % compression."""
+"""Reach of a pair over its rest distance, at most: a sheet touches itself from 20 % compression."""
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
 APPROACH = 0.75
@@ -183,8 +185,8 @@ class Contact:
         i, j, reach, full, mean = i[order], j[order], reach[order], full[order], mean[order]
         hosts = np.column_stack([host[i], host[j]])
         change = np.flatnonzero(np.any(np.diff(hosts, axis=0) != 0, axis=1)) + 1
-        start = np.concatenate([[0], change, [len(i)]]) if len(i) else np.zeros(1)
-        start = start.astype(np.int64)
+        ends = np.concatenate([change, [len(i)]]) if len(i) else np.zeros(0)
+        start = np.concatenate([[0], ends]).astype(np.int64)
         reference = self.settings.reference_distance * mean * reach / full
         return ContactPairs(i, j, reach, reference, start, hosts[start[:-1]], y.copy())
 

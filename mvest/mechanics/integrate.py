@@ -5,9 +5,10 @@ Backward Euler: with :math:`v_{n+1} = (x_{n+1} - x_n)/\Delta t` each step solves
 .. math:: M (v_{n+1} - v_n)/\Delta t + \alpha M v_{n+1}
           + f_{int}(x_{n+1}; \epsilon_n) - f_{ext}(x_{n+1}, t_{n+1}) = 0
 
-by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step that
-fails (no convergence, leaflets through each other) is halved; nothing is ever accepted unconverged,
-except in the single-solve mode, which takes one linearised solve per step by definition.
+by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step
+that fails (no convergence, leaflets through each other) is halved; nothing is ever accepted
+unconverged, except in the single-solve mode, which takes one linearised solve per step by
+definition.
 
 Sensitivities differentiate these discrete equations (Michaleris, Tortorelli and Vidal 1994, Int. J.
 Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for each parameter m,
@@ -185,7 +186,7 @@ class _Solved:
     pairs: ContactPairs | None = None
 
 
-class _Failure(Exception):
+class _StepError(Exception):
     def __init__(self, reason: Reason) -> None:
         self.reason = reason
 
@@ -264,14 +265,15 @@ def simulate(
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
     if final_only and steps[-1].static:
         stepper.differentiate = False
-    frames, sensitivities, done, records = [x0], [state.dx], [0.0], []
+    frames, sensitivities, done = [x0], [state.dx], [0.0]
+    records: list[StepRecord] = []
     reason = Reason.COMPLETED
     for step in steps:
         if step is steps[-1]:
             stepper.differentiate = True
         try:
             state = stepper.advance(state, done[-1], step, records)
-        except _Failure as failure:
+        except _StepError as failure:
             reason = failure.reason
             break
         frames.append(state.x)
@@ -312,7 +314,7 @@ class _Stepper:
             end, level = pending[-1]
             try:
                 new, solved = self._step(state, time, end, step.static)
-            except _Failure:
+            except _StepError:
                 if level >= self.newton.max_halvings or step.static:
                     raise
                 pending.append((0.5 * (time + end), level + 1))
@@ -347,7 +349,7 @@ class _Stepper:
         solved = self._newton(state, loads, rate, mass_factor, push, advance)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
-            raise _Failure(Reason.INTERSECTION)
+            raise _StepError(Reason.INTERSECTION)
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
         new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, dt)
@@ -399,7 +401,7 @@ class _Stepper:
         residuals = [float(np.linalg.norm(current.residual)) / current.scale]
         for _ in range(newton.max_iterations):
             if not np.isfinite(residuals[-1]):
-                raise _Failure(Reason.NO_CONVERGENCE)
+                raise _StepError(Reason.NO_CONVERGENCE)
             assert current.blocks is not None
             converged = residuals[-1] <= newton.tolerance
             if converged and not (self.parameters and self.differentiate):
@@ -411,9 +413,9 @@ class _Stepper:
                 forcing = min(1e-2, max(1e-9, residuals[-1]))
                 d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
-                raise _Failure(Reason.SINGULAR) from error
+                raise _StepError(Reason.SINGULAR) from error
             if not np.isfinite(d).all():
-                raise _Failure(Reason.SINGULAR)
+                raise _StepError(Reason.SINGULAR)
             if converged or float(np.abs(d).max()) <= newton.smallest_move:
                 # The factor of the converged state is kept for the sensitivities.
                 return _Solved(x, current, residuals, pairs)
@@ -423,7 +425,7 @@ class _Stepper:
                 assert current.blocks is not None
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
                 return _Solved(x, current, residuals, pairs)
-        raise _Failure(Reason.NO_CONVERGENCE)
+        raise _StepError(Reason.NO_CONVERGENCE)
 
     def _line_search(
         self,
@@ -456,7 +458,7 @@ class _Stepper:
                     best = (new_slope, trial, result)
             factor *= 0.5
         if best is None:
-            raise _Failure(Reason.NO_CONVERGENCE)
+            raise _StepError(Reason.NO_CONVERGENCE)
         return best[1], best[2]
 
     def _differentiate(

@@ -12,17 +12,19 @@ With the right stretch :math:`U = \sqrt{I + 2E}` and the Biot strain :math:`\eps
     D(E) &= L^T C L + T : d^2\epsilon / dE^2 .
 
 This is the energy-consistent corotational ("large displacement, small strain") form: the second
-Piola-Kirchhoff stress S is the derivative of the energy also where U and C : epsilon do not commute,
-a term that the usual corotational element force ``R K (R^T x - X)`` drops for an anisotropic C.
+Piola-Kirchhoff stress S is the derivative of the energy also where U and C : epsilon do not
+commute, a term that the usual corotational element force ``R K (R^T x - X)`` drops for an
+anisotropic C.
 
 In the eigenbasis of U (eigenvalues l_i): ``L: dE_ij -> 2 dE_ij / (l_i + l_j)`` and, from
 differentiating ``U U = I + 2E`` twice, ``T : d2U = -S : (dU dU) `` twice polarised, with
-``S_ij = 2 T_ij / (l_i + l_j)``. No difference of eigenvalues appears, so coinciding stretches need no
-special case.
+``S_ij = 2 T_ij / (l_i + l_j)``. No difference of eigenvalues appears, so coinciding stretches need
+no special case.
 
-Kelvin-Voigt damping (the stiffness-proportional part of Rayleigh damping in its objective form) adds
-``beta d(epsilon)/dt`` to epsilon; with backward Euler ``T = C : (epsilon + rate (epsilon - epsilon_n))``
-where ``rate = beta / dt``. It neither resists nor drives rigid rotation.
+Kelvin-Voigt damping (the stiffness-proportional part of Rayleigh damping in its objective form)
+adds ``beta d(epsilon)/dt`` to epsilon; with backward Euler
+``T = C : (epsilon + rate (epsilon - epsilon_n))`` where ``rate = beta / dt``. It neither resists
+nor drives rigid rotation.
 """
 
 from __future__ import annotations
@@ -89,8 +91,9 @@ class TransverselyIsotropic:
         margin = 1 - self.nu_pp - 2 * self.nu_fp**2 * self.E_p / self.E_f
         if not margin > 0:
             raise MaterialError(
-                f"not positive definite: 1 - nu_pp - 2 nu_fp^2 E_p/E_f = {margin:.4g}, expected > 0 "
-                f"(E_f = {self.E_f}, E_p = {self.E_p} MPa, nu_fp = {self.nu_fp}, nu_pp = {self.nu_pp})"
+                f"not positive definite: 1 - nu_pp - 2 nu_fp^2 E_p/E_f = {margin:.4g}, "
+                f"expected > 0 (E_f = {self.E_f}, E_p = {self.E_p} MPa, "
+                f"nu_fp = {self.nu_fp}, nu_pp = {self.nu_pp})"
             )
 
     @classmethod
@@ -189,7 +192,7 @@ class BiotLaw:
 
 @nb.njit(cache=True)
 def _eigen(a: FloatArray, q: FloatArray) -> None:
-    """Diagonalise the symmetric 3x3 ``a`` in place by cyclic Jacobi; ``q`` gets the eigenvectors."""
+    """Diagonalise the symmetric 3x3 ``a`` in place (cyclic Jacobi); ``q`` gets the eigenvectors."""
     for i in range(3):
         for j in range(3):
             q[i, j] = 1.0 if i == j else 0.0
@@ -230,8 +233,8 @@ def _stretch(green: FloatArray, q: FloatArray, lam: FloatArray, u: FloatArray) -
     a[0, 1] = a[1, 0] = green[5]
     _eigen(a, q)
     for i in range(3):
-        # An enhanced strain can leave the admissible set during a Newton iteration; a positive floor
-        # keeps the numbers finite, and the line search rejects such a state by its residual.
+        # An enhanced strain can leave the admissible set during a Newton iteration; a positive
+        # floor keeps the numbers finite, and the line search rejects such a state by its residual.
         lam[i] = np.sqrt(max(a[i, i], 1e-6))
     for i in range(3):
         for j in range(3):

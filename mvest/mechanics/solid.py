@@ -5,15 +5,16 @@ stress from a law, and knows neither global degrees of freedom nor what the law 
 element arrays (element axis first) and return element arrays; :mod:`mvest.mechanics.assembly`
 scatters.
 
-Kinematics. Shape-function gradients are stored along the axes of the fibre frame Q of each quadrature
-point, ``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange strain comes
-out in the fibre frame in which the law lives.
+Kinematics. Shape-function gradients are stored along the axes of the fibre frame Q of each
+quadrature point, ``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange
+strain comes out in the fibre frame in which the law lives.
 
-Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = (det J0 / det J) (G^3 x G^3) p``
-(G^3 the contravariant thickness vector at the centre). The parameters alpha of an element solve
-``int M^T S dV = 0`` and are eliminated inside the element by Newton's method at every evaluation, so
-that to the outside the element has an energy of nodal positions only (its condensed tangent is the
-Schur complement). The modes integrate to zero against constant stress: the patch test holds.
+Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with
+``M = (det J0 / det J) (G^3 x G^3) p`` (G^3 the contravariant thickness vector at the centre). The
+parameters alpha of an element solve ``int M^T S dV = 0`` and are eliminated inside the element by
+Newton's method at every evaluation, so that to the outside the element has an energy of nodal
+positions only (its condensed tangent is the Schur complement). The modes integrate to zero against
+constant stress: the patch test holds.
 """
 
 from __future__ import annotations
@@ -187,7 +188,8 @@ class Solid:
 
     def _alpha_change(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
         residual, matrix = _enhanced_system(self.modes, self.volumes, d_stress, state.tangent)
-        return -np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
+        change = np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
+        return np.asarray(-change, dtype=np.float64)
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
@@ -255,7 +257,8 @@ def _lumped_volume(mesh: SolidMesh, reference: Element, volumes: FloatArray) -> 
     shape = reference.shape(reference.points)
     diagonal = np.einsum("qa,eq->ea", shape**2, volumes)
     share = diagonal / diagonal.sum(axis=1, keepdims=True) * volumes.sum(axis=1, keepdims=True)
-    return np.bincount(mesh.elements.ravel(), share.ravel(), minlength=len(mesh.nodes))
+    mass = np.bincount(mesh.elements.ravel(), share.ravel(), minlength=len(mesh.nodes))
+    return np.asarray(mass, dtype=np.float64)
 
 
 @nb.njit(cache=True)

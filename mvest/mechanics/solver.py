@@ -74,7 +74,8 @@ class PardisoSolver:
             if old is not None:
                 self._solver.free_memory(everything=True)
             self._analyse(matrix)
-        assert self._take is not None and self._upper is not None
+        assert self._take is not None
+        assert self._upper is not None
         here, mirror = self._take
         upper, lower = matrix.data[here], matrix.data[mirror]
         self._upper.data = 0.5 * (upper + lower)
@@ -116,23 +117,25 @@ class PardisoSolver:
         if self._symmetric:
             return start
         if right.ndim == 1:
-            return self._refine(right, start, tolerance)
-        return np.stack(
-            [self._refine(right[:, k], start[:, k], tolerance) for k in range(right.shape[1])],
-            axis=1,
-        )
+            return self._refine(self._matrix, right, start, tolerance)
+        columns = [
+            self._refine(self._matrix, right[:, k], start[:, k], tolerance)
+            for k in range(right.shape[1])
+        ]
+        return np.stack(columns, axis=1)
 
-    def _refine(self, right: FloatArray, start: FloatArray, tolerance: float) -> FloatArray:
-        shape = self._upper.shape if self._upper is not None else (0, 0)
+    def _refine(
+        self, matrix: sparse.csr_matrix, right: FloatArray, start: FloatArray, tolerance: float
+    ) -> FloatArray:
         solution, _ = gmres(
-            self._matrix,
+            matrix,
             right,
             x0=start,
             rtol=tolerance,
             atol=0.0,
             restart=60,
             maxiter=3,
-            M=LinearOperator(shape, matvec=self._precondition, dtype=np.float64),
+            M=LinearOperator(matrix.shape, matvec=self._precondition, dtype=np.float64),
         )
         return np.asarray(solution)
 

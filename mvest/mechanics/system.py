@@ -1,8 +1,8 @@
 """All forces of a body at one instant: residual, consistent tangent and partial derivatives.
 
 The residual is written as internal minus external force, so that equilibrium is ``r(x) = 0``:
-``r = f_solid + f_cables + f_contact + f_hinge - p f_pressure``; the time integrator adds inertia and
-mass-proportional damping. The tangent is dr/dx, exact in every term.
+``r = f_solid + f_cables + f_contact + f_hinge - p f_pressure``; the time integrator adds inertia
+and mass-proportional damping. The tangent is dr/dx, exact in every term.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class System:
         self.solid.reset()
         self.factors = factors
 
-    # -- sparsity -----------------------------------------------------------------------------------
+    # -- sparsity ---------------------------------------------------------------------------------
     def _static_groups(self) -> list[IntArray]:
         groups = [self.solid.mesh.elements]
         if self.pressure is not None:
@@ -179,24 +179,23 @@ class System:
         """Candidate pairs at nodal positions ``x``."""
         return None if self.contact is None else self.contact.search(self.contact.points(x))
 
-    def _contact_slots(self, pairs: ContactPairs, y: FloatArray) -> IntArray:
+    def _contact_slots(self, contact: Contact, pairs: ContactPairs, y: FloatArray) -> IntArray:
         """Where the groups of ``pairs`` lie in the contact positions; renews the pattern if needed.
 
         The pattern holds the groups that touch and those that are about to, and nothing else:
         entries that are always zero would fill the factor.
         """
-        assert self.contact is not None
         hosts = list(map(tuple, pairs.hosts.tolist()))
-        touching = self.contact.touching(pairs, y)
+        touching = contact.touching(pairs, y)
         if any(t and h not in self._slots for h, t in zip(hosts, touching, strict=True)):
-            near = self.contact.touching(pairs, y, CONTACT_MARGIN)
+            near = contact.touching(pairs, y, CONTACT_MARGIN)
             groups = pairs.hosts[near]
             self._slots = {h: k for k, h in enumerate(map(tuple, groups.tolist()))}
             self._build_pattern(groups)
         slots = [self._slots.get(h, -1) if t else -1 for h, t in zip(hosts, touching, strict=True)]
         return np.array(slots, dtype=np.int64)
 
-    # -- evaluation ---------------------------------------------------------------------------------
+    # -- evaluation -------------------------------------------------------------------------------
     def evaluate(
         self,
         x: FloatArray,
@@ -216,7 +215,7 @@ class System:
         slots = None
         if tangent:
             if self.contact is not None and pairs is not None:
-                slots = self._contact_slots(pairs, self.contact.points(x))
+                slots = self._contact_slots(self.contact, pairs, self.contact.points(x))
             blocks = self.pattern.zeros()
             scatter_matrices(blocks, self._at_elements, self.solid.tangents(state))
         p = self.factors.pressure * loads.pressure
@@ -231,7 +230,7 @@ class System:
             residual -= loads.body_force
             scale = max(scale, float(np.linalg.norm(loads.body_force)))
         if self.cables is not None:
-            force, stiffness, _, _ = self._cable_forces(x, loads)
+            force, stiffness, _, _ = self._cable_forces(self.cables, x, loads)
             patches = self.cables.patches
             add_forces(residual, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
             if blocks is not None:
@@ -254,15 +253,14 @@ class System:
         return Evaluation(residual, scale, state, blocks)
 
     def _cable_forces(
-        self, x: FloatArray, loads: Loads
+        self, cables: Cables, x: FloatArray, loads: Loads
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        assert self.cables is not None
-        return self.cables.forces(
+        return cables.forces(
             x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
         )
 
     def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.csr_matrix:
-        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times the lumped mass; fixed rows are identity."""
+        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; fixed rows are identity."""
         blocks = blocks.copy()
         for i in range(3):
             blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
@@ -285,7 +283,7 @@ class System:
         matrix.has_sorted_indices = True
         return matrix
 
-    # -- partial derivatives ------------------------------------------------------------------------
+    # -- partial derivatives ----------------------------------------------------------------------
     def partial_stress(self, parameter: Parameter, state: SolidState) -> FloatArray:
         """Partial derivative of the stress ``(e, q, 6)`` by the parameter, at fixed strain."""
         if parameter.kind != "E_f":
@@ -300,7 +298,7 @@ class System:
         return by_log / parameter.value
 
     def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
-        """Partial derivative of the residual ``(n, 3)`` by the parameter, the solid's part aside."""
+        """Partial derivative ``(n, 3)`` of the residual by the parameter, solid's part excluded."""
         try:
             derivative = PARTIAL_DERIVATIVES[parameter.kind]
         except KeyError:
@@ -326,7 +324,7 @@ def _by_cables(index: int) -> Callable[[System, FloatArray, Loads], FloatArray]:
     def derivative(system: System, x: FloatArray, loads: Loads) -> FloatArray:
         out = np.zeros((system.n, 3))
         if system.cables is not None:
-            force = system._cable_forces(x, loads)[index]
+            force = system._cable_forces(system.cables, x, loads)[index]
             patches = system.cables.patches
             add_forces(out, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
         return out

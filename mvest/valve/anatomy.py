@@ -1,7 +1,8 @@
 """Value objects of the anatomy: leaflets, chordae, motion of the boundary, and the valve they form.
 
-All lengths are millimetres. Every object is frozen and checked on construction, so that a valve that
-exists is a valve that makes sense; the message of a failed check names the field and the entry.
+All lengths are millimetres. Every object is frozen and checked on construction, so that a valve
+that exists is a valve that makes sense; the message of a failed check names the field and the
+entry.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ __all__ = ["Chordae", "LeafletSurface", "Motion", "Valve", "lumped_areas", "vert
 
 
 def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
-    """``array`` as float64 after checking its shape (None matches any length) and its finiteness."""
+    """``array`` as float64 after checking its shape (None matches any length) and finiteness."""
     result = np.ascontiguousarray(array, dtype=np.float64)
     if result.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
@@ -61,7 +62,8 @@ def lumped_areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     area = 0.5 * np.linalg.norm(
         np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
     )
-    return np.bincount(triangles.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
+    total = np.bincount(triangles.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
+    return np.asarray(total, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,8 +189,8 @@ class Motion:
     Attributes
     ----------
     phase : ndarray
-        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame); the loading decides
-        how phase runs in time.
+        ``(f,)`` strictly increasing from 0 (reference frame) to 1 (closed frame); the loading
+        decides how phase runs in time.
     annulus : ndarray
         ``(f, n_annulus, 3)`` mm; entry 0 equals the reference positions.
     papillary_tips : ndarray

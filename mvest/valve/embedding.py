@@ -1,8 +1,8 @@
 """Material points embedded in a solid mesh.
 
-Whatever must not depend on the mesh (observation vertices, contact samples, chord patches, the hinge)
-is given as points of the reference frame. Here they get a host element and shape-function weights, so
-that the position of a point is ``weights @ nodal positions`` in any state and any mesh.
+Whatever must not depend on the mesh (observation vertices, contact samples, chord patches, the
+hinge) is given as points of the reference frame. Here they get a host element and shape-function
+weights, so that the position of a point is ``weights @ nodal positions`` in any state and any mesh.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ __all__ = ["SolidMesh", "jacobian_determinants"]
 def jacobian_determinants(
     nodes: FloatArray, elements: IntArray, reference: Element, points: FloatArray
 ) -> FloatArray:
-    """Determinants ``(m, q)`` in mm^3 of the map from the reference element at ``points (q, 3)``."""
+    """Determinants ``(m, q)``, mm^3, of the map from the reference element at ``points (q, 3)``."""
     gradient = reference.gradient(points)
     jacobian = np.einsum("mai,qaj->mqij", nodes[elements], gradient)
     return np.linalg.det(jacobian)
@@ -40,8 +40,8 @@ class SolidMesh:
         ``(m,)`` index into ``region_names``.
     region_names : tuple of str
     fibre : ndarray
-        ``(m, k, 3)`` unit collagen directions at the nodes of each element, so that the direction may
-        jump between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
+        ``(m, k, 3)`` unit collagen directions at the nodes of each element, so that the direction
+        may jump between leaflets. ``(n, 3)``, one direction per node, is accepted and expanded.
     pressure_faces : ndarray
         ``(f, kf)`` nodes of the ventricular faces, normals pointing out of the solid.
 

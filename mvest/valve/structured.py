@@ -1,7 +1,7 @@
 """Layered solid meshes of the template: bricks, or prisms split into tetrahedra.
 
-Every node is placed on the exact surface in material coordinates, so that refined meshes converge to
-one and the same body.
+Every node is placed on the exact surface in material coordinates, so that refined meshes converge
+to one and the same body.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from mvest.valve.template import ANTERIOR, POSTERIOR, REGIONS, Template
 
 __all__ = ["structured_mesh"]
 
-# A prism 0 1 2 (bottom) 3 4 5 (top) as three tetrahedra. The diagonal of each quadrilateral side runs
-# from the bottom node with the smaller rank; ranks increase 0 < 1 < 2, so neighbours agree.
+# A prism 0 1 2 (bottom) 3 4 5 (top) as three tetrahedra. The diagonal of each quadrilateral side
+# runs from the bottom node with the smaller rank; ranks increase 0 < 1 < 2, so neighbours agree.
 _PRISM = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
 
 
@@ -42,14 +42,19 @@ def structured_mesh(
     """
     if columns < 6 or columns % 2 or rows < 1 or layers < 1:
         raise InputError(
-            f"mesh of {columns} x {rows} x {layers} cells, expected an even number >= 6 of columns, "
-            "rows >= 1 and layers >= 1"
+            f"mesh of {columns} x {rows} x {layers} cells, expected an even number >= 6 of "
+            "columns, rows >= 1 and layers >= 1"
         )
     if element in ("hex18", "hex27"):
         return _bricks(template, element, columns, rows, layers)
     if element in ("tet4", "tet10"):
         return _tetrahedra(template, element, columns, rows, layers)
     raise InputError(f"no structured mesh of {element!r}; known: hex18, hex27, tet4, tet10")
+
+
+def _grid(*sizes: int) -> tuple[IntArray, ...]:
+    """Raveled index grids of the ``sizes``, the last index fastest."""
+    return tuple(v.ravel() for v in np.meshgrid(*map(np.arange, sizes), indexing="ij"))
 
 
 def _region(columns: int, cell: IntArray) -> IntArray:
@@ -67,12 +72,12 @@ def _bricks(template: Template, element: str, columns: int, rows: int, layers: i
     n_phi, n_s = 2 * columns, 2 * rows + 1
     per_cell = 1 if element == "hex18" else 2
     n_z = per_cell * layers + 1
-    k, j, i = (v.ravel() for v in np.meshgrid(np.arange(n_z), np.arange(n_s), np.arange(n_phi), indexing="ij"))  # fmt: skip
+    k, j, i = _grid(n_z, n_s, n_phi)
     phi, s, zeta = 360.0 * i / n_phi, j / (n_s - 1), -1 + 2.0 * k / (n_z - 1)
     nodes = template.position(phi, s, zeta)
     # xi runs against phi so that (xi, eta, zeta) is right-handed with zeta to the ventricle.
-    cz, cj, ci = (v.ravel() for v in np.meshgrid(np.arange(layers), np.arange(rows), np.arange(columns), indexing="ij"))  # fmt: skip
-    lk, lj, li = (v.ravel() for v in np.meshgrid(np.arange(per_cell + 1), np.arange(3), np.arange(3), indexing="ij"))  # fmt: skip
+    cz, cj, ci = _grid(layers, rows, columns)
+    lk, lj, li = _grid(per_cell + 1, 3, 3)
     at_i = 2 * ci[:, None] + (2 - li)
     at_j = 2 * cj[:, None] + lj
     at_k = per_cell * cz[:, None] + lk
@@ -88,7 +93,7 @@ def _tetrahedra(
 ) -> SolidMesh:
     # Everything on the twice finer parameter grid, so that midside nodes lie on the exact surface.
     n_phi, n_s, n_z = 2 * columns, 2 * rows + 1, 2 * layers + 1
-    cz, cj, ci = (v.ravel() for v in np.meshgrid(np.arange(layers), np.arange(rows), np.arange(columns), indexing="ij"))  # fmt: skip
+    cz, cj, ci = _grid(layers, rows, columns)
 
     def corner(di: int, dj: int, dk: int) -> IntArray:
         return np.stack([2 * (ci + di), 2 * (cj + dj), 2 * (cz + dk)], axis=-1)

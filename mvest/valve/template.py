@@ -7,8 +7,8 @@ Material coordinates
 * ``s`` in [0, 1] runs from the annulus to the free edge.
 * ``zeta`` in [-1, 1] runs through the thickness from the atrial to the ventricular face.
 
-Axes: x commissural, y towards the anterior side, z towards the atrium; the ventricle and the papillary
-tips lie at negative z. All lengths are mm.
+Axes: x commissural, y towards the anterior side, z towards the atrium; the ventricle and the
+papillary tips lie at negative z. All lengths are mm.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class Template:
     def __init__(self, parameters: TemplateParameters | None = None) -> None:
         self.parameters = parameters or TemplateParameters()
 
-    # -- surface ------------------------------------------------------------------------------------
+    # -- surface ----------------------------------------------------------------------------------
     def annulus(self, phi: FloatArray) -> FloatArray:
         """Annulus points ``(k, 3)`` in the reference frame."""
         p = self.parameters
@@ -253,12 +253,13 @@ class Template:
         if np.any(length <= reach):
             k = int(np.argmax(reach - length))
             raise GeometryError(
-                f"the leaflet at phi = {np.ravel(phi)[k]:.0f} degrees is {np.ravel(length)[k]:.1f} mm "
-                f"long and cannot reach its free edge, {np.ravel(reach)[k]:.1f} mm away"
+                f"the leaflet at phi = {np.ravel(phi)[k]:.0f} degrees is "
+                f"{np.ravel(length)[k]:.1f} mm long and cannot reach its free edge, "
+                f"{np.ravel(reach)[k]:.1f} mm away"
             )
         drop = np.sqrt(length**2 - reach**2)
         span = np.concatenate([across, -drop[..., None]], axis=-1)
-        # The belly lies towards the lumen, perpendicular to the chord in the chord's vertical plane.
+        # The belly lies towards the lumen, perpendicular to the chord in its vertical plane.
         inward = across / reach[..., None]
         belly = np.concatenate(
             [inward * (drop / length)[..., None], (reach / length)[..., None]], axis=-1
@@ -302,7 +303,7 @@ class Template:
         across = np.cross(normal, t)
         return np.cos(angle)[..., None] * t + np.sin(angle)[..., None] * across
 
-    # -- what hangs on it ---------------------------------------------------------------------------
+    # -- what hangs on it -------------------------------------------------------------------------
     @property
     def papillary_tips(self) -> FloatArray:
         """``(2, 3)`` mm."""
