@@ -67,6 +67,15 @@ class ObservationConfig:
 
 
 @dataclass
+class DonorConfig:
+    """What a study of the recorded donor valve adds."""
+
+    vertices: int = 430  # of the midsurface that is meshed and observed
+    contact_vertices: int = 3000  # of the midsurface on which contact is sampled
+    starts: list[Any] = field(default_factory=list)  # MPa, moduli from which each fit starts
+
+
+@dataclass
 class TruthConfig:
     """What the synthetic observation is made from; null means as the estimator's model."""
 
@@ -98,6 +107,7 @@ class PathsConfig:
 
     outputs: str = "outputs"
     results: str = "results"
+    donor: str = "${oc.env:MVEST_TRIVALVE,../shared/data/trivalve}"  # recorded donor valve
 
 
 @dataclass
@@ -140,6 +150,7 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)
+    donor: DonorConfig = field(default_factory=DonorConfig)
     continuation: bool = True  # later closures start from the last closed state
     confirm: bool = True  # close the fitted valve anew from the open state
     seed: int = 1

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from experiments.build import Twin, build_twin
 from experiments.config import NOT_THE_RESULT, hash_of, register
+from experiments.donor import run_donor
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.progress import SolveBar
 from experiments.record import make_record, measure_frames, write_fields
@@ -24,6 +25,7 @@ from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.model import ClosureModel
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
+from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.publish import publish
@@ -184,6 +186,12 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "donor": Study(
+        run_donor,
+        donor_text,
+        write_donor_tables,
+        lambda results, _, record, folder: publish_donor(results, record, folder / "fields.npz"),
     ),
 }
 """Kinds of studies that a configuration can name."""

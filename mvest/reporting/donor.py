@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mvest.errors import InputError
 from mvest.provenance import write_json
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import provenance_line, write_text
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["donor_figure", "donor_text", "publish_donor", "write_donor_tables"]
