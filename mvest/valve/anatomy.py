@@ -18,8 +18,8 @@ __all__ = ["Chordae", "LeafletSurface", "Motion", "Valve", "lumped_areas", "vert
 
 
 def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
-    """``array`` as float64 after checking its shape (None matches any length) and finiteness."""
-    result = np.ascontiguousarray(array, dtype=np.float64)
+    """A copy of ``array`` as float64, its shape (None: any length) and finiteness checked."""
+    result = np.array(array, dtype=np.float64, order="C")
     if result.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
     ):
@@ -32,8 +32,11 @@ def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> Floa
 
 
 def _indices(name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]) -> IntArray:
-    """``array`` as int64 after checking its shape and that ``0 <= array < upper``."""
-    result = np.ascontiguousarray(array, dtype=np.int64)
+    """A copy of ``array`` as int64, its shape and ``0 <= array < upper`` checked."""
+    given = np.asarray(array)
+    if given.size and not np.issubdtype(given.dtype, np.integer):
+        raise InputError(f"{name}: {given.dtype}, expected integers")
+    result = np.array(given, dtype=np.int64, order="C")
     if result.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
     ):
@@ -113,7 +116,7 @@ class LeafletSurface:
         length = np.linalg.norm(fibre, axis=1)
         if np.any(length < 1e-8):
             raise GeometryError(f"fibre of vertex {int(np.argmin(length))} has no direction")
-        set_(self, "fibre", fibre / length[:, None])
+        set_(self, "fibre", _finite("fibre", fibre / length[:, None], (n, 3)))
 
     @property
     def normals(self) -> FloatArray:

@@ -48,8 +48,8 @@ class SolidMesh:
     Raises
     ------
     InputError, GeometryError
-        On wrong shapes, values that are not finite, unused nodes, or an element whose Jacobian
-        determinant is not positive at a quadrature point.
+        On wrong shapes, values that are not finite, unused nodes, fibres without direction, or an
+        element whose Jacobian determinant is not positive at a quadrature point.
     """
 
     nodes: FloatArray
@@ -75,6 +75,10 @@ class SolidMesh:
         if fibre.shape == (n, 3):
             fibre = fibre[self.elements]
         set_(self, "fibre", _finite("mesh fibre", fibre, (m, reference.n_nodes, 3)))
+        blank = np.argwhere(np.linalg.norm(self.fibre, axis=2) < 1e-8)
+        if blank.size:
+            e, a = blank[0]
+            raise GeometryError(f"fibre at node {a} of element {e} has no direction")
         face_nodes = FACES[reference.face].n_nodes
         faces = _indices("pressure_faces", self.pressure_faces, n, (None, face_nodes))
         set_(self, "pressure_faces", faces)
