@@ -17,6 +17,8 @@ from mvest.gate import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateCase, GateRow, ru
 from mvest.model import ClosureModel
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
+from mvest.valve.embedding import embed
+from mvest.valve.surfaces import thicken
 
 __all__ = ["run_closure_study", "run_gate_study"]
 
@@ -104,9 +106,10 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
     record |= {"rows": [_plain(asdict(s)) for s in steps], "contact_distance_mm": distance}
     if not result.simulation.converged:
         record |= {"status": "failed", "reason": result.simulation.reason.value}
-    frames = np.stack([model.observed(x) for x in result.simulation.frames])
+    surface = thicken(model.valve.surface, normals)
+    faces = embed(model.mesh, surface.vertices)
+    frames = np.stack([faces(x) for x in result.simulation.frames])
     fields = folder / "fields.npz"
-    surface = model.valve.surface
     np.savez_compressed(
         fields,
         frames=frames.astype(np.float32),

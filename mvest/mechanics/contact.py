@@ -153,6 +153,8 @@ class Contact:
         self.triangles = triangles
         self.settings = settings
         self.skin = skin
+        if len(triangles) == 0:
+            raise InputError("contact needs triangles of the sampled midsurface; there are none")
         faces = np.asfortranarray(triangles, dtype=np.int32)
         self._collision_mesh = ipctk.CollisionMesh(
             np.asfortranarray(rest), ipctk.edges(faces), faces

@@ -399,13 +399,15 @@ class _Stepper:
 
         current = evaluate(x, True)
         residuals = [float(np.linalg.norm(current.residual)) / current.scale]
-        for _ in range(newton.max_iterations):
+        for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(Reason.NO_CONVERGENCE)
             assert current.blocks is not None
             converged = residuals[-1] <= newton.tolerance
             if converged and not (self.parameters and self.differentiate):
                 return _Solved(x, current, residuals, pairs)
+            if iteration == newton.max_iterations and not converged:
+                break
             try:
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
                 # A forcing term of the size of the residual keeps the convergence quadratic
@@ -445,7 +447,7 @@ class _Stepper:
             return x + factor * d, evaluate(x + factor * d, True)
         norm = float(np.linalg.norm(current.residual))
         slope = abs(float(np.sum(current.residual * d)))
-        best: tuple[float, FloatArray, Evaluation] | None = None
+        best: tuple[float, FloatArray] | None = None
         for _ in range(8):
             trial = x + factor * d
             result = evaluate(trial, True)
@@ -455,11 +457,12 @@ class _Stepper:
                 if new_norm <= (1 - 1e-3 * factor) * norm or new_slope <= 0.9 * slope:
                     return trial, result
                 if best is None or new_slope < best[0]:
-                    best = (new_slope, trial, result)
+                    best = (new_slope, trial)
             factor *= 0.5
         if best is None:
             raise _StepError(Reason.NO_CONVERGENCE)
-        return best[1], best[2]
+        # Anew, since later trials may have changed the sparsity pattern.
+        return best[1], evaluate(best[1], True)
 
     def _differentiate(
         self,

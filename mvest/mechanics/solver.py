@@ -6,7 +6,10 @@ everywhere else. Both factorise the same matrix and agree to round-off; a test c
 
 from __future__ import annotations
 
+import os
 import sys
+from functools import cache
+from importlib import metadata
 from typing import Protocol
 
 import numpy as np
@@ -39,6 +42,19 @@ class LinearSolver(Protocol):
         """
 
 
+@cache
+def _name_mkl() -> None:
+    """Tell pypardiso where MKL is: it would search the whole environment for each new solver."""
+    try:
+        files = metadata.files("mkl") or []
+    except metadata.PackageNotFoundError:
+        return
+    for file in files:
+        if file.name.startswith(("libmkl_rt.so", "mkl_rt.")):
+            os.environ.setdefault("PYPARDISO_MKL_RT", str(file.locate()))
+            return
+
+
 class PardisoSolver:
     """MKL PARDISO on the symmetric part, GMRES for the rest.
 
@@ -51,6 +67,7 @@ class PardisoSolver:
     name = "pardiso"
 
     def __init__(self) -> None:
+        _name_mkl()
         from pypardiso import PyPardisoSolver
 
         self._solver = PyPardisoSolver(mtype=-2)
@@ -102,8 +119,13 @@ class PardisoSolver:
         )
 
     def _call(self, phase: int, right: FloatArray) -> FloatArray:
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
         self._solver.set_phase(phase)
-        return np.asarray(self._solver._call_pardiso(self._upper, right))
+        try:
+            return np.asarray(self._solver._call_pardiso(self._upper, right))
+        except PyPardisoError as error:
+            raise RuntimeError(str(error)) from error
 
     def _precondition(self, right: FloatArray) -> FloatArray:
         column = np.asfortranarray(right.reshape(len(right), -1), dtype=np.float64)
@@ -127,7 +149,7 @@ class PardisoSolver:
     def _refine(
         self, matrix: sparse.csr_matrix, right: FloatArray, start: FloatArray, tolerance: float
     ) -> FloatArray:
-        solution, _ = gmres(
+        solution, unfinished = gmres(
             matrix,
             right,
             x0=start,
@@ -137,6 +159,8 @@ class PardisoSolver:
             maxiter=3,
             M=LinearOperator(matrix.shape, matvec=self._precondition, dtype=np.float64),
         )
+        if unfinished and np.linalg.norm(matrix @ solution - right) > 1e-6 * np.linalg.norm(right):
+            raise RuntimeError("GMRES did not converge: the symmetric part is nearly singular")
         return np.asarray(solution)
 
     def __del__(self) -> None:

@@ -64,7 +64,7 @@ def _moments(table: pd.DataFrame) -> list[int]:
     """Open, half open, nearly closed, closed."""
     opening = table.orifice_mm2.to_numpy()
     share = opening / max(float(opening[0]), 1e-9)
-    return [0, *(int(np.argmax(share < level)) for level in (0.6, 0.15)), len(table) - 1]
+    return [0, *(int(np.argmax(share < level)) for level in (0.75, 0.1)), len(table) - 1]
 
 
 def _draw(
@@ -84,7 +84,7 @@ def _draw(
     axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors="none"))
     low, high = rest.min(axis=0), rest.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.45)
+    axes.set_box_aspect(high - low, zoom=1.22)
     axes.set_proj_type("ortho")
     axes.view_init(elevation, azimuth)
     axes.set_axis_off()
