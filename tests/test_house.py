@@ -57,6 +57,7 @@ IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
     "hydra-joblib-launcher": ("hydra_plugins",),
     "hydra-submitit-launcher": ("hydra_plugins",),
+    "matplotlib": ("matplotlib", "mpl_toolkits"),
     "pynrrd": ("nrrd",),
     "simpleitk": ("SimpleITK",),
 }
