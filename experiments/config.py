@@ -73,6 +73,7 @@ class DonorConfig:
     vertices: int = 430  # of the midsurface that is meshed and observed
     contact_vertices: int = 3000  # of the midsurface on which contact is sampled
     starts: list[Any] = field(default_factory=list)  # MPa, moduli from which each fit starts
+    largest_change: float = 0.15  # of a modulus' logarithm from one closed state to the next
 
 
 @dataclass

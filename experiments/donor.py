@@ -68,6 +68,10 @@ class DonorStudy:
     observation : Observation
         The recorded closed frame.
     starts : tuple of (p,) MPa
+    continuation : bool
+        Whether closures after the first start from the last closed state.
+    largest_change : float
+        See :class:`Walk`.
     """
 
     recording: DonorRecording
@@ -82,6 +86,7 @@ class DonorStudy:
     observation: Observation
     starts: tuple[FloatArray, ...]
     continuation: bool
+    largest_change: float
 
     def model(self) -> ClosureModel:
         """A model that has not closed yet, so that fits know nothing of each other."""
@@ -92,22 +97,66 @@ class DonorStudy:
             self.settings,
             self.parameters,
             continuation=self.continuation,
+            repeat=False,
         )
 
 
-class Remembered:
-    """A model that keeps its predictions, so that none is computed twice."""
+class Walk:
+    """A model that goes from one closed valve to the next in small changes of the moduli.
 
-    def __init__(self, model: ClosureModel) -> None:
+    Soft leaflets are drawn far into the valve, and Newton's method does not find an equilibrium
+    that lies millimetres away. Predictions are kept, so that none is computed twice.
+
+    Parameters
+    ----------
+    model : ClosureModel
+        With ``continuation``, or every step closes the open valve.
+    largest_change : float
+        Of the logarithm of any modulus between two equilibria.
+    """
+
+    def __init__(self, model: ClosureModel, largest_change: float) -> None:
         self.model = model
-        self.known: dict[bytes, Prediction] = {}
+        self.largest_change = largest_change
+        self.known: list[tuple[FloatArray, Prediction]] = []
+        self.last: FloatArray | None = None
+        self.equilibria = 0
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``."""
-        key = np.asarray(m, dtype=np.float64).tobytes()
-        if key not in self.known:
-            self.known[key] = self.model(m)
-        return self.known[key]
+        known = self.at(m)
+        if known is None:
+            known = self._predict(np.array(m, dtype=np.float64))
+            self.known.append((np.array(m), known))
+        return known
+
+    def at(self, m: FloatArray) -> Prediction | None:
+        """What is known at ``m (p,)``, up to the rounding of a logarithm and its inverse."""
+        found = (
+            prediction for at, prediction in self.known if np.allclose(at, m, rtol=1e-12, atol=0.0)
+        )
+        return next(found, None)
+
+    def _predict(self, m: FloatArray) -> Prediction:
+        for between in self._way_to(m):
+            self.equilibria += 1
+            closure = self.model.close(between, sensitivities=False).simulation
+            if not closure.converged:
+                return Prediction.failed(f"{closure.reason.value} (on the way, at {between})")
+            self.last = between
+        self.equilibria += 1
+        prediction = self.model(m)
+        if prediction.converged:
+            self.last = m
+        return prediction
+
+    def _way_to(self, m: FloatArray) -> list[FloatArray]:
+        """Moduli between the last closed valve and ``m``."""
+        if self.last is None or not self.model.continuation:
+            return []
+        change = np.log(m / self.last)
+        n = int(np.ceil(np.abs(change).max() / self.largest_change))
+        return [self.last * np.exp(change * k / n) for k in range(1, n)]
 
 
 def build_donor(config: Values) -> DonorStudy:
@@ -162,6 +211,7 @@ def build_donor(config: Values) -> DonorStudy:
         Observation(("closed",), seen[None], np.asarray(config["filter"]["R"])),
         tuple(starts),
         config["continuation"],
+        donor["largest_change"],
     )
 
 
@@ -170,7 +220,7 @@ def run_donor(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Fit the recorded valve from every start: the record, and the picture in ``folder``."""
     study = build_donor(config)
-    generic, results = _generic_and_fits(study)
+    generic, results, equilibria = _generic_and_fits(study)
     first = results[0]
     record = make_record(
         first,
@@ -187,7 +237,7 @@ def run_donor(
     )
     rows = [_row("generic", study, study.prior.mean, generic)]
     rows += [
-        _fit_row(f"fitted, start {k + 1}", study, start, result)
+        _fit_row(f"fitted, start {k + 1}", study, start, result) | {"equilibria": equilibria[k]}
         for k, (start, result) in enumerate(zip(study.starts, results, strict=True))
     ]
     record |= {
@@ -223,14 +273,17 @@ def run_donor(
     return record, files
 
 
-def _generic_and_fits(study: DonorStudy) -> tuple[Prediction, list[StudyResult]]:
-    """The generic prediction, and the fit from every start; each start closes the open valve."""
+def _generic_and_fits(study: DonorStudy) -> tuple[Prediction, list[StudyResult], list[int]]:
+    """The generic prediction, the fit from every start, and how many equilibria each solved.
+
+    Each start closes the open valve.
+    """
     steps = len(study.settings.protocol.steps())
-    results = []
+    results, equilibria = [], []
     generic: Prediction | None = None
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(study.starts)) as bar:
         for start in study.starts:
-            model = Remembered(study.model())
+            model = Walk(study.model(), study.largest_change)
             model.model.on_step = bar.step
             case = Case(
                 study.parameters,
@@ -241,10 +294,11 @@ def _generic_and_fits(study: DonorStudy) -> tuple[Prediction, list[StudyResult]]
                 study.settings.tissue,
             )
             results.append(estimate(case, study.observation))
-            generic = generic or model.known.get(study.prior.mean.tobytes())
+            equilibria.append(model.equilibria)
+            generic = generic or model.at(study.prior.mean)
         if generic is None:
             generic = study.model()(study.prior.mean)
-    return generic, results
+    return generic, results, equilibria
 
 
 def _closed(prediction: Prediction) -> FloatArray:
@@ -280,6 +334,7 @@ def _row(name: str, study: DonorStudy, moduli: FloatArray, found: Prediction) ->
         "distance_mm": _distances(study, _closed(found)) if found.converged else None,
         "iterations": 0,
         "forward_solves": 0,
+        "equilibria": 0,
         "seconds": 0.0,
     }
 

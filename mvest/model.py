@@ -331,9 +331,11 @@ class ClosureModel:
         Values of the parameters that are not estimated.
     continuation : bool
         Whether closures after the first start from the last closed state and go straight to the new
-        equilibrium (where the protocol ends in one), instead of closing the open valve again. A
-        closure that fails so is repeated from the open valve. The closed state is the same as long
-        as there is one only, which the gate (:mod:`mvest.gate`) examines.
+        equilibrium (where the protocol ends in one), instead of closing the open valve again. The
+        closed state is the same as long as there is one only, which the gate (:mod:`mvest.gate`)
+        examines.
+    repeat : bool
+        Whether a continued closure that fails is repeated from the open valve.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -345,6 +347,7 @@ class ClosureModel:
     names: tuple[str, ...]
     fixed: dict[str, float] = field(default_factory=dict)
     continuation: bool = False
+    repeat: bool = True
     on_step: Callable[[float, int], None] | None = None
 
     _closed: FloatArray | None = field(default=None, init=False, repr=False)
@@ -392,7 +395,7 @@ class ClosureModel:
         simulation = None
         if self.continuation and self._closed is not None and steps[-1].static:
             simulation = run(steps[-1:], self._closed)
-        if simulation is None or not simulation.converged:
+        if simulation is None or (self.repeat and not simulation.converged):
             simulation = run(steps, None)
         if simulation.converged:
             self._closed = simulation.frames[-1]

@@ -111,7 +111,7 @@ def _frame(record: Record) -> pd.DataFrame:
         distance = row["distance_mm"] or {}
         for part in ("mean", "median", "rms", "max", *record["regions"]):
             plain[f"distance {part} [mm]"] = distance.get(part)
-        for key in ("iterations", "forward_solves", "seconds", "reason"):
+        for key in ("iterations", "forward_solves", "equilibria", "seconds", "reason"):
             plain[key.replace("_", " ")] = row[key]
         rows.append(plain)
     return pd.DataFrame(rows)
@@ -128,6 +128,7 @@ def _readable(record: Record) -> str:
         "rms [mm]",
         "max [mm]",
         "forward solves",
+        "equilibria",
         "time [s]",
         "ended",
     ]
@@ -143,7 +144,12 @@ def _readable(record: Record) -> str:
         distance = row["distance_mm"] or {}
         for part in ("mean", "median", "rms", "max"):
             cells.append(f"{distance[part]:.2f}" if part in distance else MISSING)
-        cells += [str(row["forward_solves"]), f"{row['seconds']:.0f}", row["reason"].split(":")[0]]
+        cells += [
+            str(row["forward_solves"]),
+            str(row["equilibria"]),
+            f"{row['seconds']:.0f}",
+            row["reason"].split(":")[0],
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     summary = record["summary"]
     spread = summary["largest_difference_between_starts"]
