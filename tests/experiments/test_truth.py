@@ -1,0 +1,152 @@
+"""Stored truths: found again, and never in the place of another one."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import experiments.truth
+import mvest
+from experiments.truth import FORWARD_MODEL, StoredModel, truth_key
+from mvest.estimation import Prediction
+
+
+class Model:
+    """Counts its calls; five numbers that depend on the parameters."""
+
+    def __init__(self, reason=None):
+        self.calls, self.reason = 0, reason
+
+    def __call__(self, m):
+        self.calls += 1
+        if self.reason:
+            return Prediction.failed(self.reason)
+        return Prediction(np.arange(5) * m[0] + m[1] / 3, np.ones((5, 2)))
+
+
+AT = np.array([6.23, 2.09])
+
+
+def test_the_second_call_reads_from_disk(tmp_path):
+    model = Model()
+    folder = tmp_path / "below" / "truth"
+    first = StoredModel(model, folder, "key")(AT)
+    # Another object, as another process would have it.
+    second = StoredModel(model, folder, "key")(AT.copy())
+    assert model.calls == 1
+    np.testing.assert_array_equal(second.y, first.y)
+    assert second.converged
+    assert second.jacobian.shape == (5, 2)
+    assert not np.any(second.jacobian)
+    assert [path.suffix for path in folder.iterdir()] == [".npz"]
+
+
+@pytest.mark.parametrize("change", [("other", AT), ("key", AT * [1, 1 + 1e-15]), ("key", AT[::-1])])
+def test_another_key_or_other_parameters_are_another_truth(tmp_path, change):
+    model = Model()
+    StoredModel(model, tmp_path, "key")(AT)
+    key, m = change
+    np.testing.assert_array_equal(StoredModel(model, tmp_path, key)(m).y, Model()(m).y)
+    assert model.calls == 2
+
+
+def test_a_failure_is_not_stored(tmp_path):
+    failing = Model("it buckled")
+    assert StoredModel(failing, tmp_path, "key")(AT).reason == "it buckled"
+    assert not list(tmp_path.iterdir())
+    assert StoredModel(Model(), tmp_path, "key")(AT).converged
+
+
+def test_what_was_written_half_is_never_read(tmp_path, monkeypatch):
+    model = Model()
+
+    def interrupted(file, **arrays):
+        file.write(b"PK\x03\x04 half a file")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(experiments.truth.np, "savez", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            StoredModel(model, tmp_path, "key")(AT)
+    assert not list(tmp_path.glob("*.npz"))
+    y = StoredModel(model, tmp_path, "key")(AT).y
+    assert model.calls == 2
+    np.testing.assert_array_equal(StoredModel(model, tmp_path, "key")(AT).y, y)
+    assert model.calls == 2
+
+
+VALUES = {"mesh": {"columns": 72, "rows": 8}, "element": "hex27", "dt_factor": 0.25}
+
+
+def test_the_key_covers_every_value():
+    base = truth_key(VALUES)
+    assert truth_key(dict(reversed(VALUES.items()))) == base
+    others = [
+        {**VALUES, "element": "hex18"},
+        {**VALUES, "dt_factor": 0.5},
+        {**VALUES, "mesh": {"columns": 72, "rows": 9}},
+        {**VALUES, "more": None},
+    ]
+    assert len({base, *map(truth_key, others)}) == 5
+
+
+@pytest.fixture
+def library(tmp_path, monkeypatch):
+    """A copy of the forward model's source that stands for the library."""
+    root = Path(mvest.__file__).parent
+    for part in FORWARD_MODEL:
+        source = root / part
+        if source.is_dir():
+            shutil.copytree(source, tmp_path / part, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, tmp_path / part)
+    monkeypatch.setattr(mvest, "__file__", str(tmp_path / "__init__.py"))
+    return tmp_path
+
+
+def test_the_key_ignores_comments_docstrings_and_layout(library):
+    base = truth_key(VALUES)
+    place = library / "mechanics" / "contact.py"
+    text = place.read_text()
+    for old, new in (
+        ('"""Contact energy in N mm."""', '"""Something else."""'),
+        ("skin = self.skin\n", "skin = self.skin  # why\n\n\n"),
+        ("# Pairs still apart", "# Those still apart"),
+        ("NEIGHBOUR = 0.8", "NEIGHBOUR = (0.8)"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    place.write_text(text.replace("Leaflet contact as", "Contact of leaflets as", 1))
+    assert truth_key(VALUES) == base
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("mechanics/contact.py", "NEIGHBOUR = 0.8", "NEIGHBOUR = 0.81"),
+        ("mechanics/law.py", " - ", " + "),
+        ("valve/template.py", "bulge: float = 0.04", "bulge: float = 0.05"),
+        ("units.py", "133.322387415", "133.3"),
+        ("model.py", "patch_radius: float = 2.0", "patch_radius: float = 2.5"),
+        ("elements.py", "0.445948490915965", "0.445948490915966"),
+    ],
+)
+def test_the_key_changes_with_the_code_of_the_forward_model(library, file, old, new):
+    base = truth_key(VALUES)
+    place = library / file
+    text = place.read_text()
+    assert old in text
+    place.write_text(text.replace(old, new))
+    assert truth_key(VALUES) != base
+
+
+def test_a_new_file_of_the_forward_model_changes_the_key(library):
+    base = truth_key(VALUES)
+    (library / "mechanics" / "another.py").write_text("VISCOSITY = 1.0\n")
+    assert truth_key(VALUES) != base
+
+
+def test_the_parts_of_the_forward_model_exist():
+    for part in FORWARD_MODEL:
+        assert (Path(mvest.__file__).parent / part).exists()
