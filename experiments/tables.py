@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from mvest.errors import MvestError
+from mvest.reporting.closure import write_closure_tables
+from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.publish import regenerate
 
 __all__ = ["main"]
+
+OTHER_TABLES = {"gate": write_gate_tables, "closure": write_closure_tables}
+"""Tables of studies that estimate nothing, each from its own record."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -19,7 +25,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("error: expected at most one argument, the folder of the results", file=sys.stderr)
         return 2
     try:
-        for path in regenerate(Path(given[0] if given else "results")):
+        results = Path(given[0] if given else "results")
+        written = regenerate(results)
+        for name, write in OTHER_TABLES.items():
+            record = results / f"{name}.json"
+            if record.is_file():
+                written += write(results, json.loads(record.read_text(encoding="utf-8")))
+        for path in written:
             print(path)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
