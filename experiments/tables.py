@@ -9,13 +9,18 @@ from pathlib import Path
 
 from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
+from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.publish import regenerate
 
 __all__ = ["main"]
 
-OTHER_TABLES = {"gate": write_gate_tables, "closure": write_closure_tables}
-"""Tables of studies that estimate nothing, each from its own record."""
+OTHER_TABLES = {
+    "gate": write_gate_tables,
+    "closure": write_closure_tables,
+    "donor": write_donor_tables,
+}
+"""Tables of studies with records of their own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -66,6 +66,10 @@ def donor_figure(fields: Path) -> Figure:
             panels.append(axes)
     bar = figure.colorbar(scale, ax=panels, shrink=0.6, pad=0.02)
     bar.set_label("distance from the recording [mm]")
+    figure.suptitle(
+        "Human tricuspid valve, closed (midsurfaces: leaflets that touch are a thickness apart)",
+        fontsize=11,
+    )
     return figure
 
 
