@@ -8,7 +8,9 @@ the start, and the fitted closure is nearer to the recording than the one with g
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,7 +91,7 @@ class DonorStudy:
     largest_change: float
 
     def model(self) -> ClosureModel:
-        """A model that has not closed yet, so that fits know nothing of each other."""
+        """A model of the open valve."""
         return ClosureModel(
             self.recording.valve(self.coarse),
             self.recording.valve(self.contact),
@@ -121,6 +123,12 @@ class Walk:
         self.known: list[tuple[FloatArray, Prediction]] = []
         self.last: FloatArray | None = None
         self.equilibria = 0
+
+    def branch(self) -> Walk:
+        """A walk of its own from where this one stands."""
+        other = Walk(copy(self.model), self.largest_change)
+        other.known, other.last = list(self.known), self.last
+        return other
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Prediction at ``m (p,)``."""
@@ -220,7 +228,8 @@ def run_donor(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Fit the recorded valve from every start: the record, and the picture in ``folder``."""
     study = build_donor(config)
-    generic, results, equilibria = _generic_and_fits(study)
+    fits = _fit(study)
+    generic, results = fits.generic, list(fits.results)
     first = results[0]
     record = make_record(
         first,
@@ -235,9 +244,10 @@ def run_donor(
         truth_values=None,
         started=started,
     )
-    rows = [_row("generic", study, study.prior.mean, generic)]
+    rows = [_generic_row(study, fits)]
     rows += [
-        _fit_row(f"fitted, start {k + 1}", study, start, result) | {"equilibria": equilibria[k]}
+        _fit_row(f"fitted, start {k + 1}", study, start, result)
+        | {"equilibria": fits.equilibria[k]}
         for k, (start, result) in enumerate(zip(study.starts, results, strict=True))
     ]
     record |= {
@@ -273,32 +283,49 @@ def run_donor(
     return record, files
 
 
-def _generic_and_fits(study: DonorStudy) -> tuple[Prediction, list[StudyResult], list[int]]:
-    """The generic prediction, the fit from every start, and how many equilibria each solved.
+@dataclass(frozen=True, slots=True, eq=False)
+class Fits:
+    """The closure with generic moduli, and the fit from every start.
 
-    Each start closes the open valve.
+    Attributes
+    ----------
+    generic : Prediction
+    seconds : float
+        Wall-clock time of the generic closure.
+    results : tuple of StudyResult
+    equilibria : tuple of int
+        Closed states that each fit went through.
     """
+
+    generic: Prediction
+    seconds: float
+    results: tuple[StudyResult, ...]
+    equilibria: tuple[int, ...]
+
+
+def _fit(study: DonorStudy) -> Fits:
+    """Close the open valve with the generic moduli, and fit it from there from every start."""
     steps = len(study.settings.protocol.steps())
-    results, equilibria = [], []
-    generic: Prediction | None = None
+    results, walks = [], []
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(study.starts)) as bar:
+        started = time.perf_counter()
+        first = Walk(study.model(), study.largest_change)
+        first.model.on_step = bar.step
+        generic = first(study.prior.mean)
+        seconds = time.perf_counter() - started
         for start in study.starts:
-            model = Walk(study.model(), study.largest_change)
-            model.model.on_step = bar.step
+            walk = first.branch()
+            walks.append(walk)
             case = Case(
                 study.parameters,
-                model,
+                walk,
                 study.prior,
                 replace(study.filter, start=tuple(map(float, start))),
                 study.transform,
                 study.settings.tissue,
             )
             results.append(estimate(case, study.observation))
-            equilibria.append(model.equilibria)
-            generic = generic or model.at(study.prior.mean)
-        if generic is None:
-            generic = study.model()(study.prior.mean)
-    return generic, results, equilibria
+    return Fits(generic, seconds, tuple(results), tuple(walk.equilibria for walk in walks))
 
 
 def _closed(prediction: Prediction) -> FloatArray:
@@ -323,19 +350,20 @@ def _distances(study: DonorStudy, closed: FloatArray) -> dict[str, float]:
     }
 
 
-def _row(name: str, study: DonorStudy, moduli: FloatArray, found: Prediction) -> dict[str, Any]:
+def _generic_row(study: DonorStudy, fits: Fits) -> dict[str, Any]:
+    found = fits.generic
     return {
-        "closure": name,
+        "closure": "generic",
         "status": "converged" if found.converged else "failed",
         "reason": "closed" if found.converged else found.reason,
-        "start": moduli.tolist(),
+        "start": study.prior.mean.tolist(),
         "estimate": None,
         "std": None,
         "distance_mm": _distances(study, _closed(found)) if found.converged else None,
         "iterations": 0,
-        "forward_solves": 0,
-        "equilibria": 0,
-        "seconds": 0.0,
+        "forward_solves": 1,
+        "equilibria": 1,
+        "seconds": fits.seconds,
     }
 
 
