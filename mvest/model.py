@@ -9,9 +9,8 @@ positions and their Jacobian.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -65,6 +64,11 @@ class TissueSettings:
     nu: float = 0.488
     reading: str = "A"
 
+    def __post_init__(self) -> None:
+        known = [reading.value for reading in PoissonReading]
+        if self.reading not in known:
+            raise InputError(f"Poisson reading {self.reading!r}, expected {' or '.join(known)}")
+
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
         return TransverselyIsotropic.from_ratio(
@@ -102,6 +106,8 @@ class ClosureProtocol:
     def __post_init__(self) -> None:
         if not self.dt > 0:
             raise InputError(f"time step dt = {self.dt} s, expected > 0")
+        if not np.isfinite(self.pressure_mmHg):
+            raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
         if not (self.ramp > 0 and self.end >= self.ramp and self.growth >= 1):
             raise InputError(f"closure protocol {self}: expected 0 < ramp <= end and growth >= 1")
 
@@ -155,6 +161,13 @@ class MechanicsSettings:
     support_stiffness: float = 50.0
     patch_radius: float = 2.0
     solver: str = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("density", "support_stiffness", "patch_radius"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"mechanics {name} = {getattr(self, name)}, expected > 0")
+        if self.support not in ("hinge", "clamp"):
+            raise InputError(f"annulus support {self.support!r}, expected hinge or clamp")
 
 
 def build_system(
@@ -426,8 +439,3 @@ class ClosureModel:
             [np.zeros((open_.size, len(self.names))), derivative.reshape(-1, len(self.names))]
         )
         return Prediction(y, jacobian)
-
-
-def with_protocol(settings: MechanicsSettings, **changes: Any) -> MechanicsSettings:
-    """Settings with some values of the protocol changed."""
-    return replace(settings, protocol=replace(settings.protocol, **changes))

@@ -58,6 +58,13 @@ class ChordLayout:
     open_slack: float = 1.035
     toe_strain: float = 0.015
 
+    def __post_init__(self) -> None:
+        if not self.marginal_phi and not self.basal:
+            raise InputError("a chord layout needs at least one chord")
+        for k, place in enumerate(self.basal):
+            if len(place) != 2:
+                raise InputError(f"basal chord {k} is {place}, expected (phi, s)")
+
 
 @dataclass(frozen=True, slots=True)
 class TemplateParameters:
@@ -132,6 +139,10 @@ class TemplateParameters:
     chordae: ChordLayout = ChordLayout()
 
     def __post_init__(self) -> None:
+        if len(self.tips) != 3:
+            raise InputError(f"template tips = {self.tips}, expected (x, y, z)")
+        if not 0 < self.fibre_turn <= 0.5:
+            raise InputError(f"template fibre_turn = {self.fibre_turn}, expected in (0, 0.5]")
         for name in (
             "half_commissural", "half_ap", "length_anterior", "length_posterior",
             "length_commissure", "edge_half_width", "thickness_anterior", "thickness_posterior",
