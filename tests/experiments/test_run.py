@@ -98,7 +98,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 
 ERRORS = [
-    ("experiment=nope", "Could not find 'experiment/nope'; known: debug"),
+    ("experiment=nope", "Could not find 'experiment/nope'; known: closure, debug"),
     ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "Key 'inital' not in 'FilterConfig'; did you mean initial?"),
