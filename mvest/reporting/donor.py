@@ -173,6 +173,14 @@ def _readable(record: Record) -> str:
             f"The fitted closure is {verdict} the recording than the generic one: mean distance "
             f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm."
         )
+    bound = (record["identifiability"] or {}).get("cramer_rao_std")
+    if bound:
+        alone = ", ".join(MISSING if v is None else f"{v:.2g}" for v in bound)
+        facts.append(
+            "The ± are the filter's standard deviations, prior included; the data alone would "
+            f"leave {alone} MPa: a modulus whose bound is as large as itself rests on the prior as much "
+            "as on the recording."
+        )
     return "\n".join([*lines, "", " ".join(facts)])
 
 
