@@ -178,8 +178,8 @@ def _readable(record: Record) -> str:
         alone = ", ".join(MISSING if v is None else f"{v:.2g}" for v in bound)
         facts.append(
             "The ± are the filter's standard deviations, prior included; the data alone would "
-            f"leave {alone} MPa: a modulus whose bound is as large as itself rests on the prior as much "
-            "as on the recording."
+            f"leave {alone} MPa: a modulus whose bound is as large as itself rests on the prior as "
+            "much as on the recording."
         )
     return "\n".join([*lines, "", " ".join(facts)])
 
