@@ -23,7 +23,6 @@ from mvest.estimation import (
     Transform,
     observation_noise,
 )
-from mvest.mechanics.law import PoissonReading
 from mvest.mechanics.solver import linear_solver
 from mvest.model import ClosureModel, MechanicsSettings
 from mvest.study import Case
@@ -254,13 +253,6 @@ def _require_tissue(
     settings: MechanicsSettings, parameters: tuple[str, ...], *points: FloatArray
 ) -> None:
     """Refuse unknowns that the model does not have, and values that no tissue can have."""
-    readings = [reading.value for reading in PoissonReading]
-    for region, tissue in settings.tissue.items():
-        if tissue.reading not in readings:
-            raise ConfigurationError(
-                f"mechanics.tissue.{region}.reading = {tissue.reading!r}, expected one of "
-                f"{', '.join(readings)}"
-            )
     for k, parameter in enumerate(parameters):
         kind, _, region = parameter.partition(".")
         if kind != "E_f":

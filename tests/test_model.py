@@ -459,9 +459,14 @@ def test_a_region_without_tissue_or_modulus_is_named(tissue, moduli):
 
 
 def test_an_unknown_support_names_the_known_ones():
-    model = model_of(OPEN, **TINY, settings={"support": "glue"})
     with pytest.raises(InputError, match="support 'glue', expected hinge or clamp"):
-        model.close(AT)
+        model_of(OPEN, **TINY, settings={"support": "glue"})
+
+
+@pytest.mark.parametrize("name", ["density", "support_stiffness", "patch_radius"])
+def test_settings_that_must_be_positive_are_refused_by_name(name):
+    with pytest.raises(InputError, match=f"{name} = -1.0, expected > 0"):
+        model_of(OPEN, **TINY, settings={name: -1.0})
 
 
 def test_an_unknown_parameter_names_the_known_ones():
