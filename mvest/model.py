@@ -67,7 +67,9 @@ class TissueSettings:
     def __post_init__(self) -> None:
         known = [reading.value for reading in PoissonReading]
         if self.reading not in known:
-            raise InputError(f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}")
+            raise InputError(
+                f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
+            )
 
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
