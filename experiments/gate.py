@@ -92,7 +92,7 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
 
     values = np.array(config["truth"]["values"], dtype=float)
     model = model_of(config, GateCase("reference"))
-    result = model.close(values, sensitivities=False)
+    result = model.close(values, sensitivities=False, every_frame=True)
     thickness = float(model.valve.surface.thickness.mean())
     distance = (
         0.5

@@ -58,6 +58,7 @@ REFERENCE = GateCase("reference")
 GATE_CASES = (
     GateCase("time step / 2", dt=0.5),
     GateCase("time step / 4", dt=0.25),
+    GateCase("time step / 16", dt=0.0625),
     GateCase("activation distance - 10 %", activation=0.9),
     GateCase("contact samples x 1.33", sampling=4 / 3),
     GateCase("mesh x 1.5", mesh=1.5),

@@ -89,7 +89,9 @@ class ClosureProtocol:
     ramp : float
         s over which pressure and boundary motion rise (smooth step).
     dt : float
-        s, time step during the ramp.
+        s, time step during the ramp. The closed state does not depend on it where it is the only
+        one (the gate divides it by up to 16), so that a closure that is wanted for this state alone
+        takes the ramp in one step.
     growth : float
         Factor by which steps grow after the ramp, towards equilibrium.
     end : float
@@ -100,7 +102,7 @@ class ClosureProtocol:
 
     pressure_mmHg: float = 120.0
     ramp: float = 0.3
-    dt: float = 0.02
+    dt: float = 0.3
     growth: float = 1.5
     end: float = 0.5
     equilibrium: bool = True
@@ -369,8 +371,19 @@ class ClosureModel:
     _system: System | None = field(default=None, init=False, repr=False)
     _solver: LinearSolver | None = field(default=None, init=False, repr=False)
 
-    def close(self, m: FloatArray, *, sensitivities: bool = True) -> ClosureResult:
+    def close(
+        self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
+    ) -> ClosureResult:
         """Run the closure with parameters ``m (p,)``.
+
+        Parameters
+        ----------
+        m : ndarray
+        sensitivities : bool
+            Whether the last frame is differentiated.
+        every_frame : bool
+            Whether all frames are wanted, and not only the last one: they are then solved to the
+            full tolerance, and no closure continues from another one.
 
         Raises
         ------
@@ -401,14 +414,15 @@ class ClosureModel:
                 damping=self.settings.damping,
                 newton=self.settings.newton,
                 parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
-                final_only=True,
+                final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
                 on_step=self.on_step,
             )
 
         simulation = None
-        if self.continuation and self._closed is not None and steps[-1].static:
+        continued = self.continuation and not every_frame
+        if continued and self._closed is not None and steps[-1].static:
             simulation = run(steps[-1:], self._closed)
         if simulation is None or (self.repeat and not simulation.converged):
             simulation = run(steps, None)

@@ -9,6 +9,7 @@ indexed addition.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba as nb
 import numpy as np
@@ -19,7 +20,7 @@ from mvest.typing import FloatArray, IntArray
 __all__ = ["Pattern", "add_forces", "scatter_blocks", "scatter_matrices"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Pattern:
     """Sparsity pattern of a matrix with 3x3 blocks.
 
@@ -79,12 +80,29 @@ class Pattern:
         """Block data ``(n_blocks, 3, 3)``."""
         return np.zeros((len(self.keys), 3, 3))
 
-    def matrix(self, blocks: FloatArray) -> sparse.csr_matrix:
-        """The matrix ``(3n, 3n)`` with the given block data."""
-        rows, columns = np.divmod(self.keys, self.n)
-        pointer = np.searchsorted(rows, np.arange(self.n + 1))
-        size = 3 * self.n
-        return sparse.bsr_matrix((blocks, columns, pointer), shape=(size, size)).tocsr()
+    @cached_property
+    def rows(self) -> IntArray:
+        """Row ``(n_blocks,)`` of each block."""
+        return self.keys // self.n
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Column ``(n_blocks,)`` of each block."""
+        return self.keys % self.n
+
+    @cached_property
+    def pointer(self) -> IntArray:
+        """Where each row starts ``(n + 1,)``."""
+        return np.searchsorted(self.rows, np.arange(self.n + 1))
+
+    def matrix(self, blocks: FloatArray) -> sparse.bsr_matrix:
+        """The matrix ``(3n, 3n)`` with the given block data, which it refers to.
+
+        All matrices of one pattern have the very same array of indices.
+        """
+        matrix = sparse.bsr_matrix((3 * self.n, 3 * self.n), blocksize=(3, 3))
+        matrix.data, matrix.indices, matrix.indptr = blocks, self.columns, self.pointer
+        return matrix
 
 
 def _incidence(n: int, nodes: IntArray) -> sparse.csr_matrix:

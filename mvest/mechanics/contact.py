@@ -43,7 +43,6 @@ from dataclasses import dataclass
 import ipctk
 import numba as nb
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -155,6 +154,7 @@ class Contact:
         self.skin = skin
         if len(triangles) == 0:
             raise InputError("contact needs triangles of the sampled midsurface; there are none")
+        self._by_host = np.argsort(points.host, kind="stable")
         faces = np.asfortranarray(triangles, dtype=np.int32)
         self._collision_mesh = ipctk.CollisionMesh(
             np.asfortranarray(rest), ipctk.edges(faces), faces
@@ -168,29 +168,23 @@ class Contact:
         y : ndarray
             ``(k, 3)`` current positions of the points.
         """
-        skin = self.skin
         longest = self.settings.activation_distance * float(self.thickness.max())
-        pairs = cKDTree(y).query_pairs(longest + skin, output_type="ndarray")
-        i, j = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
-        mean = 0.5 * (self.thickness[i] + self.thickness[j])
-        full = self.settings.activation_distance * mean
-        at_rest = np.linalg.norm(self.rest[i] - self.rest[j], axis=1)
-        reach = np.minimum(full, NEIGHBOUR * at_rest)
-        near = np.linalg.norm(y[i] - y[j], axis=1) < reach + skin
-        # Neighbours that would have to be compressed to half their rest distance never touch.
-        near &= reach > 0.5 * self.settings.reference_distance * mean
-        i, j, reach, full, mean = i[near], j[near], reach[near], full[near], mean[near]
-        host = self.points.host
-        swap = host[i] > host[j]
-        i, j = np.where(swap, j, i), np.where(swap, i, j)
-        order = np.lexsort((j, i, host[j], host[i]))
-        i, j, reach, full, mean = i[order], j[order], reach[order], full[order], mean[order]
-        hosts = np.column_stack([host[i], host[j]])
+        first, second, reach, reference = _search(
+            y,
+            self.rest,
+            self.thickness,
+            self._by_host,
+            self.points.host,
+            self.settings.activation_distance,
+            self.settings.reference_distance,
+            longest + self.skin,
+            self.skin,
+        )
+        hosts = np.column_stack([self.points.host[first], self.points.host[second]])
         change = np.flatnonzero(np.any(np.diff(hosts, axis=0) != 0, axis=1)) + 1
-        ends = np.concatenate([change, [len(i)]]) if len(i) else np.zeros(0)
+        ends = np.concatenate([change, [len(first)]]) if len(first) else np.zeros(0)
         start = np.concatenate([[0], ends]).astype(np.int64)
-        reference = self.settings.reference_distance * mean * reach / full
-        return ContactPairs(i, j, reach, reference, start, hosts[start[:-1]], y.copy())
+        return ContactPairs(first, second, reach, reference, start, hosts[start[:-1]], y.copy())
 
     def stale(self, pairs: ContactPairs, y: FloatArray) -> bool:
         """Whether a point has moved so far that the search must be repeated."""
@@ -219,7 +213,7 @@ class Contact:
         return float(np.sum(self.areas[pairs.first] * self.areas[pairs.second] * phi))
 
     def touching(self, pairs: ContactPairs, y: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Groups ``(g,)`` with a pair whose distance is below its reach plus ``margin`` mm."""
+        """Groups ``(g,)`` with a pair whose distance is below ``1 + margin`` times its reach."""
         return _touching(y, pairs.first, pairs.second, pairs.reach, pairs.start, margin)
 
     def add_tangent(
@@ -298,6 +292,117 @@ def _kernel(r: float, h: float, r0: float, p0: float) -> tuple[float, float]:
     first = (dp - p / r) / (2.0 * np.pi * r)
     second = (ddp - 2.0 * dp / r + 2.0 * p / (r * r)) / (2.0 * np.pi * r)
     return first, second
+
+
+@nb.njit(cache=True)
+def _cells(y: FloatArray, size: float) -> tuple[IntArray, IntArray, IntArray]:
+    """Points sorted into cubes of the given size: cube of each point, first of each, members."""
+    n = len(y)
+    low = np.array([y[:, c].min() for c in range(3)])
+    counts = np.array([int((y[:, c].max() - low[c]) / size) + 1 for c in range(3)])
+    place = np.empty((n, 3), dtype=np.int64)
+    start = np.zeros(counts[0] * counts[1] * counts[2] + 1, dtype=np.int64)
+    for i in range(n):
+        for c in range(3):
+            place[i, c] = min(int((y[i, c] - low[c]) / size), counts[c] - 1)
+        start[(place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2] + 1] += 1
+    start = np.cumsum(start)
+    filled = start.copy()
+    members = np.empty(n, dtype=np.int64)
+    for i in range(n):
+        k = (place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2]
+        members[filled[k]] = i
+        filled[k] += 1
+    return np.concatenate((counts, place.ravel())), start, members
+
+
+@nb.njit(cache=True)
+def _search(
+    y: FloatArray,
+    rest: FloatArray,
+    thickness: FloatArray,
+    by_host: IntArray,
+    host: IntArray,
+    activation: float,
+    distance: float,
+    radius: float,
+    skin: float,
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Candidate pairs (first, second, reach, reference) in the order of their hosts."""
+    n = len(y)
+    grid, start, members = _cells(y, radius)
+    n0, n1, n2 = grid[0], grid[1], grid[2]
+    place = grid[3:].reshape(n, 3)
+    size = 64 * n
+    first, second = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.int64)
+    reach, reference = np.empty(size), np.empty(size)
+    count = 0
+    for p in range(n):
+        i = by_host[p]
+        for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, n0)):
+            for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, n1)):
+                row = (a * n1 + b) * n2
+                begin = start[row + max(place[i, 2] - 1, 0)]
+                end = start[row + min(place[i, 2] + 2, n2)]
+                for q in range(begin, end):
+                    j = members[q]
+                    if host[j] < host[i] or (host[j] == host[i] and j <= i):
+                        continue
+                    rr = 0.0
+                    for c in range(3):
+                        rr += (y[i, c] - y[j, c]) ** 2
+                    if rr >= radius * radius:
+                        continue
+                    mean = 0.5 * (thickness[i] + thickness[j])
+                    full = activation * mean
+                    apart = 0.0
+                    for c in range(3):
+                        apart += (rest[i, c] - rest[j, c]) ** 2
+                    near = min(full, NEIGHBOUR * np.sqrt(apart))
+                    # Neighbours that would have to be compressed to half their rest distance
+                    # never touch.
+                    if rr >= (near + skin) ** 2 or near <= 0.5 * distance * mean:
+                        continue
+                    if count == size:
+                        size *= 2
+                        first, second = _grown(first, size), _grown(second, size)
+                        reach, reference = _grown(reach, size), _grown(reference, size)
+                    first[count], second[count] = i, j
+                    reach[count] = near
+                    reference[count] = distance * mean * near / full
+                    count += 1
+    order = _sort_by_second_host(first, second, count, host)
+    return first[order], second[order], reach[order], reference[order]
+
+
+@nb.njit(cache=True)
+def _grown(values: FloatArray, size: int) -> FloatArray:
+    out = np.empty(size, dtype=values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+@nb.njit(cache=True)
+def _sort_by_second_host(first: IntArray, second: IntArray, count: int, host: IntArray) -> IntArray:
+    """Stable order by the host of ``second`` within each run of equal hosts of ``first``."""
+    order = np.empty(count, dtype=np.int64)
+    bins = np.zeros(host.max() + 2, dtype=np.int64)
+    begin = 0
+    while begin < count:
+        end = begin
+        owner = host[first[begin]]
+        while end < count and host[first[end]] == owner:
+            end += 1
+        bins[:] = 0
+        for k in range(begin, end):
+            bins[host[second[k]] + 1] += 1
+        bins = np.cumsum(bins)
+        for k in range(begin, end):
+            h = host[second[k]]
+            order[begin + bins[h]] = k
+            bins[h] += 1
+        begin = end
+    return order
 
 
 @nb.njit(cache=True)
@@ -437,7 +542,7 @@ def _touching(
         for k in range(start[g], start[g + 1]):
             i, j = first[k], second[k]
             rr = (y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2 + (y[i, 2] - y[j, 2]) ** 2
-            if rr < (reach[k] + margin) ** 2:
+            if rr < (reach[k] * (1.0 + margin)) ** 2:
                 out[g] = True
                 break
     return out

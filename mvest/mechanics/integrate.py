@@ -80,6 +80,9 @@ class NewtonSettings:
     ----------
     tolerance : float
         Norm of the residual over the norm of the largest force.
+    path_tolerance : float
+        The same for steps that are only passed through, when the last frame alone is wanted and it
+        is an equilibrium, which no step before it enters.
     max_iterations : int
     max_halvings : int
         How often a failing step may be halved.
@@ -92,14 +95,16 @@ class NewtonSettings:
     """
 
     tolerance: float = 1e-9
-    max_iterations: int = 30
+    path_tolerance: float = 1e-1
+    max_iterations: int = 60
     max_halvings: int = 8
     single_solve: bool = False
     largest_move: float = 4.0
     smallest_move: float = 1e-10
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0 or self.max_iterations < 1 or self.max_halvings < 0:
+        positive = self.tolerance > 0 and self.path_tolerance > 0
+        if not positive or self.max_iterations < 1 or self.max_halvings < 0:
             raise InputError(f"inadmissible Newton settings: {self}")
 
 
@@ -219,8 +224,9 @@ def simulate(
     parameters : sequence of Parameter
         To differentiate by.
     final_only : bool
-        Only the derivatives of the last frame are wanted; those of the others may be zero. If the
-        last step is static, nothing before it needs differentiating: an equilibrium has no history.
+        Only the last frame is wanted. If its step is static, nothing before it needs to be
+        differentiated (an equilibrium has no history) or solved to more than the path's tolerance:
+        the frames before it are approximate and their derivatives zero.
     initial_velocity : ndarray, optional
         ``(n, 3)`` mm/s.
     initial_positions : ndarray, optional
@@ -265,12 +271,14 @@ def simulate(
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
     if final_only and steps[-1].static:
         stepper.differentiate = False
+        stepper.tolerance = max(newton.path_tolerance, newton.tolerance)
     frames, sensitivities, done = [x0], [state.dx], [0.0]
     records: list[StepRecord] = []
     reason = Reason.COMPLETED
     for step in steps:
         if step is steps[-1]:
             stepper.differentiate = True
+            stepper.tolerance = newton.tolerance
         try:
             state = stepper.advance(state, done[-1], step, records)
         except _StepError as failure:
@@ -305,6 +313,8 @@ class _Stepper:
         self.parameters = parameters
         self.solver = solver
         self.differentiate = True
+        self.tolerance = newton.tolerance
+        self._pairs: ContactPairs | None = None
 
     def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
         """State at ``step.time``; halves the step where it fails."""
@@ -312,9 +322,12 @@ class _Stepper:
         time = start
         while pending:
             end, level = pending[-1]
+            enhanced = self.system.solid.enhanced_parameters
             try:
                 new, solved = self._step(state, time, end, step.static)
             except _StepError:
+                # A failed step must not leave its enhanced strains behind.
+                self.system.solid.enhanced_parameters = enhanced
                 if level >= self.newton.max_halvings or step.static:
                     raise
                 pending.append((0.5 * (time + end), level + 1))
@@ -370,7 +383,7 @@ class _Stepper:
         mass = system.solid.lumped_mass[:, None]
         fixed = system.fixed_nodes
         x = state.x.copy()
-        pairs = system.search_contact(x)
+        pairs = self._candidates(x)
         if advance:
             move = advance * state.v
             factor = min(1.0, newton.largest_move / max(float(np.abs(move).max()), 1e-300))
@@ -383,13 +396,7 @@ class _Stepper:
 
         def evaluate(at: FloatArray, tangent: bool) -> Evaluation:
             nonlocal pairs
-            contact = system.contact
-            if (
-                contact is not None
-                and pairs is not None
-                and contact.stale(pairs, contact.points(at))
-            ):
-                pairs = system.search_contact(at)
+            pairs = self._candidates(at)
             result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=tangent)
             inertial = mass_factor * mass * at - push
             result.residual += inertial
@@ -403,7 +410,7 @@ class _Stepper:
             if not np.isfinite(residuals[-1]):
                 raise _StepError(Reason.NO_CONVERGENCE)
             assert current.blocks is not None
-            converged = residuals[-1] <= newton.tolerance
+            converged = residuals[-1] <= self.tolerance
             if converged and not (self.parameters and self.differentiate):
                 return _Solved(x, current, residuals, pairs)
             if iteration == newton.max_iterations and not converged:
@@ -428,6 +435,16 @@ class _Stepper:
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
                 return _Solved(x, current, residuals, pairs)
         raise _StepError(Reason.NO_CONVERGENCE)
+
+    def _candidates(self, x: FloatArray) -> ContactPairs | None:
+        """Pairs that may touch at ``x``; the last search serves until points have moved too far."""
+        contact = self.system.contact
+        if contact is None:
+            return None
+        y = contact.points(x)
+        if self._pairs is None or contact.stale(self._pairs, y):
+            self._pairs = contact.search(y)
+        return self._pairs
 
     def _line_search(
         self,

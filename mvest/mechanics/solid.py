@@ -95,6 +95,11 @@ class Solid:
         t/mm^3.
     enhanced : bool
         Whether the enhanced thickness strain of solid-shells is switched on.
+
+    Attributes
+    ----------
+    enhanced_parameters : ndarray
+        ``(e, n_modes)`` alpha that the next evaluation starts from.
     """
 
     def __init__(
@@ -117,7 +122,7 @@ class Solid:
 
     def reset(self) -> None:
         """Forget the enhanced parameters that the next evaluation would start from."""
-        self._alpha = np.zeros((len(self.mesh.elements), self.n_modes))
+        self.enhanced_parameters = np.zeros((len(self.mesh.elements), self.n_modes))
 
     def initial_strain(self) -> FloatArray:
         """Strain measure of the reference state, zeros ``(e, q, 6)``."""
@@ -129,8 +134,8 @@ class Solid:
         green_u, f = _strains(x, elements, self.gradients)
         if self.n_modes == 0:
             stress, tangent = self.law.response(green_u, region, previous, rate)
-            return SolidState(green_u, stress, tangent, self._alpha, f)
-        alpha = self._alpha
+            return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
+        alpha = self.enhanced_parameters
         for _ in range(ENHANCED_ITERATIONS):
             green = green_u + np.einsum("eqim,em->eqi", self.modes, alpha)
             stress, tangent = self.law.response(green, region, previous, rate)
@@ -142,7 +147,7 @@ class Solid:
             # An enhanced strain beyond +-0.2 per iteration is far outside the law's small strains.
             alpha = alpha + np.clip(step, -0.2, 0.2)
         if np.isfinite(alpha).all():
-            self._alpha = alpha
+            self.enhanced_parameters = alpha
         return SolidState(green, stress, tangent, alpha, f)
 
     def forces(self, state: SolidState) -> FloatArray:

@@ -8,30 +8,36 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from typing import Protocol
 
+import numba as nb
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, gmres, splu
 
 from mvest.errors import InputError
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["LinearSolver", "PardisoSolver", "SuperLUSolver", "linear_solver"]
 
 
 EXACT = 1e-13
 """Tolerance of a solution that is as good as double precision allows."""
+SLACK = 1.3
+"""Blocks kept over blocks needed from which the symbolic analysis is worth repeating."""
+NESTED_FROM = 20_000
+"""Nodes from which nested dissection fills less than minimum degree."""
 
 
 class LinearSolver(Protocol):
-    """Factorise a square sparse matrix, then solve with one or many right-hand sides."""
+    """Factorise a square matrix of 3x3 blocks, then solve with one or many right-hand sides."""
 
     name: str
 
-    def factorize(self, matrix: sparse.csr_matrix) -> None:
+    def factorize(self, matrix: sparse.bsr_matrix) -> None:
         """Factorise ``matrix``; a symbolic analysis is reused while the pattern is unchanged."""
 
     def solve(self, right: FloatArray, tolerance: float = EXACT) -> FloatArray:
@@ -59,9 +65,14 @@ class PardisoSolver:
     """MKL PARDISO on the symmetric part, GMRES for the rest.
 
     Only the follower pressure at free edges makes the tangent unsymmetric, and only slightly. The
-    symmetric part is factorised as such (type -2: half the memory, several times faster than the
-    unsymmetric type 11) and serves GMRES (Saad and Schultz 1986) as preconditioner for the exact
-    matrix, so that the solution is that of the unsymmetric system to the tolerance asked for.
+    symmetric part S is factorised as such (type -2: half the memory, several times faster than the
+    unsymmetric type 11). With K the rest, GMRES (Saad and Schultz 1986) solves
+    ``(1 + S^-1 K) x = S^-1 b``, so that the solution is that of the unsymmetric system to the
+    tolerance asked for.
+
+    The pattern of a contact problem is wider than what touches at the moment. Blocks of zeros would
+    fill the factor all the same, so they are left out; the symbolic analysis, which works on blocks
+    and costs a fraction of a factorisation, is repeated when other blocks come to life.
     """
 
     name = "pardiso"
@@ -71,59 +82,60 @@ class PardisoSolver:
         from pypardiso import PyPardisoSolver
 
         self._solver = PyPardisoSolver(mtype=-2)
-        self._matrix: sparse.csr_matrix | None = None
-        self._upper: sparse.csr_matrix | None = None
-        self._take: tuple[IntArray, IntArray] | None = None
-        self._symmetric = True
+        # One-based numbers of MKL's manual: no defaults (1), ordering (2) chosen in _analyse,
+        # pivots perturbed at 1e-8 (10), no scaling (11) and no matching (13), which blocks do not
+        # allow, Bunch-Kaufman pivots (21), 3x3 blocks (37).
+        for number, value in ((1, 1), (10, 8), (11, 0), (13, 0), (21, 1), (37, 3)):
+            self._solver.set_iparm(number, value)
+        self._columns: IntArray | None = None
+        self._upper: _Upper | None = None
+        self._kept: BoolArray | None = None
+        self._factor: _Blocks | None = None
+        self._skew: sparse.bsr_matrix | None = None
 
-    def factorize(self, matrix: sparse.csr_matrix) -> None:
-        """Numeric factorisation; the symbolic one only when the pattern has changed.
+    def factorize(self, matrix: sparse.bsr_matrix) -> None:
+        """Numeric factorisation; the symbolic one only when other blocks are nonzero.
 
-        The pattern must be symmetric; the same index arrays mean the same pattern.
+        The pattern must be symmetric; the same index array means the same pattern.
         """
-        old = self._matrix
-        same = old is not None and (
-            old.indices is matrix.indices
-            or (old.nnz == matrix.nnz and np.array_equal(old.indices, matrix.indices))
+        if self._columns is not matrix.indices or self._upper is None:
+            self._upper = _Upper.of(matrix)
+            self._columns = matrix.indices
+            self._kept = None
+        upper = self._upper
+        needed = _nonzero(matrix.data, upper.here, upper.mirror)
+        needed[upper.diagonal] = True
+        renew = (
+            self._kept is None
+            or bool(np.any(needed & ~self._kept))
+            or np.count_nonzero(self._kept) > SLACK * np.count_nonzero(needed)
+        )
+        if renew:
+            self._release()
+            self._kept = needed
+            self._factor = upper.some(needed)
+        assert self._factor is not None
+        largest = _symmetric_part(
+            matrix.data, self._factor.here, self._factor.mirror, self._factor.data
         )
         none = np.zeros((matrix.shape[0], 1))
-        if not same:
-            if old is not None:
-                self._solver.free_memory(everything=True)
-            self._analyse(matrix)
-        assert self._take is not None
-        assert self._upper is not None
-        here, mirror = self._take
-        upper, lower = matrix.data[here], matrix.data[mirror]
-        self._upper.data = 0.5 * (upper + lower)
-        self._symmetric = bool(np.max(np.abs(upper - lower)) <= 1e-14 * np.max(np.abs(upper)))
-        self._matrix = matrix
-        if not same:
+        if renew:
+            self._solver.set_iparm(2, 0 if upper.n < NESTED_FROM else 2)
             self._call(11, none)
         self._call(22, none)
+        self._skew = _antisymmetric_part(matrix, self._factor, 1e-14 * largest)
 
-    def _analyse(self, matrix: sparse.csr_matrix) -> None:
-        """Where the upper triangle and its mirror image lie in the data of ``matrix``."""
-        rank = sparse.csr_matrix(
-            (np.arange(1, matrix.nnz + 1), matrix.indices, matrix.indptr), shape=matrix.shape
-        )
-        upper = sparse.triu(rank, format="csr")
-        mirror = sparse.triu(rank.T.tocsr(), format="csr")
-        upper.sort_indices()
-        mirror.sort_indices()
-        if not np.array_equal(upper.indices, mirror.indices):
-            raise InputError("the matrix to factorise must have a symmetric sparsity pattern")
-        self._take = (upper.data - 1, mirror.data - 1)
-        self._upper = sparse.csr_matrix(
-            (np.zeros(upper.nnz), upper.indices, upper.indptr), shape=matrix.shape
-        )
+    def _release(self) -> None:
+        if self._factor is not None:
+            self._factor = None
+            self._solver.free_memory(everything=True)
 
     def _call(self, phase: int, right: FloatArray) -> FloatArray:
         from pypardiso.pardiso_wrapper import PyPardisoError
 
         self._solver.set_phase(phase)
         try:
-            return np.asarray(self._solver._call_pardiso(self._upper, right))
+            return np.asarray(self._solver._call_pardiso(self._factor, right))
         except PyPardisoError as error:
             raise RuntimeError(str(error)) from error
 
@@ -133,39 +145,167 @@ class PardisoSolver:
 
     def solve(self, right: FloatArray, tolerance: float = EXACT) -> FloatArray:
         """Solution for one or many right-hand sides."""
-        if self._matrix is None:
+        if self._factor is None:
             raise InputError("solve called before factorize")
         start = self._precondition(right)
-        if self._symmetric:
+        if self._skew is None:
             return start
         if right.ndim == 1:
-            return self._refine(self._matrix, right, start, tolerance)
-        columns = [
-            self._refine(self._matrix, right[:, k], start[:, k], tolerance)
-            for k in range(right.shape[1])
-        ]
+            return self._refine(self._skew, start, tolerance)
+        columns = [self._refine(self._skew, start[:, k], tolerance) for k in range(right.shape[1])]
         return np.stack(columns, axis=1)
 
-    def _refine(
-        self, matrix: sparse.csr_matrix, right: FloatArray, start: FloatArray, tolerance: float
-    ) -> FloatArray:
-        solution, unfinished = gmres(
-            matrix,
-            right,
-            x0=start,
-            rtol=tolerance,
-            atol=0.0,
-            restart=60,
-            maxiter=3,
-            M=LinearOperator(matrix.shape, matvec=self._precondition, dtype=np.float64),
+    def _refine(self, skew: sparse.bsr_matrix, start: FloatArray, tolerance: float) -> FloatArray:
+        operator = LinearOperator(
+            skew.shape, matvec=lambda v: v + self._precondition(skew @ v), dtype=np.float64
         )
-        if unfinished and np.linalg.norm(matrix @ solution - right) > 1e-6 * np.linalg.norm(right):
-            raise RuntimeError("GMRES did not converge: the symmetric part is nearly singular")
+        solution, unfinished = gmres(
+            operator, start, x0=start, rtol=tolerance, atol=0.0, restart=60, maxiter=3
+        )
+        if unfinished:
+            error = np.linalg.norm(operator.matvec(solution) - start)
+            if error > 1e-6 * np.linalg.norm(start):
+                raise RuntimeError("GMRES did not converge: the symmetric part is nearly singular")
         return np.asarray(solution)
 
     def __del__(self) -> None:
-        if getattr(self, "_matrix", None) is not None and not sys.is_finalizing():
-            self._solver.free_memory(everything=True)
+        if getattr(self, "_factor", None) is not None and not sys.is_finalizing():
+            self._release()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Blocks:
+    """Blocks of the upper triangle as PARDISO reads them, and where they come from.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Block rows and columns.
+    indptr, indices : ndarray
+        Block pattern.
+    data : ndarray
+        ``(u, 3, 3)``, each block by columns: so MKL stores them when indices count from one.
+    here, mirror : ndarray
+        ``(u,)`` positions of the blocks and of their mirror images in the matrix.
+    """
+
+    shape: tuple[int, int]
+    indptr: IntArray
+    indices: IntArray
+    data: FloatArray
+    here: IntArray
+    mirror: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Upper:
+    """Where the blocks of the upper triangle and their mirror images lie in a block matrix.
+
+    Attributes
+    ----------
+    n : int
+        Block rows.
+    rows, columns : ndarray
+        ``(u,)`` of the blocks in the upper triangle.
+    here, mirror : ndarray
+        ``(u,)`` their positions and those of their mirror images.
+    diagonal : ndarray
+        ``(n,)`` which of them lie on the diagonal.
+    """
+
+    n: int
+    rows: IntArray
+    columns: IntArray
+    here: IntArray
+    mirror: IntArray
+    diagonal: IntArray
+
+    @classmethod
+    def of(cls, matrix: sparse.bsr_matrix) -> _Upper:
+        n = matrix.shape[0] // 3
+        rows = np.repeat(np.arange(n), np.diff(matrix.indptr))
+        columns = matrix.indices.astype(np.int64)
+        keys = rows * n + columns
+        here = np.flatnonzero(columns >= rows)
+        # In the order of their columns, the blocks of the lower triangle are the mirror images.
+        lower = np.flatnonzero(columns <= rows)
+        mirror = lower[np.argsort(columns[lower], kind="stable")]
+        rows, columns = rows[here], columns[here]
+        if len(mirror) != len(here) or not np.array_equal(keys[mirror], columns * n + rows):
+            raise InputError("the matrix to factorise must have a symmetric sparsity pattern")
+        return cls(n, rows, columns, here, mirror, np.flatnonzero(rows == columns))
+
+    def some(self, kept: BoolArray) -> _Blocks:
+        """The blocks marked in ``kept (u,)``, still without their entries."""
+        pointer = np.searchsorted(self.rows[kept], np.arange(self.n + 1))
+        here = self.here[kept]
+        data = np.zeros((len(here), 3, 3))
+        return _Blocks((self.n, self.n), pointer, self.columns[kept], data, here, self.mirror[kept])
+
+
+@nb.njit(cache=True)
+def _nonzero(blocks: FloatArray, here: IntArray, mirror: IntArray) -> BoolArray:
+    """Which blocks of the upper triangle, or their mirror images, are not all zero."""
+    out = np.zeros(len(here), dtype=np.bool_)
+    for k in range(len(here)):
+        one, other = blocks[here[k]], blocks[mirror[k]]
+        for i in range(3):
+            for j in range(3):
+                if one[i, j] != 0.0 or other[i, j] != 0.0:
+                    out[k] = True
+    return out
+
+
+@nb.njit(cache=True)
+def _symmetric_part(blocks: FloatArray, here: IntArray, mirror: IntArray, out: FloatArray) -> float:
+    """Write the symmetric part, each block by columns; returns the largest entry."""
+    largest = 0.0
+    for k in range(len(here)):
+        one, other = blocks[here[k]], blocks[mirror[k]]
+        for i in range(3):
+            for j in range(3):
+                out[k, j, i] = 0.5 * (one[i, j] + other[j, i])
+                largest = max(largest, abs(one[i, j]))
+    return largest
+
+
+@nb.njit(cache=True)
+def _unsymmetric(
+    blocks: FloatArray, here: IntArray, mirror: IntArray, threshold: float
+) -> IntArray:
+    """Blocks that differ from the transpose of their mirror image by more than round-off."""
+    out = np.empty(len(here), dtype=np.int64)
+    count = 0
+    for k in range(len(here)):
+        one, other = blocks[here[k]], blocks[mirror[k]]
+        found = False
+        for i in range(3):
+            for j in range(3):
+                found = found or abs(one[i, j] - other[j, i]) > threshold
+        if found:
+            out[count] = k
+            count += 1
+    return out[:count]
+
+
+def _antisymmetric_part(
+    matrix: sparse.bsr_matrix, factor: _Blocks, threshold: float
+) -> sparse.bsr_matrix | None:
+    """Half the difference of the matrix and its transpose, None if it is round-off."""
+    some = _unsymmetric(matrix.data, factor.here, factor.mirror, threshold)
+    if len(some) == 0:
+        return None
+    n = factor.shape[0]
+    rows = np.searchsorted(factor.indptr, some, side="right") - 1
+    columns = factor.indices[some]
+    one, other = matrix.data[factor.here[some]], matrix.data[factor.mirror[some]]
+    half = 0.5 * (one - other.transpose(0, 2, 1))
+    off = rows != columns
+    rows, columns = np.append(rows, columns[off]), np.append(columns, rows[off])
+    data = np.concatenate([half, -half[off].transpose(0, 2, 1)])
+    order = np.lexsort((columns, rows))
+    pointer = np.searchsorted(rows[order], np.arange(n + 1))
+    return sparse.bsr_matrix((data[order], columns[order], pointer), shape=(3 * n, 3 * n))
 
 
 class SuperLUSolver:
@@ -176,7 +316,7 @@ class SuperLUSolver:
     def __init__(self) -> None:
         self._factor: SuperLU | None = None
 
-    def factorize(self, matrix: sparse.csr_matrix) -> None:
+    def factorize(self, matrix: sparse.bsr_matrix) -> None:
         """Symbolic and numeric factorisation."""
         self._factor = splu(
             matrix.tocsc(),

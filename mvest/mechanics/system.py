@@ -23,8 +23,8 @@ from mvest.typing import FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
 
-CONTACT_MARGIN = 0.3
-"""mm before activation at which a pair of elements enters the sparsity pattern."""
+CONTACT_MARGIN = 0.12
+"""A pair of elements enters the sparsity pattern this share of its reach before it touches."""
 
 _NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 
@@ -172,8 +172,9 @@ class System:
         self._forward = self.pattern.positions(first, second)
         self._backward = self.pattern.positions(second, first)
         self._at_diagonal = self.pattern.diagonal
-        self._csr_order: IntArray | None = None
-        self._matrix: sparse.csr_matrix | None = None
+        fixed = np.zeros(self.n, dtype=bool)
+        fixed[self.fixed_nodes] = True
+        self._at_fixed = fixed[self.pattern.rows] | fixed[self.pattern.columns]
 
     def search_contact(self, x: FloatArray) -> ContactPairs | None:
         """Candidate pairs at nodal positions ``x``."""
@@ -259,29 +260,17 @@ class System:
             x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
         )
 
-    def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.csr_matrix:
-        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; fixed rows are identity."""
-        blocks = blocks.copy()
+    def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.bsr_matrix:
+        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; fixed rows are identity.
+
+        Overwrites ``blocks`` and refers to them.
+        """
         for i in range(3):
             blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
         if self.fixed_nodes.size:
-            fixed = np.zeros(self.n, dtype=bool)
-            fixed[self.fixed_nodes] = True
-            rows, columns = np.divmod(self.pattern.keys, self.n)
-            blocks[fixed[rows] | fixed[columns]] = 0.0
+            blocks[self._at_fixed] = 0.0
             blocks[self._at_diagonal[self.fixed_nodes]] = np.eye(3)
-        if self._matrix is None or self._csr_order is None:
-            numbered = np.arange(blocks.size, dtype=float).reshape(blocks.shape)
-            template = self.pattern.matrix(numbered)
-            template.sort_indices()
-            self._csr_order = template.data.astype(np.int64)
-            self._matrix = template
-        matrix = sparse.csr_matrix(
-            (blocks.ravel()[self._csr_order], self._matrix.indices, self._matrix.indptr),
-            shape=self._matrix.shape,
-        )
-        matrix.has_sorted_indices = True
-        return matrix
+        return self.pattern.matrix(blocks)
 
     # -- partial derivatives ----------------------------------------------------------------------
     def partial_stress(self, parameter: Parameter, state: SolidState) -> FloatArray:
