@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from mvest.typing import FloatArray, IntArray
@@ -86,14 +87,14 @@ class Pattern:
         return self.keys // self.n
 
     @cached_property
-    def columns(self) -> IntArray:
+    def columns(self) -> NDArray[np.int32]:
         """Column ``(n_blocks,)`` of each block."""
-        return self.keys % self.n
+        return (self.keys % self.n).astype(np.int32)
 
     @cached_property
-    def pointer(self) -> IntArray:
+    def pointer(self) -> NDArray[np.int32]:
         """Where each row starts ``(n + 1,)``."""
-        return np.searchsorted(self.rows, np.arange(self.n + 1))
+        return np.searchsorted(self.rows, np.arange(self.n + 1)).astype(np.int32)
 
     def matrix(self, blocks: FloatArray) -> sparse.bsr_matrix:
         """The matrix ``(3n, 3n)`` with the given block data, which it refers to.

@@ -376,7 +376,7 @@ def _search(
 
 
 @nb.njit(cache=True)
-def _grown(values: FloatArray, size: int) -> FloatArray:
+def _grown(values: np.ndarray, size: int) -> np.ndarray:
     out = np.empty(size, dtype=values.dtype)
     out[: len(values)] = values
     return out

@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, gmres, splu
 
@@ -87,7 +88,7 @@ class PardisoSolver:
         # allow, Bunch-Kaufman pivots (21), 3x3 blocks (37).
         for number, value in ((1, 1), (10, 8), (11, 0), (13, 0), (21, 1), (37, 3)):
             self._solver.set_iparm(number, value)
-        self._columns: IntArray | None = None
+        self._columns: NDArray[np.int32] | None = None
         self._upper: _Upper | None = None
         self._kept: BoolArray | None = None
         self._factor: _Blocks | None = None

@@ -280,10 +280,10 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(
     assert status == 0, err
     kept = sorted(path.name for path in (tmp_path / "published" / "records").iterdir())
     assert kept == [
-        "mesh-independence-hex18-structured-24-x-3.json",
         "mesh-independence-hex18-structured-36-x-4.json",
         "mesh-independence-hex18-structured-36-x-8.json",
         "mesh-independence-hex18-structured-54-x-6.json",
+        "mesh-independence-hex18-structured-72-x-8.json",
     ]
     table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
     assert table.count("hex18 structured") == 4

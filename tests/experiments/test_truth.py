@@ -111,7 +111,7 @@ def test_the_key_ignores_comments_docstrings_and_layout(library):
     text = place.read_text()
     for old, new in (
         ('"""Contact energy in N mm."""', '"""Something else."""'),
-        ("skin = self.skin\n", "skin = self.skin  # why\n\n\n"),
+        ("self.skin = skin\n", "self.skin = skin  # why\n\n\n"),
         ("# Pairs still apart", "# Those still apart"),
         ("NEIGHBOUR = 0.8", "NEIGHBOUR = (0.8)"),
     ):
