@@ -8,6 +8,7 @@ indexed addition.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +19,14 @@ from scipy import sparse
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Pattern", "add_forces", "scatter_blocks", "scatter_matrices"]
+__all__ = [
+    "Pattern",
+    "add_forces",
+    "adjacency",
+    "coupling",
+    "scatter_blocks",
+    "scatter_matrices",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,40 +45,19 @@ class Pattern:
     keys: IntArray
 
     @classmethod
-    def of(
-        cls, n: int, groups: list[IntArray], coupled: tuple[IntArray, IntArray] | None = None
-    ) -> Pattern:
-        """Pattern in which every group couples all its nodes with each other.
-
-        Parameters
-        ----------
-        n : int
-            Number of nodes.
-        groups : list of ndarray
-            ``(g, k)`` nodes of each group.
-        coupled : tuple of ndarray, optional
-            ``(pairs (p, 2), group (g, k))``: rows of the second array that are coupled with each
-            other.
-        """
-        total = sparse.identity(n, format="csr", dtype=np.int32)
-        for nodes in groups:
-            incidence = _incidence(n, nodes)
-            total = total + incidence.T @ incidence
-        if coupled is not None and len(coupled[0]):
-            pairs, nodes = coupled
-            incidence = _incidence(n, nodes)
-            one = np.ones(len(pairs), dtype=np.int32)
-            both = sparse.csr_matrix((one, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes),) * 2)
-            total = total + incidence.T @ ((both + both.T) @ incidence)
-        total = total.tocsr()
-        total.sort_indices()
-        rows = np.repeat(np.arange(n, dtype=np.int64), np.diff(total.indptr))
-        return cls(n, rows * n + total.indices)
+    def of(cls, coupled: sparse.csr_matrix) -> Pattern:
+        """Pattern of the entries stored in ``coupled (n, n)``."""
+        coupled.sort_indices()
+        n = coupled.shape[0]
+        rows = np.repeat(np.arange(n, dtype=np.int64), np.diff(coupled.indptr))
+        return cls(n, rows * n + coupled.indices)
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
-        """Positions ``(g, r, c)`` of the blocks coupling ``rows (g, r)`` and ``columns (g, c)``."""
-        key = rows[:, :, None] * self.n + columns[:, None, :]
-        return np.searchsorted(self.keys, key)
+        """Positions ``(g, r, c)`` of the blocks coupling ``rows (g, r)`` and ``columns (g, c)``.
+
+        All of them must be in the pattern.
+        """
+        return _positions(self.pointer, self.columns, rows, columns)
 
     @property
     def diagonal(self) -> IntArray:
@@ -106,11 +93,67 @@ class Pattern:
         return matrix
 
 
+def adjacency(n: int, groups: Sequence[IntArray]) -> sparse.csr_matrix:
+    """Matrix ``(n, n)`` with an entry for each pair of nodes that are in a group together.
+
+    Parameters
+    ----------
+    n : int
+        Number of nodes.
+    groups : sequence of ndarray
+        ``(g, k)`` nodes of each group. The diagonal is there in any case.
+    """
+    total = sparse.identity(n, format="csr", dtype=np.int32)
+    for nodes in groups:
+        incidence = _incidence(n, nodes)
+        total = total + incidence.T @ incidence
+    return total.tocsr()
+
+
+def coupling(n: int, nodes: IntArray, pairs: IntArray) -> sparse.csr_matrix:
+    """Matrix ``(n, n)`` with an entry for all nodes of groups that are coupled, both ways round.
+
+    Parameters
+    ----------
+    n : int
+        Number of nodes.
+    nodes : ndarray
+        ``(g, k)`` nodes of each group.
+    pairs : ndarray
+        ``(p, 2)`` which groups are coupled.
+    """
+    incidence = _incidence(n, nodes)
+    one = np.ones(len(pairs), dtype=np.int32)
+    both = sparse.csr_matrix((one, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes),) * 2)
+    return (incidence.T @ ((both + both.T) @ incidence)).tocsr()
+
+
 def _incidence(n: int, nodes: IntArray) -> sparse.csr_matrix:
     """Incidence ``(g, n)`` of groups and nodes."""
     rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     ones = np.ones(nodes.size, dtype=np.int32)
     return sparse.csr_matrix((ones, (rows, nodes.ravel())), shape=(len(nodes), n))
+
+
+@nb.njit(cache=True)
+def _positions(
+    pointer: NDArray[np.int32], indices: NDArray[np.int32], rows: IntArray, columns: IntArray
+) -> IntArray:
+    """Positions of entries of a matrix with sorted rows, by bisection within each row."""
+    out = np.empty((rows.shape[0], rows.shape[1], columns.shape[1]), dtype=np.int64)
+    for g in range(rows.shape[0]):
+        for a in range(rows.shape[1]):
+            start, end = pointer[rows[g, a]], pointer[rows[g, a] + 1]
+            for b in range(columns.shape[1]):
+                low, high, wanted = start, end, columns[g, b]
+                while high - low > 1:
+                    middle = (low + high) // 2
+                    if indices[middle] <= wanted:
+                        low = middle
+                    else:
+                        high = middle
+                out[g, a, b] = low
+    return out
 
 
 @nb.njit(cache=True)

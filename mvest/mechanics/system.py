@@ -14,7 +14,14 @@ import numpy as np
 from scipy import sparse
 
 from mvest.errors import InputError
-from mvest.mechanics.assembly import Pattern, add_forces, scatter_blocks, scatter_matrices
+from mvest.mechanics.assembly import (
+    Pattern,
+    add_forces,
+    adjacency,
+    coupling,
+    scatter_blocks,
+    scatter_matrices,
+)
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact, ContactPairs
 from mvest.mechanics.pressure import PressureLoad
@@ -133,7 +140,7 @@ class System:
             self.fixed_nodes.min() < 0 or self.fixed_nodes.max() >= self.n
         ):
             raise InputError(f"fixed_nodes must lie between 0 and {self.n - 1}")
-        self._slots: dict[tuple[int, int], int] = {}
+        self._static = adjacency(self.n, self._static_groups())
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     def retune(self, law: Law, factors: Factors) -> None:
@@ -156,9 +163,10 @@ class System:
         return groups
 
     def _build_pattern(self, hosts: IntArray) -> None:
-        """Pattern with contact between the pairs of elements ``hosts (g, 2)``."""
+        """Pattern with contact between the pairs of elements ``hosts (g, 2)``, in their order."""
         elements = self.solid.mesh.elements
-        self.pattern = Pattern.of(self.n, self._static_groups(), (hosts, elements))
+        self._coupled = hosts[:, 0] * len(elements) + hosts[:, 1]
+        self.pattern = Pattern.of(self._static + coupling(self.n, elements, hosts))
         self._at_elements = self.pattern.positions(elements, elements)
         if self.pressure is not None:
             self._at_faces = self.pattern.positions(self.pressure.faces, self.pressure.faces)
@@ -186,15 +194,13 @@ class System:
         The pattern holds the groups that touch and those that are about to, and nothing else:
         entries that are always zero would fill the factor.
         """
-        hosts = list(map(tuple, pairs.hosts.tolist()))
+        keys = pairs.hosts[:, 0] * len(self.solid.mesh.elements) + pairs.hosts[:, 1]
         touching = contact.touching(pairs, y)
-        if any(t and h not in self._slots for h, t in zip(hosts, touching, strict=True)):
-            near = contact.touching(pairs, y, CONTACT_MARGIN)
-            groups = pairs.hosts[near]
-            self._slots = {h: k for k, h in enumerate(map(tuple, groups.tolist()))}
-            self._build_pattern(groups)
-        slots = [self._slots.get(h, -1) if t else -1 for h, t in zip(hosts, touching, strict=True)]
-        return np.array(slots, dtype=np.int64)
+        if not np.isin(keys[touching], self._coupled, assume_unique=True).all():
+            self._build_pattern(pairs.hosts[contact.touching(pairs, y, CONTACT_MARGIN)])
+        slots = np.full(len(keys), -1, dtype=np.int64)
+        slots[touching] = np.searchsorted(self._coupled, keys[touching])
+        return slots
 
     # -- evaluation -------------------------------------------------------------------------------
     def evaluate(
