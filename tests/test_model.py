@@ -183,6 +183,20 @@ def test_a_continued_closure_ends_in_the_state_of_one_from_the_open_valve(closed
     np.testing.assert_allclose(warm.sensitivities[-1], cold.sensitivities[-1], rtol=0, atol=1e-6)
 
 
+def test_the_closed_state_does_not_depend_on_how_the_path_to_it_is_solved(closed):
+    model, simulation = closed
+    rough, last = simulation.records[:-1], simulation.records[-1]
+    assert max(r.residuals[-1] for r in rough) > 1e-4
+    assert last.residuals[-1] < 1e-9
+    # Solved in full at every step, and with continuation forbidden where every frame is wanted.
+    full = model.close(AT, sensitivities=False, every_frame=True).simulation
+    assert full.converged
+    assert len(full.times) == len(simulation.times) > 2
+    assert max(r.residuals[-1] for r in full.records) < 1e-9
+    assert np.abs(full.frames[-2] - simulation.frames[-2]).max() > 1e-6
+    np.testing.assert_allclose(full.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+
+
 def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     model = model_of(GENTLE, **SMALL)
     model = replace(model, continuation=True)

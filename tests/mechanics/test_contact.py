@@ -182,6 +182,46 @@ def test_the_search_finds_all_pairs_that_can_become_active_before_it_is_stale():
     )
 
 
+def test_the_search_finds_what_comparing_all_points_finds():
+    # Several points to a host, hosts in no order, a point far away, one flat layer of cells.
+    random = np.random.default_rng(9)
+    y = random.uniform(0, 9, (200, 3)) * [1, 1, 0.02]
+    y[-1] = [60.0, -40.0, 0.0]
+    rest = y + random.normal(scale=1.5, size=y.shape)
+    host = random.integers(0, 30, 200)
+    contact = contact_of(rest, host=host, skin=0.4)
+    pairs = contact.search(y)
+    settings, t = contact.settings, contact.thickness
+    expected = {}
+    for i in range(200):
+        for j in range(i + 1, 200):
+            mean = 0.5 * (t[i] + t[j])
+            full = settings.activation_distance * mean
+            reach = min(full, NEIGHBOUR * np.linalg.norm(rest[i] - rest[j]))
+            near = np.linalg.norm(y[i] - y[j]) < reach + 0.4
+            if near and reach > 0.5 * settings.reference_distance * mean:
+                reference = settings.reference_distance * mean * reach / full
+                expected[i, j] = (reach, reference)
+    found = {
+        (min(i, j), max(i, j)): (reach, reference)
+        for i, j, reach, reference in zip(
+            pairs.first, pairs.second, pairs.reach, pairs.reference, strict=True
+        )
+    }
+    assert len(found) == len(pairs.first) > 500
+    assert found.keys() == expected.keys()
+    for key, values in expected.items():
+        np.testing.assert_allclose(found[key], values, rtol=1e-14)
+    first, second = host[pairs.first], host[pairs.second]
+    assert np.all(first <= second)
+    for k, (one, other) in enumerate(pairs.hosts):
+        group = slice(pairs.start[k], pairs.start[k + 1])
+        assert np.all(first[group] == one)
+        assert np.all(second[group] == other)
+    keys = pairs.hosts[:, 0] * 30 + pairs.hosts[:, 1]
+    assert np.all(np.diff(keys) > 0)
+
+
 def test_a_step_takes_from_a_pair_at_most_its_share_of_the_way_to_the_barrier():
     contact, pairs, y = pair(1.4)
     dy = np.array([[0.0, 0, 0], [-10.0, 0.05, 0], [0, 0, 0]])

@@ -109,6 +109,29 @@ def test_a_body_without_support_has_no_static_equilibrium():
     assert len(result.frames) == 1
 
 
+def test_a_failed_step_leaves_nothing_behind(monkeypatch):
+    # A wild iterate may send the enhanced strains far off; the halved step must not start there.
+    true_evaluate, calls = Solid.evaluate, []
+
+    def evaluate(self, x, previous, rate):
+        state = true_evaluate(self, x, previous, rate)
+        calls.append(1)
+        if len(calls) == 3:
+            self.enhanced_parameters = self.enhanced_parameters + 50.0
+            state.stress[:] = np.nan
+        return state
+
+    undisturbed = sheet()
+    monkeypatch.setattr(Solid, "evaluate", evaluate)
+    disturbed = sheet()
+    assert undisturbed.converged
+    assert disturbed.converged
+    assert disturbed.records[0].halvings == 1
+    # One halved step of three is another path to nearly the same place, not to another one.
+    largest = np.abs(undisturbed.frames[-1] - undisturbed.frames[0]).max()
+    np.testing.assert_allclose(disturbed.frames[-1], undisturbed.frames[-1], atol=0.05 * largest)
+
+
 def test_failing_steps_are_halved_and_the_frames_stay_at_the_asked_times():
     settings = NewtonSettings(max_iterations=4, max_halvings=8)
     times = [0.03, 0.06]
