@@ -1,0 +1,461 @@
+r"""The same sheet in mvest and in two independent finite element libraries, timed side by side.
+
+A square sheet of linear tetrahedra, clamped on its four sides, is inflated from below by a follower
+pressure in one static step. All libraries get the same nodes, elements, law (St Venant-Kirchhoff),
+load and convergence criterion, and start from the flat sheet; so the deflections must agree, and
+what differs is the time. The peers are felupe and NGSolve; one that is not installed gets a row
+that says so. One more row per mesh factorises and solves mvest's tangent and does nothing else:
+what an iteration with this direct solver costs at least.
+
+felupe solves with PARDISO, as its documentation advises. NGSolve has an energy compiled by C++, if
+its compiler driver ``ngscxx`` is on the path, and its own sparse Cholesky factorisation: the
+fastest of its forms and solvers that were tried. What is set up once (mesh, sparsity pattern,
+compiled terms) is not timed; the symbolic analysis of the matrix is. All take turns, so that a busy
+machine slows all of them alike.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 \
+        python -m tests.benchmark.peers [OUTPUT.json]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import mvest
+from mvest.mechanics import (
+    Loads,
+    NewtonSettings,
+    Simulation,
+    Step,
+    System,
+    box,
+    outer_faces,
+    simulate,
+)
+from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.solver import linear_solver
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh import SolidMesh
+
+MESHES = ((40, 40, 1), (60, 60, 1))
+SIZE = (20.0, 20.0, 1.3)
+"""mm."""
+YOUNG, POISSON = 2.0, 0.45
+"""Young's modulus in MPa and Poisson's ratio."""
+PRESSURE = 0.002
+"""MPa."""
+TOLERANCE = 1e-8
+"""Residual at which Newton's method stops, over the forces that the residual is made of."""
+MAX_ITERATIONS = 16
+REPEATS = 6
+"""Whole solves by each library; the first is not counted."""
+AGREEMENT = 1e-6
+"""Relative difference of the deflections from mvest's above which the comparison is void."""
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+MU = YOUNG / (2 * (1 + POISSON))
+LAMBDA = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+
+
+class Solved(NamedTuple):
+    """One solve: its Newton iterations and how far the centre moved up (mm), if it did."""
+
+    iterations: int
+    deflection: float | None
+
+
+class Candidate(NamedTuple):
+    """A library with the sheet set up, ready to be solved again and again."""
+
+    library: str
+    version: str
+    note: str
+    solve: Callable[[], Solved]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table; what a row has not is None."""
+
+    library: str
+    version: str | None
+    nodes: int
+    seconds_per_iteration: float | None
+    iterations: int | None
+    deflection_mm: float | None
+    difference: float | None
+    note: str
+
+
+class Sheet:
+    """The mesh that all libraries share.
+
+    Attributes
+    ----------
+    nodes, elements : ndarray
+        ``(n, 3)`` mm and ``(m, 4)``.
+    under : ndarray
+        ``(f, 3)`` faces underneath, normals downwards.
+    clamped : ndarray
+        Nodes of the four sides.
+    centre : int
+        Node in the middle of the underside.
+    """
+
+    def __init__(self, cells: tuple[int, int, int]) -> None:
+        self.nodes, self.elements = box("tet4", cells, SIZE)
+        faces = outer_faces(self.elements, "tet4")
+        self.under = faces[np.all(self.nodes[faces][:, :, 2] == 0, axis=1)]
+        plane = self.nodes[:, :2]
+        self.clamped = np.flatnonzero(np.any((plane == 0) | (plane == SIZE[:2]), axis=1))
+        middle = (SIZE[0] / 2, SIZE[1] / 2, 0.0)
+        self.centre = int(np.argmin(np.linalg.norm(self.nodes - middle, axis=1)))
+
+
+class SaintVenantKirchhoff:
+    """The law ``S = C E`` with constant isotropic moduli, for one region."""
+
+    def __init__(self) -> None:
+        self.moduli = np.diag([2 * MU] * 3 + [MU] * 3)
+        self.moduli[:3, :3] += LAMBDA
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """The Green-Lagrange strain itself; nothing is damped."""
+        return green
+
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
+        stress = (green.reshape(-1, 6) @ self.moduli).reshape(green.shape)
+        return stress, np.tile(self.moduli, (*green.shape[:2], 1, 1))
+
+    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
+        """The stress is proportional to Young's modulus."""
+        return np.where((region == which)[:, None, None], stress, 0.0)
+
+    def history_stress(
+        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Zero: the stress has no history."""
+        return np.zeros_like(green)
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """The change of the strain itself."""
+        return d_green
+
+
+class Mvest:
+    """The sheet in mvest."""
+
+    def __init__(self, sheet: Sheet) -> None:
+        mesh = SolidMesh(
+            sheet.nodes,
+            sheet.elements,
+            "tet4",
+            np.zeros(len(sheet.elements), dtype=np.int64),
+            ("sheet",),
+            np.broadcast_to([1.0, 0.0, 0.0], sheet.nodes.shape).copy(),
+            sheet.under,
+        )
+        self.system = System(
+            Solid(mesh, SaintVenantKirchhoff()),
+            pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
+            fixed_nodes=sheet.clamped,
+        )
+        self.loads = Loads(pressure=PRESSURE, fixed=sheet.nodes[sheet.clamped])
+
+    def simulate(self) -> Simulation:
+        """One static step, with a solver that has not seen the matrix before."""
+        result = simulate(
+            self.system,
+            lambda _: self.loads,
+            [Step(1.0, static=True)],
+            newton=NewtonSettings(tolerance=TOLERANCE, max_iterations=MAX_ITERATIONS),
+            solver=linear_solver(),
+        )
+        if not result.converged:
+            raise RuntimeError(f"mvest: {result.reason.value}")
+        return result
+
+
+def with_mvest(sheet: Sheet) -> Candidate:
+    """The sheet in mvest."""
+    body = Mvest(sheet)
+
+    def solve() -> Solved:
+        result = body.simulate()
+        return Solved(result.iterations, float(result.frames[-1, sheet.centre, 2]))
+
+    return Candidate("mvest", mvest.__version__, f"solver {linear_solver().name}", solve)
+
+
+def factor_alone(sheet: Sheet) -> Candidate:
+    """Factorising and solving mvest's tangent of the inflated sheet, analysed beforehand."""
+    body = Mvest(sheet)
+    state = body.system.evaluate(
+        body.simulate().frames[-1],
+        body.loads,
+        None,
+        body.system.solid.initial_strain(),
+        0.0,
+        tangent=True,
+    )
+    assert state.blocks is not None
+    matrix = body.system.matrix(state.blocks, 0.0)
+    right = np.ones(matrix.shape[0])
+    solver = linear_solver()
+    solver.factorize(matrix)
+
+    def solve() -> Solved:
+        solver.factorize(matrix)
+        solver.solve(right)
+        return Solved(1, None)
+
+    version = metadata.version("mkl" if solver.name == "pardiso" else "scipy")
+    return Candidate("factor + solve alone", version, f"{solver.name}, mvest's tangent", solve)
+
+
+def with_felupe(sheet: Sheet) -> Candidate:
+    """The sheet in felupe."""
+    import felupe as fem
+    from pypardiso import spsolve
+
+    eye = np.eye(3)[:, :, None, None]
+
+    def second(f: FloatArray) -> FloatArray:
+        green = 0.5 * (np.einsum("ki...,kj...->ij...", f, f) - eye)
+        return LAMBDA * np.trace(green) * eye + 2 * MU * green
+
+    def stress(x: list[Any]) -> list[Any]:
+        f, state = x[0], x[-1]
+        return [np.einsum("ik...,kj...->ij...", f, second(f)), state]
+
+    def elasticity(x: list[Any]) -> list[Any]:
+        f = x[0]
+        s = second(f)
+        left = np.einsum("ik...,jk...->ij...", f, f)
+        moduli = LAMBDA * np.einsum("ij...,kl...->ijkl...", f, f)
+        moduli += MU * np.einsum("il...,kj...->ijkl...", f, f)
+        for i in range(3):
+            moduli[i, :, i, :] += s
+            moduli[:, i, :, i] += MU * left
+        return [moduli]
+
+    region = fem.RegionTetra(fem.Mesh(sheet.nodes, sheet.elements, "tetra"))
+    solid = fem.SolidBody(
+        fem.Material(stress, elasticity), fem.FieldContainer([fem.Field(region, dim=3)])
+    )
+    load = fem.SolidBodyPressure(
+        fem.FieldContainer([fem.Field(_felupe_underside(sheet), dim=3)]), pressure=PRESSURE
+    )
+    held = (3 * sheet.clamped[:, None] + np.arange(3)).ravel()
+    free = np.setdiff1d(np.arange(sheet.nodes.size), held)
+
+    def check(dx: FloatArray, f: Any, ftol: float, **_: Any) -> tuple[float, float, bool]:
+        relative = float(np.linalg.norm(f[free]) / np.linalg.norm(f))
+        return float(np.linalg.norm(dx)), relative, relative <= ftol
+
+    def solve() -> Solved:
+        result = fem.newtonraphson(
+            items=[solid, load],
+            x0=fem.FieldContainer([fem.Field(region, dim=3)]),
+            dof0=held,
+            dof1=free,
+            ext0=np.zeros(len(held)),
+            solver=spsolve,
+            tol=TOLERANCE,
+            maxiter=MAX_ITERATIONS,
+            check=check,
+            verbose=0,
+        )
+        return Solved(result.iterations, float(result.x[0].values[sheet.centre, 2]))
+
+    return Candidate("felupe", metadata.version("felupe"), "solver pypardiso.spsolve", solve)
+
+
+def _felupe_underside(sheet: Sheet) -> Any:
+    """Region of the faces underneath; felupe has boundary regions of bricks only.
+
+    The tetrahedra above the faces, the corners of the face first, with one quadrature point in the
+    middle of the face: exact, for the deformation gradient is constant.
+    """
+    import felupe as fem
+
+    on = np.isin(sheet.elements, sheet.under)
+    above = on.sum(axis=1) == 3
+    order = np.argsort(~on[above], axis=1, kind="stable")
+    cells = np.take_along_axis(sheet.elements[above], order, axis=1)
+    edges = np.diff(sheet.nodes[cells], axis=1)
+    inverted = np.linalg.det(edges) < 0
+    cells[inverted] = cells[inverted][:, [1, 0, 2, 3]]
+    middle = fem.quadrature.Scheme(np.array([[1 / 3, 1 / 3, 0.0]]), np.array([0.5]))
+    region = fem.RegionTetra(fem.Mesh(sheet.nodes, cells, "tetra"), quadrature=middle)
+    region.dV = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)[None, :]
+    region.normals = np.tile(np.array([0.0, 0.0, -1.0])[:, None, None], (1, 1, len(cells)))
+    return region
+
+
+def with_ngsolve(sheet: Sheet) -> Candidate:
+    """The sheet in NGSolve."""
+    import ngsolve as ng
+    from netgen.meshing import NgException
+
+    mesh = _ngsolve_mesh(sheet)
+    space = ng.VectorH1(mesh, order=1)
+    n = len(sheet.nodes)
+    free = ng.BitArray(space.ndof)
+    free.Set()
+    for axis in range(3):
+        for node in sheet.clamped:
+            free.Clear(int(axis * n + node))
+    at_free = np.array(free, dtype=bool)
+    u, v = space.TnT()
+    f = ng.Id(3) + ng.Grad(u)
+    green = 0.5 * (f.trans * f - ng.Id(3))
+    energy = 0.5 * LAMBDA * ng.Trace(green) ** 2 + MU * ng.InnerProduct(green, green)
+    f_under = ng.Id(3) + ng.Grad(u).Trace()
+    push = ng.InnerProduct(ng.Cof(f_under) * ng.CF((0, 0, -1)), v.Trace())
+    # One point per element and face integrates both terms exactly. With all sides clamped the
+    # load stiffness is symmetric, so that half the matrix suffices.
+    one = {ng.TET: ng.IntegrationRule(ng.TET, 1), ng.TRIG: ng.IntegrationRule(ng.TRIG, 1)}
+    form = ng.BilinearForm(space, symmetric=True)
+    try:
+        options = {"realcompile": True, "wait": True}
+        energy, push, how = energy.Compile(**options), push.Compile(**options), "compiled by C++"
+    except NgException:
+        energy, push, how = energy.Compile(), push.Compile(), "interpreted: no C++ compiler"
+    form += ng.Variation(energy * ng.dx(intrules=one))
+    form += PRESSURE * push * ng.ds("under", intrules=one)
+    position = ng.GridFunction(space)
+    residual, step = position.vec.CreateVector(), position.vec.CreateVector()
+
+    def solve() -> Solved:
+        position.vec[:] = 0.0
+        inverse = None
+        for iteration in range(MAX_ITERATIONS + 1):
+            form.Apply(position.vec, residual)
+            entries = residual.FV().NumPy()
+            if np.linalg.norm(entries[at_free]) <= TOLERANCE * np.linalg.norm(entries):
+                return Solved(iteration, float(position.vec.FV().NumPy()[2 * n + sheet.centre]))
+            form.AssembleLinearization(position.vec)
+            if inverse is None:
+                inverse = form.mat.Inverse(free, inverse="sparsecholesky")
+            else:
+                inverse.Update()
+            step.data = inverse * residual
+            position.vec.data -= step
+        raise RuntimeError("NGSolve: Newton's method did not converge")
+
+    note = f"solver sparsecholesky; terms {how}"
+    return Candidate("ngsolve", metadata.version("ngsolve"), note, solve)
+
+
+def _ngsolve_mesh(sheet: Sheet) -> Any:
+    """The mesh with its underside as the only boundary, nodes in the order of the sheet."""
+    import ngsolve as ng
+    from netgen import meshing
+
+    mesh = meshing.Mesh(dim=3)
+    points = [mesh.Add(meshing.MeshPoint(meshing.Pnt(*map(float, x)))) for x in sheet.nodes]
+    mesh.Add(meshing.FaceDescriptor(surfnr=1, domin=1, domout=0, bc=1))
+    mesh.SetBCName(0, "under")
+    mesh.SetMaterial(1, "sheet")
+    for element in sheet.elements:
+        mesh.Add(meshing.Element3D(1, [points[k] for k in element]))
+    for face in sheet.under:
+        mesh.Add(meshing.Element2D(1, [points[k] for k in face]))
+    return ng.Mesh(mesh)
+
+
+def measure(sheet: Sheet) -> list[Row]:
+    """Rows of all libraries, mvest first."""
+    n = len(sheet.nodes)
+    candidates: list[Candidate] = []
+    missing: list[Row] = []
+    for name, prepare in PREPARE.items():
+        try:
+            candidates.append(prepare(sheet))
+        except ImportError as error:
+            missing.append(Row(name, None, n, None, None, None, None, f"not importable: {error}"))
+    seconds: list[list[float]] = [[] for _ in candidates]
+    solved: list[Solved] = []
+    for _ in range(REPEATS):
+        solved = []
+        for candidate, taken in zip(candidates, seconds, strict=True):
+            start = time.perf_counter()
+            solved.append(candidate.solve())
+            taken.append((time.perf_counter() - start) / solved[-1].iterations)
+    expected = solved[0].deflection
+    assert expected is not None
+    rows = []
+    for (library, version, note, _), taken, (iterations, deflection) in zip(
+        candidates, seconds, solved, strict=True
+    ):
+        difference = None if deflection is None else abs(deflection / expected - 1)
+        median = float(np.median(taken[1:]))
+        rows.append(Row(library, version, n, median, iterations, deflection, difference, note))
+    return rows + missing
+
+
+PREPARE: dict[str, Callable[[Sheet], Candidate]] = {
+    "mvest": with_mvest,
+    "felupe": with_felupe,
+    "ngsolve": with_ngsolve,
+    "factor + solve alone": factor_alone,
+}
+
+
+def table(rows: list[Row]) -> str:
+    """The rows as plain text."""
+
+    def cell(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
+
+    lines = [
+        f"{'library':<21}{'version':>10}{'nodes':>7}{'s/iteration':>13}{'iterations':>12}"
+        f"{'deflection mm':>16}{'difference':>12}  note"
+    ]
+    lines += [
+        f"{row.library:<21}{row.version or '-':>10}{row.nodes:>7}"
+        f"{cell(row.seconds_per_iteration, '.4f'):>13}{cell(row.iterations, 'd'):>12}"
+        f"{cell(row.deflection_mm, '.10f'):>16}{cell(row.difference, '.1e'):>12}  {row.note}"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> str | None:
+    """Print the table, write it where told; returns what is wrong, if anything."""
+    rows: list[Row] = []
+    for cells in MESHES:
+        rows += measure(Sheet(cells))
+    print(table(rows))
+    if arguments:
+        record = {
+            "rows": [asdict(row) for row in rows],
+            "tolerance": TOLERANCE,
+            "repeats": REPEATS - 1,
+            "threads": {name: os.environ.get(name) for name in THREADS},
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+        }
+        Path(arguments[0]).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    apart = [r.library for r in rows if r.difference is not None and not r.difference < AGREEMENT]
+    return f"deflections differ from mvest's: {', '.join(apart)}" if apart else None
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
