@@ -17,7 +17,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 TRACKING := sqlite:///$(CURDIR)/outputs/mlflow.db
 
-.PHONY: help install reproduce tables test test-all lint format dashboard lock clean
+.PHONY: help install reproduce tables test test-all bench lint format dashboard lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,6 +42,15 @@ test: $(INSTALLED) ## the tests that finish in minutes
 
 test-all: $(INSTALLED) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES)
+
+BENCH := $(BIN)/python -m pytest tests/benchmark -p no:xdist -o python_files='bench_*.py'
+bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (about 20 minutes)
+	@mkdir -p outputs
+	$(BENCH) --benchmark-json=outputs/benchmark.json
+	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "3k and (closure or factorisation)" \
+		--benchmark-json=outputs/benchmark_2_threads.json
+	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
+	$(BIN)/python -m experiments.benchmark outputs/benchmark.json outputs/benchmark_2_threads.json outputs/peers.json
 
 lint: $(INSTALLED) ## style and types
 	$(BIN)/ruff check .

@@ -18,17 +18,12 @@ from mvest.errors import InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact, ContactSettings
-from mvest.mechanics.integrate import (
-    Damping,
-    NewtonSettings,
-    Simulation,
-    Step,
-    simulate,
-)
+from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import LinearSolver, linear_solver
+from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Factors, Loads, Parameter, System
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa

@@ -79,13 +79,16 @@ def git_state(directory: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file was changed); both
+        ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside
+        ``results/`` was changed); both
         None outside a checkout, before the first commit, or where git is not installed.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
     if sha is None:
         return {"sha": None, "dirty": None}
-    changes = _git(directory, "status", "--porcelain", "--untracked-files=no")
+    # What runs write to results/ is no part of what they ran.
+    places = (":(top)", ":(top,exclude)results")
+    changes = _git(directory, "status", "--porcelain", "--untracked-files=no", "--", *places)
     return {"sha": sha, "dirty": None if changes is None else bool(changes)}
 
 

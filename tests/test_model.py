@@ -12,7 +12,7 @@ import pytest
 import mvest.model
 from mvest.errors import InputError
 from mvest.mechanics.contact import Contact, ContactSettings
-from mvest.mechanics.integrate import NewtonSettings, Reason
+from mvest.mechanics.steps import NewtonSettings, Reason
 from mvest.model import (
     ClosureModel,
     ClosureProtocol,

@@ -47,6 +47,18 @@ def test_a_clean_checkout_is_named_by_its_commit(checkout: Path) -> None:
     assert git_state(checkout) == {"sha": git(checkout, "rev-parse", "HEAD"), "dirty": False}
 
 
+def test_results_are_written_by_runs_and_do_not_make_them_dirty(checkout: Path) -> None:
+    for name in ("results", "code"):
+        (checkout / name).mkdir()
+        (checkout / name / "kept.txt").write_text("one")
+    git(checkout, "add", ".")
+    git(checkout, "commit", "-qm", "more")
+    (checkout / "results" / "kept.txt").write_text("two")
+    assert git_state(checkout / "code")["dirty"] is False
+    (checkout / "code" / "kept.txt").write_text("two")
+    assert git_state(checkout / "results")["dirty"] is True
+
+
 def test_a_changed_tracked_file_is_dirty_and_an_untracked_one_is_not(checkout: Path) -> None:
     (checkout / "output.txt").write_text("left behind by a run\n")
     assert git_state(checkout)["dirty"] is False

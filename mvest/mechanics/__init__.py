@@ -12,7 +12,8 @@ What is here, in the order data flows:
   tangents of all elements of a mesh;
 * ``pressure``, ``cables`` (chordae, annular hinge), ``contact``: what acts on the solid;
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
-* ``solver``: sparse direct solvers; ``integrate``: time steps, Newton's method, sensitivities;
+* ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
+  time steps, Newton's method, sensitivities;
 * ``box``: blocks of cells and outer faces; ``body``: all of it without a valve.
 
 A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):
@@ -36,8 +37,9 @@ A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at 
 
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.box import box, outer_faces
-from mvest.mechanics.integrate import Damping, NewtonSettings, Reason, Simulation, Step, simulate
+from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.steps import Damping, NewtonSettings, Reason, Simulation, Step
 from mvest.mechanics.system import Factors, Loads, Parameter, System
 
 __all__ = [

@@ -9,11 +9,12 @@ from numpy.typing import ArrayLike
 
 from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError, MaterialError
-from mvest.mechanics.integrate import Damping, NewtonSettings, Simulation, Step, simulate
+from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, TransverselyIsotropic
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, Parameter, System
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh import SolidMesh

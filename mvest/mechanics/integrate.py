@@ -6,9 +6,9 @@ Backward Euler: with :math:`v_{n+1} = (x_{n+1} - x_n)/\Delta t` each step solves
           + f_{int}(x_{n+1}; \epsilon_n) - f_{ext}(x_{n+1}, t_{n+1}) = 0
 
 by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step
-that fails (no convergence, leaflets through each other) is halved; nothing is ever accepted
-unconverged, except in the single-solve mode, which takes one linearised solve per step by
-definition.
+that fails (no convergence, leaflets through each other) is halved, a static one is tried again
+after the body has had more time to come to rest; nothing is ever accepted unconverged, except in
+the single-solve mode, which takes one linearised solve per step by definition.
 
 Sensitivities differentiate these discrete equations (Michaleris, Tortorelli and Vidal 1994, Int. J.
 Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for each parameter m,
@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 
 import numpy as np
 
@@ -29,147 +28,24 @@ from mvest.errors import InputError
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.contact import ContactPairs
 from mvest.mechanics.solver import LinearSolver, linear_solver
+from mvest.mechanics.steps import (
+    Damping,
+    NewtonSettings,
+    Reason,
+    Simulation,
+    Step,
+    StepRecord,
+)
 from mvest.mechanics.system import Evaluation, Loads, Parameter, System
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Damping",
-    "NewtonSettings",
-    "Reason",
-    "Simulation",
-    "Step",
-    "StepRecord",
-    "simulate",
-]
+__all__ = ["simulate"]
 
 
-class Reason(Enum):
-    """Why a simulation stopped."""
-
-    COMPLETED = "completed"
-    NO_CONVERGENCE = "Newton's method did not converge at the smallest step"
-    INTERSECTION = "leaflets pass through each other at the smallest step"
-    SINGULAR = "the tangent could not be factorised"
-
-
-@dataclass(frozen=True, slots=True)
-class Damping:
-    """Rayleigh damping ``C = alpha M + beta K``.
-
-    Attributes
-    ----------
-    alpha : float
-        1/s, mass-proportional.
-    beta : float
-        s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law`).
-    """
-
-    alpha: float = 0.1
-    beta: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not (self.alpha >= 0 and self.beta >= 0):
-            raise InputError(f"damping alpha = {self.alpha}, beta = {self.beta}, expected >= 0")
-
-
-@dataclass(frozen=True, slots=True)
-class NewtonSettings:
-    """How each step is solved.
-
-    Attributes
-    ----------
-    tolerance : float
-        Norm of the residual over the norm of the largest force.
-    path_tolerance : float
-        The same for steps that are only passed through, when the last frame alone is wanted and it
-        is an equilibrium, which no step before it enters.
-    max_iterations : int
-    max_halvings : int
-        How often a failing step may be halved.
-    single_solve : bool
-        One linearised solve per step, as SOFA does by default; nothing is checked for convergence.
-    largest_move : float
-        mm that a node may move in one iteration.
-    smallest_move : float
-        mm; a correction this small is round-off and counts as converged.
-    """
-
-    tolerance: float = 1e-9
-    path_tolerance: float = 1e-1
-    max_iterations: int = 60
-    max_halvings: int = 8
-    single_solve: bool = False
-    largest_move: float = 4.0
-    smallest_move: float = 1e-10
-
-    def __post_init__(self) -> None:
-        positive = self.tolerance > 0 and self.path_tolerance > 0
-        if not positive or self.max_iterations < 1 or self.max_halvings < 0:
-            raise InputError(f"inadmissible Newton settings: {self}")
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One time step: its end time (s) and whether it is static (no inertia, no damping)."""
-
-    time: float
-    static: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class StepRecord:
-    """What one accepted (sub)step cost.
-
-    Attributes
-    ----------
-    time, dt : float
-        s.
-    residuals : tuple of float
-        Relative residual before each iteration and after the last.
-    active_contacts : int
-        Pairs within reach.
-    halvings : int
-        Level of the substep.
-    """
-
-    time: float
-    dt: float
-    residuals: tuple[float, ...]
-    active_contacts: int
-    halvings: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Simulation:
-    """Result of a forward run; a failure is a value.
-
-    Attributes
-    ----------
-    times : ndarray
-        ``(f,)`` s of the completed steps, the initial state first.
-    frames : ndarray
-        ``(f, n, 3)`` mm nodal positions.
-    sensitivities : ndarray
-        ``(f, p, n, 3)`` mm per unit of each parameter.
-    reason : Reason
-    records : tuple of StepRecord
-    """
-
-    times: FloatArray
-    frames: FloatArray
-    sensitivities: FloatArray
-    reason: Reason
-    records: tuple[StepRecord, ...]
-
-    @property
-    def converged(self) -> bool:
-        """Whether all steps were completed."""
-        return self.reason is Reason.COMPLETED
-
-    @property
-    def iterations(self) -> int:
-        """Newton iterations in all."""
-        return sum(len(r.residuals) - 1 for r in self.records)
+SETTLINGS = 2
+"""How often a body may be let rest before an equilibrium that is not found at once."""
+SETTLING_STEPS = 3
+"""Steps of one rest."""
 
 
 @dataclass(slots=True, eq=False)
@@ -269,16 +145,12 @@ def simulate(
         np.zeros((n_p, *strain0.shape)),
     )
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
-    if final_only and steps[-1].static:
-        stepper.differentiate = False
-        stepper.tolerance = max(newton.path_tolerance, newton.tolerance)
+    stepper.last_only = final_only and steps[-1].static
     frames, sensitivities, done = [x0], [state.dx], [0.0]
     records: list[StepRecord] = []
     reason = Reason.COMPLETED
     for step in steps:
-        if step is steps[-1]:
-            stepper.differentiate = True
-            stepper.tolerance = newton.tolerance
+        stepper.passing = stepper.last_only and step is not steps[-1]
         try:
             state = stepper.advance(state, done[-1], step, records)
         except _StepError as failure:
@@ -312,42 +184,73 @@ class _Stepper:
         self.newton = newton
         self.parameters = parameters
         self.solver = solver
-        self.differentiate = True
-        self.tolerance = newton.tolerance
+        self.last_only = False
+        self.passing = False  # whether the steps now taken are not wanted for themselves
         self._pairs: ContactPairs | None = None
 
     def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
         """State at ``step.time``; halves the step where it fails."""
+        if step.static:
+            return self._settle(state, start, step.time, records)
         pending = [(step.time, 0)]
         time = start
         while pending:
             end, level = pending[-1]
-            enhanced = self.system.solid.enhanced_parameters
             try:
-                new, solved = self._step(state, time, end, step.static)
+                state = self._try(state, end, end - time, False, level, records)
             except _StepError:
-                # A failed step must not leave its enhanced strains behind.
-                self.system.solid.enhanced_parameters = enhanced
-                if level >= self.newton.max_halvings or step.static:
+                if level >= self.newton.max_halvings:
                     raise
                 pending.append((0.5 * (time + end), level + 1))
                 pending[-2] = (end, level + 1)
                 continue
             pending.pop()
-            contact = self.system.contact
-            active = (
-                contact.active(solved.pairs, contact.points(new.x))
-                if contact is not None and solved.pairs is not None
-                else 0
-            )
-            records.append(StepRecord(end, end - time, tuple(solved.residuals), active, level))
-            state, time = new, end
+            time = end
         return state
 
-    def _step(
-        self, state: _State, start: float, end: float, static: bool
-    ) -> tuple[_State, _Solved]:
-        dt = end - start
+    def _settle(
+        self, state: _State, start: float, time: float, records: list[StepRecord]
+    ) -> _State:
+        """Equilibrium at ``time``; where it is not found from a moving body, the body rests first.
+
+        Resting takes steps of time under the final loads, each twice as long as the one before.
+        """
+        for level in range(SETTLINGS + 1):
+            try:
+                return self._try(state, time, time - start, True, level, records)
+            except _StepError:
+                if level == SETTLINGS or not state.dt:
+                    raise
+            self.passing = self.last_only
+            for _ in range(SETTLING_STEPS):
+                state = self._try(state, time, 2 * state.dt, False, level + 1, records)
+            self.passing = False
+        raise AssertionError("unreachable")
+
+    def _try(
+        self,
+        state: _State,
+        time: float,
+        dt: float,
+        static: bool,
+        level: int,
+        records: list[StepRecord],
+    ) -> _State:
+        """State after one step, which is put on record; a failed one leaves nothing behind."""
+        enhanced = self.system.solid.enhanced_parameters
+        try:
+            new, solved = self._step(state, time, dt, static)
+        except _StepError:
+            self.system.solid.enhanced_parameters = enhanced
+            raise
+        contact = self.system.contact
+        active = 0
+        if contact is not None and solved.pairs is not None:
+            active = contact.active(solved.pairs, contact.points(new.x))
+        records.append(StepRecord(time, dt, tuple(solved.residuals), active, level))
+        return new
+
+    def _step(self, state: _State, end: float, dt: float, static: bool) -> tuple[_State, _Solved]:
         loads = self.loading(end)
         rate = 0.0 if static else self.damping.beta / dt
         mass = self.system.solid.lumped_mass[:, None]
@@ -366,7 +269,7 @@ class _Stepper:
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
         new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, dt)
-        if self.parameters and self.differentiate:
+        if self.parameters and not self.passing:
             self._differentiate(state, new, solved, loads, rate, dt, static)
         return new, solved
 
@@ -380,6 +283,7 @@ class _Stepper:
         advance: float,
     ) -> _Solved:
         system, newton = self.system, self.newton
+        tolerance = max(newton.path_tolerance if self.passing else 0.0, newton.tolerance)
         mass = system.solid.lumped_mass[:, None]
         fixed = system.fixed_nodes
         x = state.x.copy()
@@ -410,8 +314,8 @@ class _Stepper:
             if not np.isfinite(residuals[-1]):
                 raise _StepError(Reason.NO_CONVERGENCE)
             assert current.blocks is not None
-            converged = residuals[-1] <= self.tolerance
-            if converged and not (self.parameters and self.differentiate):
+            converged = residuals[-1] <= tolerance
+            if converged and (self.passing or not self.parameters):
                 return _Solved(x, current, residuals, pairs)
             if iteration == newton.max_iterations and not converged:
                 break

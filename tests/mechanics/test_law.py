@@ -5,9 +5,10 @@ import pytest
 
 from mvest.errors import MaterialError
 from mvest.mechanics.cables import Hinge
-from mvest.mechanics.integrate import NewtonSettings, Step, simulate
+from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
+from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Loads, System
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, block, point_masses, rotation
 

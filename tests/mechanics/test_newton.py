@@ -14,10 +14,12 @@ from mvest.mechanics import (
     Step,
     System,
     box,
+    integrate,
     outer_faces,
     simulate,
     simulate_body,
 )
+from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from tests.mechanics.bodies import MATERIALS, block, sandwich
 
@@ -185,3 +187,55 @@ def test_inadmissible_newton_settings(settings):
 def test_inadmissible_damping(settings):
     with pytest.raises(InputError, match="damping"):
         Damping(**settings)
+
+
+def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatch):
+    mesh = block("hex18", (4, 2, 1), (20.0, 10.0, 1.3))
+    nodes, law = mesh.nodes, BiotLaw.of((MATERIALS["A"],))
+    fixed = np.flatnonzero(nodes[:, 0] == 0)
+    faces = outer_faces(mesh.elements, "hex18")
+    under = faces[np.all(nodes[faces][:, :, 2] == 0, axis=1)]
+
+    def run(**options):
+        system = System(Solid(mesh, law), pressure=PressureLoad(under, "quad9"), fixed_nodes=fixed)
+        loads = Loads(pressure=2e-4, fixed=nodes[fixed])
+        parameters = [Parameter("pressure_scale", 1.0)]
+        steps = [Step(0.01), Step(0.02), Step(1.0, static=True)]
+        return simulate(system, lambda t: loads, steps, parameters=parameters, **options)
+
+    undisturbed = run(final_only=True)
+    true_step, refused = integrate._Stepper._step, []
+
+    def step(self, state, end, dt, static):
+        if static and not refused:
+            refused.append(dt)
+            raise integrate._StepError(Reason.NO_CONVERGENCE)
+        return true_step(self, state, end, dt, static)
+
+    monkeypatch.setattr(integrate._Stepper, "_step", step)
+    for final_only in (True, False):
+        refused.clear()
+        rested = run(final_only=final_only)
+        assert rested.converged
+        assert len(rested.times) == 4
+        # Three steps of twice the length each, then the equilibrium.
+        assert [r.dt for r in rested.records[2:]] == pytest.approx([0.02, 0.04, 0.08, 0.98])
+        assert [r.halvings for r in rested.records] == [0, 0, 1, 1, 1, 1]
+        np.testing.assert_allclose(rested.frames[-1], undisturbed.frames[-1], atol=1e-8)
+        np.testing.assert_allclose(
+            rested.sensitivities[-1], undisturbed.sensitivities[-1], rtol=0, atol=1e-6
+        )
+
+
+def test_an_equilibrium_that_is_never_found_is_a_failure(monkeypatch):
+    true_step = integrate._Stepper._step
+
+    def step(self, state, end, dt, static):
+        if static:
+            raise integrate._StepError(Reason.NO_CONVERGENCE)
+        return true_step(self, state, end, dt, static)
+
+    monkeypatch.setattr(integrate._Stepper, "_step", step)
+    result = sheet(static=True)
+    assert result.reason is Reason.NO_CONVERGENCE
+    assert len(result.times) == 1

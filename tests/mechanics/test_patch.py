@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mvest.mechanics.integrate import NewtonSettings, Step, simulate
+from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw
 from mvest.mechanics.solid import Solid
+from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Loads, System
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, block, boundary, rotation
 

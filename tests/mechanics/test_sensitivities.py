@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.integrate import NewtonSettings, Step, simulate
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Factors, Parameter
 from tests.mechanics.bodies import sandwich
 

@@ -1,0 +1,147 @@
+"""What a simulation is asked for and what it gives back: steps, settings, frames, reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from mvest.errors import InputError
+from mvest.typing import FloatArray
+
+__all__ = [
+    "Damping",
+    "NewtonSettings",
+    "Reason",
+    "Simulation",
+    "Step",
+    "StepRecord",
+]
+
+
+class Reason(Enum):
+    """Why a simulation stopped."""
+
+    COMPLETED = "completed"
+    NO_CONVERGENCE = "Newton's method did not converge at the smallest step"
+    INTERSECTION = "leaflets pass through each other at the smallest step"
+    SINGULAR = "the tangent could not be factorised"
+
+
+@dataclass(frozen=True, slots=True)
+class Damping:
+    """Rayleigh damping ``C = alpha M + beta K``.
+
+    Attributes
+    ----------
+    alpha : float
+        1/s, mass-proportional.
+    beta : float
+        s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law`).
+    """
+
+    alpha: float = 0.1
+    beta: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (self.alpha >= 0 and self.beta >= 0):
+            raise InputError(f"damping alpha = {self.alpha}, beta = {self.beta}, expected >= 0")
+
+
+@dataclass(frozen=True, slots=True)
+class NewtonSettings:
+    """How each step is solved.
+
+    Attributes
+    ----------
+    tolerance : float
+        Norm of the residual over the norm of the largest force.
+    path_tolerance : float
+        The same for steps that are only passed through, when the last frame alone is wanted and it
+        is an equilibrium, which no step before it enters.
+    max_iterations : int
+    max_halvings : int
+        How often a failing step may be halved.
+    single_solve : bool
+        One linearised solve per step, as SOFA does by default; nothing is checked for convergence.
+    largest_move : float
+        mm that a node may move in one iteration.
+    smallest_move : float
+        mm; a correction this small is round-off and counts as converged.
+    """
+
+    tolerance: float = 1e-9
+    path_tolerance: float = 1e-1
+    max_iterations: int = 60
+    max_halvings: int = 8
+    single_solve: bool = False
+    largest_move: float = 4.0
+    smallest_move: float = 1e-10
+
+    def __post_init__(self) -> None:
+        positive = self.tolerance > 0 and self.path_tolerance > 0
+        if not positive or self.max_iterations < 1 or self.max_halvings < 0:
+            raise InputError(f"inadmissible Newton settings: {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One time step: its end time (s) and whether it is static (no inertia, no damping)."""
+
+    time: float
+    static: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """What one accepted (sub)step cost.
+
+    Attributes
+    ----------
+    time, dt : float
+        s.
+    residuals : tuple of float
+        Relative residual before each iteration and after the last.
+    active_contacts : int
+        Pairs within reach.
+    halvings : int
+        How often the step was halved; of a static one, how often the body was let rest before it.
+    """
+
+    time: float
+    dt: float
+    residuals: tuple[float, ...]
+    active_contacts: int
+    halvings: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """Result of a forward run; a failure is a value.
+
+    Attributes
+    ----------
+    times : ndarray
+        ``(f,)`` s of the completed steps, the initial state first.
+    frames : ndarray
+        ``(f, n, 3)`` mm nodal positions.
+    sensitivities : ndarray
+        ``(f, p, n, 3)`` mm per unit of each parameter.
+    reason : Reason
+    records : tuple of StepRecord
+    """
+
+    times: FloatArray
+    frames: FloatArray
+    sensitivities: FloatArray
+    reason: Reason
+    records: tuple[StepRecord, ...]
+
+    @property
+    def converged(self) -> bool:
+        """Whether all steps were completed."""
+        return self.reason is Reason.COMPLETED
+
+    @property
+    def iterations(self) -> int:
+        """Newton iterations in all."""
+        return sum(len(r.residuals) - 1 for r in self.records)

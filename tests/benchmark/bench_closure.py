@@ -1,0 +1,104 @@
+"""Kernels at the closed state, time steps and whole closures, in three sizes and two elements."""
+
+import numpy as np
+import pytest
+
+from mvest.mechanics.assembly import scatter_matrices
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.steps import Step
+from mvest.model import boundary_loading
+from tests.benchmark.valves import CELLS, Closed, close, closed, parameters
+
+ROUNDS = {"3k": 7, "7k": 5, "25k": 3}
+
+
+@pytest.fixture(scope="module", params=[f"{e}-{s}" for e, s in CELLS])
+def case(request) -> tuple[Closed, dict]:
+    element, size = request.param.split("-")
+    valve = closed(element, size)
+    about = {"element": element, "size": size, "nodes": valve.nodes, "rounds": ROUNDS[size]}
+    return valve, about
+
+
+def test_residual(case, measure):
+    c, about = case
+    at = (c.x, c.loads, c.pairs, c.strain, 0.0)
+    measure(lambda: c.system.evaluate(*at, tangent=False), **about)
+
+
+def test_tangent(case, measure):
+    c, about = case
+    at = (c.x, c.loads, c.pairs, c.strain, 0.0)
+    measure(lambda: c.system.evaluate(*at, tangent=True), **about)
+
+
+def test_scatter(case, measure):
+    c, about = case
+    tangents = c.system.solid.tangents(c.system.solid.evaluate(c.x, c.strain, 0.0))
+    blocks = c.system.pattern.zeros()
+    where = c.system._at_elements
+    measure(lambda: scatter_matrices(blocks, where, tangents), **about)
+
+
+def test_contact_search(case, measure):
+    c, about = case
+    measure(lambda: c.system.contact.search(c.y), **about)
+
+
+def test_contact_gradient(case, measure):
+    c, about = case
+    measure(lambda: c.system.contact.forces(c.pairs, c.y), **about)
+
+
+def test_contact_hessian(case, measure):
+    c, about = case
+    system, contact = c.system, c.system.contact
+    slots = system._contact_slots(contact, c.pairs, c.y)
+    blocks = system.pattern.zeros()
+    where = (slots, system._forward, system._backward, system._at_elements)
+    measure(lambda: contact.add_tangent(c.pairs, c.y, blocks, *where), **about)
+
+
+@pytest.fixture
+def factorised(case):
+    c, _ = case
+    blocks = c.system.evaluate(c.x, c.loads, c.pairs, c.strain, 0.0, tangent=True).blocks
+    matrix = c.system.matrix(blocks, 0.0)
+    solver = linear_solver()
+    solver.factorize(matrix)
+    return solver, matrix
+
+
+def test_factorisation(case, measure, factorised):
+    solver, matrix = factorised
+    measure(lambda: solver.factorize(matrix), **case[1])
+
+
+def test_solve(case, measure, factorised):
+    solver, matrix = factorised
+    right = np.random.default_rng(0).normal(size=matrix.shape[0])
+    measure(lambda: solver.solve(right), **case[1])
+
+
+def test_time_step(case, measure):
+    c, about = case
+    loading = boundary_loading(c.system, c.model.valve, c.model.contact_valve, c.model.settings)
+
+    def step():
+        c.system.solid.reset()
+        return simulate(c.system, loading, [Step(0.02)])
+
+    assert measure(step, **about | {"rounds": 3}).converged
+
+
+@pytest.mark.parametrize("count", [0, 2, 6, 20])
+def test_closure(case, measure, count):
+    c, about = case
+    if about["size"] == "25k" and count not in (0, 2):
+        pytest.skip("the largest size is closed without derivatives and with two")
+    wanted = parameters(count)
+    rounds = {"3k": 3, "7k": 2, "25k": 1}[about["size"]]
+    about = about | {"rounds": rounds, "warmup": 0, "parameters": count, "peak_mb": c.peak_mb}
+    simulation = measure(lambda: close(c, wanted), **about)
+    np.testing.assert_allclose(simulation.frames[-1], c.x, atol=1e-6)

@@ -1,0 +1,123 @@
+"""The valves that the benchmark runs on: three sizes, two elements, closed once each."""
+
+from __future__ import annotations
+
+import resource
+import time
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from mvest.mechanics.contact import ContactPairs
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.steps import Simulation
+from mvest.mechanics.system import Loads, Parameter, System
+from mvest.model import ClosureModel, MechanicsSettings, TissueSettings, boundary_loading
+from mvest.typing import FloatArray
+from mvest.valve.structured import structured_mesh
+from mvest.valve.template import Template
+
+MODULI = ("E_f.anterior", "E_f.posterior")
+VALUES = np.array([6.23, 2.09])
+TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
+OBSERVED, CONTACT = (112, 29), (144, 32)
+
+CELLS = {
+    ("hex18", "3k"): (62, 6),
+    ("hex18", "7k"): (84, 10),
+    ("hex18", "25k"): (160, 19),
+    ("tet4", "3k"): (116, 13),
+    ("tet4", "7k"): (168, 20),
+    ("tet4", "25k"): (320, 38),
+}
+"""Cells around and along the leaflets for about 3.2, 7 and 25 thousand nodes, one layer."""
+
+ALL = (
+    *(Parameter(name, value) for name, value in zip(MODULI, VALUES, strict=True)),
+    Parameter("pressure_scale", 1.0),
+    Parameter("chord_stiffness", 1.0),
+    Parameter("chord_rest_length", 1.0),
+)
+
+
+def parameters(count: int) -> tuple[Parameter, ...]:
+    """The model's parameters, repeated until there are ``count``: a repeated one costs the same."""
+    return tuple(ALL[k % len(ALL)] for k in range(count))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closed:
+    """A valve at its closed state, with everything that the kernels need."""
+
+    model: ClosureModel
+    system: System
+    simulation: Simulation
+    x: FloatArray
+    y: FloatArray
+    pairs: ContactPairs
+    loads: Loads
+    strain: FloatArray
+    seconds: float
+    peak_mb: float
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return self.system.n
+
+
+@cache
+def model(element: str, size: str) -> ClosureModel:
+    """The default valve in one of the sizes."""
+    template = Template()
+    return ClosureModel(
+        template.valve(*OBSERVED),
+        template.valve(*CONTACT),
+        structured_mesh(template, element, *CELLS[element, size]),
+        MechanicsSettings(TISSUE),
+        MODULI,
+    )
+
+
+@cache
+def closed(element: str, size: str) -> Closed:
+    """The closed valve; the time of this closure and the process's peak memory are kept."""
+    valve = model(element, size)
+    start = time.perf_counter()
+    result = valve.close(VALUES)
+    seconds = time.perf_counter() - start
+    assert result.simulation.converged, result.simulation.reason.value
+    system, x = result.system, result.simulation.frames[-1]
+    assert system.contact is not None
+    y = system.contact.points(x)
+    loading = boundary_loading(system, valve.valve, valve.contact_valve, valve.settings)
+    return Closed(
+        valve,
+        system,
+        result.simulation,
+        x,
+        y,
+        system.contact.search(y),
+        loading(1e3),
+        system.solid.initial_strain(),
+        seconds,
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    )
+
+
+def close(case: Closed, wanted: tuple[Parameter, ...]) -> Simulation:
+    """The whole closure from the open valve, differentiated by the parameters."""
+    valve, system = case.model, case.system
+    system.solid.reset()
+    simulation = simulate(
+        system,
+        boundary_loading(system, valve.valve, valve.contact_valve, valve.settings),
+        valve.settings.protocol.steps(),
+        damping=valve.settings.damping,
+        newton=valve.settings.newton,
+        parameters=wanted,
+        final_only=True,
+    )
+    assert simulation.converged, simulation.reason.value
+    return simulation
