@@ -70,7 +70,14 @@ def benchmark_table(
 
 
 def _keys(table: pd.DataFrame) -> pd.Series[str]:
-    return table[KEY].fillna("").astype(str).agg("/".join, axis=1)
+    """One text for each row that says what was measured, the same after a journey through CSV."""
+
+    def text(value: object) -> str:
+        if value is None or value != value:
+            return ""
+        return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+    return table[KEY].map(text).agg("/".join, axis=1)
 
 
 def fitted_orders(table: pd.DataFrame) -> pd.DataFrame:

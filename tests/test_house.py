@@ -37,6 +37,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),
     "mvest.estimation": LEAVES,
     "mvest.model": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
+    "mvest.batch": (*LEAVES, "mvest.estimation", "mvest.model"),
     "mvest.gate": (*LEAVES, "mvest.model"),
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
     "mvest.study": (
