@@ -112,7 +112,7 @@ def test_the_usual_overrides_reach_the_objects() -> None:
 def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
     config = plain(composed("experiment=debug", "truth=independent"))
     twin = build_twin(config)
-    assert twin.truth_model.mesh.element_type == "hex27"
+    assert twin.truth_model.mesh.element_type == "tet10"
     assert truth_mesh(config["mesh"], config["truth"])["columns"] == 2 * config["mesh"]["columns"]
     steps = (twin.truth_model.settings.protocol.dt, twin.model.settings.protocol.dt)
     assert steps[0] == pytest.approx(steps[1] / 4)
