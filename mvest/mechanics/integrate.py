@@ -56,7 +56,7 @@ class _State:
     dx: FloatArray  # (p, n, 3)
     dv: FloatArray
     d_strain: FloatArray  # (p, e, q, 6)
-    dt: float = 0.0  # of the step that led here
+    dt: float = 0.0  # of the step of time that led here, 0 at rest
 
 
 @dataclass(slots=True, eq=False)
@@ -268,7 +268,8 @@ class _Stepper:
             raise _StepError(Reason.INTERSECTION)
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
-        new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, dt)
+        advanced = 0.0 if static else dt
+        new = _State(solved.x, new_v, strain, state.dx, state.dv, state.d_strain, advanced)
         if self.parameters and not self.passing:
             self._differentiate(state, new, solved, loads, rate, dt, static)
         return new, solved
