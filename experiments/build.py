@@ -45,6 +45,9 @@ FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""
 
+COARSEST = (24, 3)
+"""Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
+
 UNSTRUCTURED_SURFACE = (112, 29)
 """Vertices of the surface that an unstructured mesh fills, whatever is observed."""
 
@@ -123,6 +126,8 @@ def build_twin(config: Values) -> Twin:
         dict(config["fixed"]),
         continuation=config["continuation"],
     )
+    if config["guided"]:
+        model.guide = guide_of(model, template, config["mesh"])
 
     changed = truth_mesh(config["mesh"], truth)
     other = truth["element"] or element
@@ -188,6 +193,21 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
 def _cells(mesh: Values) -> dict[str, Any]:
     """What decides a structured mesh besides its element."""
     return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
+
+
+def guide_of(model: ClosureModel, template: Template, mesh: Values) -> ClosureModel | None:
+    """The model on a mesh of half as many cells each way, guided itself; None at the coarsest.
+
+    Guides have solid-shells, whatever the element and the source of the model's mesh.
+    """
+    if mesh["columns"] <= COARSEST[0]:
+        return None
+    cells = COARSEST
+    if mesh["columns"] > 2.5 * COARSEST[0]:
+        cells = (2 * round(mesh["columns"] / 4), max(mesh["rows"] // 2, COARSEST[1]))
+    coarse = replace(model, mesh=structured_mesh(template, "hex18", *cells), guide=None)
+    coarse.guide = guide_of(coarse, template, {"columns": cells[0], "rows": cells[1]})
+    return coarse
 
 
 def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> SolidMesh:

@@ -220,16 +220,17 @@ def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
 def _confirm(twin: Twin, result: StudyResult) -> float | None:
     """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
 
-    None where closures were not continued, so that there is nothing to confirm, or where the new
-    closure failed.
+    None where every closure started from the open state, so that there is nothing to confirm, or
+    where the new closure failed.
     """
-    if result.estimate is None or result.fitted is None or not twin.model.continuation:
+    usual = twin.model.continuation, twin.model.guide
+    if result.estimate is None or result.fitted is None or usual == (False, None):
         return None
-    twin.model.continuation = False
+    twin.model.continuation, twin.model.guide = False, None
     with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
         twin.model.on_step = bar.step
         anew = ObservedFrames(twin.model, twin.frames)(result.estimate)
-    twin.model.continuation = True
+    twin.model.continuation, twin.model.guide = usual
     if not anew.converged:
         return None
     last = anew.y.reshape(result.fitted.shape)[-1]

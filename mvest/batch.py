@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import joblib
 import numpy as np
@@ -48,8 +47,8 @@ def predict_many(
         )
     if processes < 1:
         raise InputError(f"processes = {processes}, expected at least 1")
-    # A copy without the mechanics that the model may have built; these belong to one process.
-    fresh = replace(model, on_step=None)
+    # The mechanics that the model may have built belong to one process.
+    fresh = model.fresh()
     if processes == 1:
         return _predict(fresh, values)
     # Neighbours in the list tend to cost alike: dealt out in turn, all processes get a like share.

@@ -9,7 +9,7 @@ positions and their Jacobian.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -346,8 +346,13 @@ class ClosureModel:
         equilibrium (where the protocol ends in one), instead of closing the open valve again. The
         closed state is the same as long as there is one only, which the gate (:mod:`mvest.gate`)
         examines.
+    guide : ClosureModel, optional
+        The same valve with the same parameters on a coarser mesh. A closure that would start from
+        the open valve is followed there, and its closed state is where the equilibrium on this
+        mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
+        the same reason as with ``continuation``.
     repeat : bool
-        Whether a continued closure that fails is repeated from the open valve.
+        Whether a continued or guided closure that fails is repeated from the open valve.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -359,12 +364,26 @@ class ClosureModel:
     names: tuple[str, ...]
     fixed: dict[str, float] = field(default_factory=dict)
     continuation: bool = False
+    guide: ClosureModel | None = None
     repeat: bool = True
     on_step: Callable[[float, int], None] | None = None
 
     _closed: FloatArray | None = field(default=None, init=False, repr=False)
+    _in_guide: Embedding | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
     _solver: LinearSolver | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.guide is not None and self.guide.names != self.names:
+            raise InputError(
+                f"the guide's parameters are {', '.join(self.guide.names)}, expected those of the "
+                f"model: {', '.join(self.names)}"
+            )
+
+    def fresh(self) -> ClosureModel:
+        """A model of the same that has not built or closed anything, and tells nobody of steps."""
+        guide = None if self.guide is None else self.guide.fresh()
+        return replace(self, guide=guide, on_step=None)
 
     def close(
         self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
@@ -378,7 +397,7 @@ class ClosureModel:
             Whether the last frame is differentiated.
         every_frame : bool
             Whether all frames are wanted, and not only the last one: they are then solved to the
-            full tolerance, and no closure continues from another one.
+            full tolerance, and the closure starts from the open valve.
 
         Raises
         ------
@@ -416,14 +435,26 @@ class ClosureModel:
             )
 
         simulation = None
-        continued = self.continuation and not every_frame
-        if continued and self._closed is not None and steps[-1].static:
-            simulation = run(steps[-1:], self._closed)
+        if steps[-1].static and not every_frame:
+            start = self._closed if self.continuation else None
+            if start is None and self.guide is not None:
+                start = self._guided(self.guide, m)
+            if start is not None:
+                simulation = run(steps[-1:], start)
         if simulation is None or (self.repeat and not simulation.converged):
             simulation = run(steps, None)
         if simulation.converged:
             self._closed = simulation.frames[-1]
         return ClosureResult(system, simulation)
+
+    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
+        """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""
+        simulation = guide.close(m, sensitivities=False).simulation
+        if not simulation.converged:
+            return None
+        if self._in_guide is None:
+            self._in_guide = embed(guide.mesh, self.mesh.nodes)
+        return self._in_guide(simulation.frames[-1])
 
     @cached_property
     def observed(self) -> Embedding:

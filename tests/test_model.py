@@ -197,6 +197,48 @@ def test_the_closed_state_does_not_depend_on_how_the_path_to_it_is_solved(closed
     np.testing.assert_allclose(full.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
 
 
+def test_a_guided_closure_ends_in_the_state_of_one_from_the_open_valve(closed, monkeypatch):
+    model, simulation = closed
+    coarse = model_of(CLOSING, cells=(10, 2))
+    guided = replace(model, continuation=False, guide=coarse)
+    result = guided.close(AT).simulation
+    assert result.converged
+    assert len(result.times) == 2  # the equilibrium alone was looked for on the fine mesh
+    # It started where the coarse valve is closed, not where the fine one is.
+    assert 0.01 < np.abs(result.frames[0] - simulation.frames[-1]).max() < 5.0
+    np.testing.assert_allclose(result.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        result.sensitivities[-1], simulation.sensitivities[-1], rtol=0, atol=1e-6
+    )
+    # Every frame can only come from the open valve, and so does the state where the guide fails.
+    assert len(guided.close(AT, sensitivities=False, every_frame=True).simulation.times) > 2
+    monkeypatch.setattr(ClosureModel, "_guided", lambda self, guide, m: None)
+    alone = guided.close(AT, sensitivities=False).simulation
+    assert len(alone.times) > 2
+    np.testing.assert_allclose(alone.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+
+
+def test_a_guide_has_the_model_s_parameters():
+    guide = model_of(OPEN, (*MODULI, "pressure_scale"), **TINY)
+    with pytest.raises(InputError, match=r"the guide's parameters are .*pressure_scale"):
+        replace(model_of(OPEN, **TINY), guide=guide)
+
+
+def test_a_fresh_model_has_built_nothing_and_its_guide_neither():
+    guide = model_of(GENTLE, **SMALL)
+    model = model_of(GENTLE, cells=(12, 2), samples=(32, 8))
+    model = replace(model, guide=guide, on_step=lambda t, n: None)
+    model.close(AT, sensitivities=False)
+    assert guide._system is not None
+    fresh = model.fresh()
+    assert fresh._system is None
+    assert fresh._closed is None
+    assert fresh.on_step is None
+    assert fresh.guide is not guide
+    assert fresh.guide._system is None
+    assert fresh.mesh is model.mesh
+
+
 def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     model = model_of(GENTLE, **SMALL)
     model = replace(model, continuation=True)

@@ -6,7 +6,7 @@ import pytest
 from mvest.estimation import Gaussian, PaperFilter
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.update import kalman_update
-from tests.benchmark.valves import MODULI, VALUES, model
+from tests.benchmark.valves import VALUES, model
 
 
 @pytest.mark.parametrize("points", [3248, 100_000])
@@ -25,18 +25,20 @@ def test_update(measure, points, count):
 @pytest.mark.parametrize("element", ["hex18", "tet4"])
 def test_table_1(measure, element):
     """The paper's filter from its start; observation and first closure from the open valve."""
-    valve = model(element, "3k")
     start = Gaussian.from_variance([5.0, 3.0], 0.01)
 
     def study():
-        valve._closed = None
-        valve.continuation = False
-        y = valve(VALUES).y
-        valve._closed = None
+        y = model(element, "3k").fresh()(VALUES).y
+        valve = model(element, "3k").fresh()
         valve.continuation = True
         return PaperFilter()(valve, start, y, R=0.01)
 
     estimate = measure(
-        study, rounds=1, warmup=0, element=element, nodes=len(valve.mesh.nodes), names=MODULI
+        study,
+        rounds=1,
+        warmup=0,
+        element=element,
+        size="3k",
+        nodes=len(model(element, "3k").mesh.nodes),
     )
     np.testing.assert_allclose(estimate.mean, VALUES, rtol=1e-4)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import resource
-import time
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
+from experiments.build import guide_of
 from mvest.mechanics.contact import ContactPairs
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.steps import Simulation
@@ -58,7 +58,6 @@ class Closed:
     pairs: ContactPairs
     loads: Loads
     strain: FloatArray
-    seconds: float
     peak_mb: float
 
     @property
@@ -71,22 +70,23 @@ class Closed:
 def model(element: str, size: str) -> ClosureModel:
     """The default valve in one of the sizes."""
     template = Template()
-    return ClosureModel(
+    columns, rows = CELLS[element, size]
+    valve = ClosureModel(
         template.valve(*OBSERVED),
         template.valve(*CONTACT),
-        structured_mesh(template, element, *CELLS[element, size]),
+        structured_mesh(template, element, columns, rows),
         MechanicsSettings(TISSUE),
         MODULI,
     )
+    valve.guide = guide_of(valve, template, {"columns": columns, "rows": rows})
+    return valve
 
 
 @cache
 def closed(element: str, size: str) -> Closed:
-    """The closed valve; the time of this closure and the process's peak memory are kept."""
+    """The closed valve, by guides; the process's peak memory after the closure is kept."""
     valve = model(element, size)
-    start = time.perf_counter()
     result = valve.close(VALUES)
-    seconds = time.perf_counter() - start
     assert result.simulation.converged, result.simulation.reason.value
     system, x = result.system, result.simulation.frames[-1]
     assert system.contact is not None
@@ -101,7 +101,6 @@ def closed(element: str, size: str) -> Closed:
         system.contact.search(y),
         loading(1e3),
         system.solid.initial_strain(),
-        seconds,
         resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     )
 

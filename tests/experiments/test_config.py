@@ -109,6 +109,23 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     assert twin.truth_model.mesh.sha256 == twin.model.mesh.sha256
 
 
+def test_guides_are_coarser_down_to_the_coarsest() -> None:
+    config = plain(composed("guided=true", "mesh.columns=108", "mesh.rows=12"))
+    config["mechanics"]["element"] = "tet4"
+    twin = build_twin(config)
+    found, model = [], twin.model
+    while model.guide is not None:
+        model = model.guide
+        assert model.mesh.element_type == "hex18"
+        assert model.names == twin.model.names
+        assert model.valve is twin.model.valve
+        found.append(len(model.mesh.elements))
+    assert found == [54 * 6, 24 * 3]
+    # The truth and the usual study are not guided.
+    assert twin.truth_model.guide is None
+    assert build_twin(plain(composed())).model.guide is None
+
+
 def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
     config = plain(composed("experiment=debug", "truth=independent"))
     twin = build_twin(config)
