@@ -18,7 +18,7 @@ from experiments.build import Twin, build_twin
 from experiments.config import NOT_THE_RESULT, hash_of, register
 from experiments.donor import run_donor
 from experiments.gate import run_closure_study, run_gate_study
-from experiments.progress import SolveBar
+from experiments.progress import SolveBar, announce_compilation
 from experiments.record import make_record, measure_frames, write_fields
 from experiments.tracking import log_run
 from mvest.errors import ConfigurationError, InputError, MvestError
@@ -77,6 +77,7 @@ def run_job(config: DictConfig) -> None:
             f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
         )
     require_writable(folder)
+    announce_compilation()
     kind = STUDIES[values["study"]]
     record, files = kind.run(values, hash_of(config), folder, started)
 

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import math
+import sys
 from types import TracebackType
 
 from tqdm import tqdm
 
-__all__ = ["SolveBar"]
+from mvest.mechanics.solid import kernels_are_compiled
+
+__all__ = ["SolveBar", "announce_compilation"]
+
+
+def announce_compilation() -> None:
+    """Say that the first run after an installation takes longer, and why."""
+    if not kernels_are_compiled():
+        print("compiling on first use; this takes about a minute once", file=sys.stderr)
 
 
 class SolveBar:

@@ -20,6 +20,7 @@ constant stress: the patch test holds.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numba as nb
@@ -30,7 +31,7 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh import SolidMesh
 
-__all__ = ["Law", "Solid", "SolidState"]
+__all__ = ["Law", "Solid", "SolidState", "kernels_are_compiled"]
 
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
@@ -195,6 +196,12 @@ class Solid:
         residual, matrix = _enhanced_system(self.modes, self.volumes, d_stress, state.tangent)
         change = np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
         return np.asarray(-change, dtype=np.float64)
+
+
+def kernels_are_compiled() -> bool:
+    """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
+    place = _tangents.stats.cache_path
+    return place is not None and any(Path(place).glob("solid._tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
