@@ -25,7 +25,14 @@ __all__ = ["benchmark_figure", "benchmark_table", "fitted_orders", "main"]
 
 KEY = ["what", "element", "size", "parameters", "points", "threads"]
 COLOURS = {"hex18": "#0072B2", "tet4": "#D55E00"}
-DRAWN = {"closure": "o", "tangent": "s", "factorisation": "^", "solve": "D", "contact search": "v"}
+DRAWN = {
+    "closure": "o",
+    "guided closure": "P",
+    "tangent": "s",
+    "factorisation": "^",
+    "solve": "D",
+    "contact search": "v",
+}
 
 
 def benchmark_table(
