@@ -48,7 +48,7 @@ BENCH_OF ?= not 25k
 bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (BENCH_OF=25k: the largest valves, an hour)
 	@mkdir -p outputs
 	$(BENCH) -k "$(BENCH_OF)" --benchmark-json=outputs/benchmark.json
-	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "3k and (closure or factorisation)" \
+	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "3k and (test_closure or test_factorisation)" \
 		--benchmark-json=outputs/benchmark_2_threads.json
 	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
 	$(BIN)/python -m experiments.benchmark outputs/benchmark.json outputs/benchmark_2_threads.json outputs/peers.json

@@ -113,7 +113,7 @@ def test_the_key_ignores_comments_docstrings_and_layout(library):
         ('"""Contact energy in N mm."""', '"""Something else."""'),
         ("self.skin = skin\n", "self.skin = skin  # why\n\n\n"),
         ("# Pairs still apart", "# Those still apart"),
-        ("NEIGHBOUR = 0.8", "NEIGHBOUR = (0.8)"),
+        ("BARRIER = 0.85", "BARRIER = (0.85)"),
     ):
         assert old in text
         text = text.replace(old, new)
@@ -124,7 +124,7 @@ def test_the_key_ignores_comments_docstrings_and_layout(library):
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
-        ("mechanics/contact.py", "NEIGHBOUR = 0.8", "NEIGHBOUR = 0.81"),
+        ("mechanics/contact.py", "BARRIER = 0.85", "BARRIER = 0.86"),
         ("mechanics/law.py", " - ", " + "),
         ("valve/template.py", "bulge: float = 0.04", "bulge: float = 0.05"),
         ("units.py", "133.322387415", "133.3"),

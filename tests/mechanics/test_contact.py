@@ -10,11 +10,11 @@ from mvest.errors import InputError
 from mvest.mechanics.contact import (
     APPROACH,
     BARRIER,
-    NEIGHBOUR,
     Contact,
     ContactPairs,
     ContactSettings,
 )
+from mvest.mechanics.pair_search import NEIGHBOUR
 from mvest.valve.embedding import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses
 
