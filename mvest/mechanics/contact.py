@@ -27,7 +27,8 @@ Distances scale with the local thickness t (mean of the two points): :math:`r_0 
 :math:`h = c_h t`, :math:`r_b = 0.85 r_0`; with :math:`r_b \ge t` the thick leaflets cannot overlap.
 Neighbours on the same sheet must not repel each other: the reach of a pair is shortened to
 ``NEIGHBOUR * D`` (:mod:`mvest.mechanics.pair_search`) where D is its distance at rest, so that no
-pair is active in the stress-free state and the same rule serves pleats, commissures and leaflets alike.
+pair is active in the stress-free state and the same rule serves pleats, commissures and leaflets
+alike.
 
 No passing: no Newton step takes the triangulated midsurface samples through each other (continuous
 collision detection along the step, Li et al. 2020, ACM Trans. Graph. 39(4):49, by the IPC toolkit),
