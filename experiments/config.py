@@ -153,7 +153,7 @@ class Config:
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
     continuation: bool = True  # later closures start from the last closed state
-    guided: bool = False  # the first closure is followed on coarser meshes
+    guided: bool = True  # the first closure is followed on coarser meshes
     confirm: bool = True  # close the fitted valve anew from the open state
     seed: int = 1
     paths: PathsConfig = field(default_factory=PathsConfig)

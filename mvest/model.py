@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -39,6 +40,12 @@ __all__ = [
     "TissueSettings",
     "build_system",
 ]
+
+
+REST = (0.05, 0.15)
+"""s, steps of time in which a state taken over from another mesh comes to rest under the final
+loads. Damping by stiffness holds what the coarser mesh could not tell; without it the equilibrium
+of large meshes (160 x 19 cells) is not found from there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,11 +426,14 @@ class ClosureModel:
         system = self._system
         system.retune(material_law(self.mesh, self.settings, moduli), factors)
         steps = self.settings.protocol.steps()
+        loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
-        def run(steps: Sequence[Step], start: FloatArray | None) -> Simulation:
+        def run(
+            steps: Sequence[Step], start: FloatArray | None = None, time: float = 0.0
+        ) -> Simulation:
             return simulate(
                 system,
-                boundary_loading(system, self.valve, self.contact_valve, self.settings),
+                loading,
                 steps,
                 damping=self.settings.damping,
                 newton=self.settings.newton,
@@ -431,18 +441,24 @@ class ClosureModel:
                 final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
+                initial_time=time,
                 on_step=self.on_step,
             )
 
         simulation = None
         if steps[-1].static and not every_frame:
-            start = self._closed if self.continuation else None
-            if start is None and self.guide is not None:
+            end, last = self.settings.protocol.end, steps[-1]
+            if self.continuation and self._closed is not None:
+                simulation = run([last], self._closed, end)
+            elif self.guide is not None:
                 start = self._guided(self.guide, m)
-            if start is not None:
-                simulation = run(steps[-1:], start)
+                if start is not None:
+                    rests = [Step(end + t) for t in accumulate(REST)]
+                    simulation = run(
+                        [*rests, replace(last, time=last.time + sum(REST))], start, end
+                    )
         if simulation is None or (self.repeat and not simulation.converged):
-            simulation = run(steps, None)
+            simulation = run(steps)
         if simulation.converged:
             self._closed = simulation.frames[-1]
         return ClosureResult(system, simulation)

@@ -84,6 +84,7 @@ def simulate(
     solver: LinearSolver | None = None,
     initial_velocity: FloatArray | None = None,
     initial_positions: FloatArray | None = None,
+    initial_time: float = 0.0,
     on_step: Callable[[float, int], None] | None = None,
 ) -> Simulation:
     """Integrate ``system`` over ``steps``.
@@ -94,7 +95,7 @@ def simulate(
     loading : callable
         Time (s) -> :class:`Loads`.
     steps : sequence of Step
-        With strictly increasing times > 0.
+        With strictly increasing times > ``initial_time``.
     damping, newton, solver : optional
         Defaults: the paper's damping, converged Newton, the fastest available solver.
     parameters : sequence of Parameter
@@ -106,8 +107,9 @@ def simulate(
     initial_velocity : ndarray, optional
         ``(n, 3)`` mm/s.
     initial_positions : ndarray, optional
-        ``(n, 3)`` mm where the first Newton iteration starts; default the reference positions. Only
-        for runs of static steps, whose result does not depend on it unless equilibria are several.
+        ``(n, 3)`` mm, where the body is at the beginning; default the reference positions.
+    initial_time : float
+        s, of the beginning.
     on_step : callable, optional
         Called with (time, Newton iterations so far) after each step, for progress.
 
@@ -128,14 +130,16 @@ def simulate(
     if (
         len(times) == 0
         or not np.all(np.isfinite(times))
-        or np.any(np.diff(times, prepend=0.0) <= 0)
+        or np.any(np.diff(times, prepend=initial_time) <= 0)
     ):
-        raise InputError("time steps must increase strictly from 0; a step of size 0 is not a step")
+        raise InputError(
+            f"time steps must increase strictly from {initial_time:g}; a step of size 0 is none"
+        )
     n, n_p = system.n, len(parameters)
-    if initial_positions is not None and not all(step.static for step in steps):
-        raise InputError("initial positions are for runs of static steps only")
-    x0 = np.array(system.solid.mesh.nodes if initial_positions is None else initial_positions)
-    strain0 = system.solid.initial_strain()
+    x0, strain0 = np.array(system.solid.mesh.nodes), system.solid.initial_strain()
+    if initial_positions is not None:
+        x0 = np.array(initial_positions, dtype=float)
+        strain0 = system.solid.law.strain(system.solid.evaluate(x0, strain0, 0.0).green)
     state = _State(
         x0,
         np.zeros((n, 3)) if initial_velocity is None else np.array(initial_velocity, dtype=float),
@@ -146,7 +150,7 @@ def simulate(
     )
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
     stepper.last_only = final_only and steps[-1].static
-    frames, sensitivities, done = [x0], [state.dx], [0.0]
+    frames, sensitivities, done = [x0], [state.dx], [initial_time]
     records: list[StepRecord] = []
     reason = Reason.COMPLETED
     for step in steps:
@@ -324,7 +328,7 @@ class _Stepper:
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
                 # A forcing term of the size of the residual keeps the convergence quadratic
                 # (Dembo, Eisenstat and Steihaug 1982, SIAM J. Numer. Anal. 19:400).
-                forcing = min(1e-2, max(1e-9, residuals[-1]))
+                forcing = min(1e-3, max(1e-9, residuals[-1]))
                 d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
                 raise _StepError(Reason.SINGULAR) from error

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -42,7 +43,9 @@ class Embedding:
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Positions ``(k, ...)`` of the points where the nodes are at ``x (n, ...)``."""
-        return np.einsum("kw,kw...->k...", self.weights, x[self.nodes])
+        values = np.ascontiguousarray(x, dtype=np.float64)
+        flat = _weighted_sums(self.nodes, self.weights, values.reshape(len(values), -1))
+        return flat.reshape(len(self.nodes), *values.shape[1:])
 
     def average(self, coefficients: FloatArray, groups: IntArray) -> Embedding:
         """Weighted averages of the points.
@@ -70,6 +73,17 @@ class Embedding:
             nodes[k, len(index) :] = index[0]
             weights[k, : len(index)] = value
         return Embedding(nodes, weights, np.full(len(rows), -1, dtype=np.int64))
+
+
+@nb.njit(cache=True)
+def _weighted_sums(nodes: IntArray, weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Rows ``(k, c)`` of ``weights (k, w)`` with the rows of ``values (n, c)`` at ``nodes``."""
+    out = np.zeros((nodes.shape[0], values.shape[1]))
+    for k in range(nodes.shape[0]):
+        for w in range(nodes.shape[1]):
+            for c in range(values.shape[1]):
+                out[k, c] += weights[k, w] * values[nodes[k, w], c]
+    return out
 
 
 def embed(

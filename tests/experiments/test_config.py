@@ -110,7 +110,7 @@ def test_the_usual_overrides_reach_the_objects() -> None:
 
 
 def test_guides_are_coarser_down_to_the_coarsest() -> None:
-    config = plain(composed("guided=true", "mesh.columns=108", "mesh.rows=12"))
+    config = plain(composed("mesh.columns=108", "mesh.rows=12"))
     config["mechanics"]["element"] = "tet4"
     twin = build_twin(config)
     found, model = [], twin.model
@@ -121,9 +121,9 @@ def test_guides_are_coarser_down_to_the_coarsest() -> None:
         assert model.valve is twin.model.valve
         found.append(len(model.mesh.elements))
     assert found == [54 * 6, 24 * 3]
-    # The truth and the usual study are not guided.
+    # The truth is not guided, nor is who does not want to be.
     assert twin.truth_model.guide is None
-    assert build_twin(plain(composed())).model.guide is None
+    assert build_twin(plain(composed("guided=false"))).model.guide is None
 
 
 def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:

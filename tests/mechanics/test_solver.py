@@ -71,6 +71,23 @@ def test_blocks_of_zeros_may_come_to_life(tangent, name):
         np.testing.assert_allclose(each @ solver.solve(right), right, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("share", [3e-6, 3e-3])
+def test_weak_couplings_count_whether_or_not_they_are_in_the_factor(name, share):
+    """Many of them together are strong: a factor without the weaker ones is only half the answer."""
+    n, rng = 400, np.random.default_rng(1)
+    weak = share * rng.normal(size=(n, n, 3, 3))
+    dense = (weak + weak.transpose(1, 0, 3, 2)).transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
+    dense += np.diag(rng.uniform(1.0, 2.0, 3 * n))
+    right = rng.normal(size=(3 * n, 2))
+    solver = linear_solver(name)
+    solver.factorize(sparse.bsr_matrix(dense, blocksize=(3, 3)))
+    expected = np.linalg.solve(dense, right)
+    without = right / np.diag(dense)[:, None]
+    assert np.abs(without - expected).max() > 1e-5
+    np.testing.assert_allclose(solver.solve(right), expected, rtol=0, atol=1e-10)
+
+
 def test_an_unsymmetric_pattern_is_refused():
     if "pardiso" not in available():
         pytest.skip("PARDISO is not installed; SuperLU takes any pattern")
