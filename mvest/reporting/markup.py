@@ -1,7 +1,7 @@
 """Text of tables for readers: Markdown and LaTeX, with every character shown as itself.
 
-Names of runs and reasons of failures are whatever a user typed or a library said, so nothing of them
-may act as markup.
+Names of runs and reasons of failures are whatever a user typed or a library said, so nothing of
+them may act as markup.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def markdown_rows(rows: Sequence[Mapping[str, str]]) -> str:
 
 
 def latex_rows(rows: Sequence[Mapping[str, str]]) -> str:
-    """A booktabs table (``\\usepackage{booktabs}``): first column left, the others right."""
+    r"""A booktabs table (``\usepackage{booktabs}``): first column left, the others right."""
     header = [latex_text(name) for name in rows[0]]
     body = [" & ".join(_cell(text) for text in row.values()) + r" \\" for row in rows]
     return "\n".join(

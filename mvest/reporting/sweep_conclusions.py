@@ -8,7 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from mvest.reporting.markup import number
-from mvest.reporting.sweep_rows import Run, Sweep, factor_text, runs_of, short_names
+from mvest.reporting.sweep_rows import (
+    FACTORS,
+    Run,
+    Sweep,
+    factor_names,
+    factor_text,
+    kind_of,
+    runs_of,
+    short_names,
+)
 from mvest.reporting.sweep_statistics import (
     BASIN_PERCENT,
     BOUND_FACTOR,
@@ -36,7 +45,7 @@ UNKNOWN_QUESTION = "How do the estimates depend on what was varied?"
 
 def question(sweep: Sweep) -> str:
     """What the sweep asks."""
-    return QUESTIONS.get(sweep["sweep"]["kind"], UNKNOWN_QUESTION)
+    return QUESTIONS.get(kind_of(sweep), UNKNOWN_QUESTION)
 
 
 def conclusions(sweep: Sweep) -> list[str]:
@@ -53,10 +62,9 @@ def conclusions(sweep: Sweep) -> list[str]:
         return ["The sweep has no jobs, so nothing follows from it."]
     if not converged(runs):
         return [f"None of the {len(runs)} runs converged, so nothing follows.", *_failures(runs)]
-    kind = sweep["sweep"]["kind"]
     if not any(np.isfinite(run.truth).all() for run in runs):
         return ["The truth is unknown here, so there are no errors to compare.", *_failures(runs)]
-    return by_kind.get(kind, _anything)(sweep, runs) + _failures(runs)
+    return by_kind.get(kind_of(sweep), _anything)(sweep, runs) + _failures(runs)
 
 
 def _failures(runs: Sequence[Run]) -> list[str]:
@@ -84,15 +92,12 @@ def _worst(runs: Sequence[Run]) -> Run | None:
 
 
 def _initial_guess(sweep: Sweep, runs: list[Run]) -> list[str]:
-    groups = {
-        factor_text(mode): group for (mode,), group in grouped(runs, ["filter"]).items()
-    }
-    counts = [
-        f"{sum(map(in_basin, group))} of {len(group)} starts converge to within "
-        f"{BASIN_PERCENT:g} % in the {mode} mode"
-        for mode, group in groups.items()
-    ]
-    sentences = [f"{_listed(counts)}."]
+    groups = {mode: group for (mode,), group in grouped(runs, ["filter"]).items()}
+    counts = [f"{sum(map(in_basin, group))} of {len(group)}" for group in groups.values()]
+    modes = [f"in the {mode} mode" for mode in groups]
+    first = f"{counts[0]} starts converge to within {BASIN_PERCENT:g} % {modes[0]}"
+    following = [f"{n} {mode}" for n, mode in zip(counts[1:], modes[1:], strict=True)]
+    sentences = [f"{', '.join([first, *following])}."]
     starts = np.array([run.start for run in runs])
     if np.isfinite(starts).all():
         ranges = [
@@ -196,8 +201,7 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
         level = max(run.factors["noise_mm"] for run in noisy)
         top = [run for run in noisy if run.factors["noise_mm"] == level]
         errors = [
-            f"{number(accuracy(top, k).rmse_percent, 2)} % ({name})"
-            for k, name in enumerate(names)
+            f"{number(accuracy(top, k).rmse_percent, 2)} % ({name})" for k, name in enumerate(names)
         ]
         if converged(top):
             sentences.append(
@@ -272,12 +276,15 @@ def _filter(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 
 def _anything(sweep: Sweep, runs: list[Run]) -> list[str]:
-    kind, worst = sweep["sweep"]["kind"], _worst(runs)
-    sentences = [
-        f"Sweeps of the kind “{kind}” have no figures of their own: the table lists every setting."
-    ]
+    worst = _worst(runs)
+    kind, needed = sweep["sweep"]["kind"], FACTORS.get(str(sweep["sweep"]["kind"]))
+    missing = sorted((needed or set()) - set(factor_names(sweep)))
+    why = (
+        f"This sweep of the kind “{kind}” lacks the factor {_listed(missing)} in a job and has"
+        if needed and missing
+        else f"Sweeps of the kind “{kind}” have"
+    )
+    sentences = [f"{why} no figures of their own: the table lists every setting."]
     if worst is not None:
-        sentences.append(
-            f"The largest error is {number(worst.largest_error)} % ({worst.row})."
-        )
+        sentences.append(f"The largest error is {number(worst.largest_error)} % ({worst.row}).")
     return sentences

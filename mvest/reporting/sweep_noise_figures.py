@@ -1,4 +1,4 @@
-"""Figures of a sweep over noise: the error against its bound, and whether intervals can be trusted."""
+"""Figures of a sweep over noise: error against its bound, and whether intervals can be trusted."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _errors(axes: Any, runs: Sequence[Run], k: int) -> float:
 
 
 def _beside(n: int, width: float) -> FloatArray:
-    """n places side by side within ± width; one alone stands in the middle."""
+    """N places side by side within ± width; one alone stands in the middle."""
     return np.linspace(-width, width, n) if n > 1 else np.zeros(n)
 
 

@@ -21,6 +21,7 @@ from mvest.reporting.files import HASH_DIGITS
 from mvest.typing import FloatArray
 
 __all__ = [
+    "FACTORS",
     "Run",
     "Sweep",
     "check_sweep",
@@ -29,6 +30,7 @@ __all__ = [
     "factor_label",
     "factor_names",
     "factor_text",
+    "kind_of",
     "runs_of",
     "short_names",
     "sweep_line",
@@ -48,6 +50,16 @@ UNITS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
 """Endings of factor names that say a unit."""
 
 
+FACTORS: dict[str, set[str]] = {
+    "initial_guess": set(),
+    "covariance": {"varied", "scale"},
+    "noise": {"kind", "noise_mm"},
+    "discrepancy": {"discrepancy"},
+    "filter": {"filter"},
+}
+"""Kinds of sweeps with tables and figures of their own, and what these are drawn over."""
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
     """One run of a sweep; arrays are in the order of the sweep's parameters, NaN where absent.
@@ -58,6 +70,8 @@ class Run:
         What is varied, and its value here.
     seed : int or None
         None where a job left no run behind and does not say which seeds it had.
+    mode : str
+        Of the filter.
     truth, start, estimate, std, bound : FloatArray
         ``(p,)`` MPa for moduli. ``bound`` is the Cramér–Rao standard deviation.
     iterates, iterate_std : FloatArray
@@ -68,6 +82,7 @@ class Run:
     row: str
     factors: Mapping[str, Any]
     seed: int | None
+    mode: str
     converged: bool
     reason: str
     truth: FloatArray
@@ -128,12 +143,10 @@ def check_sweep(sweep: Any, where: str) -> Sweep:
 def runs_of(sweep: Sweep) -> list[Run]:
     """Every run in the order of the jobs and, within one, of its seeds.
 
-    Seeds that a job was to run and left no result of (``seed`` and ``repeats`` of the job say which)
-    count as failed runs; a job that does not say so and has no result counts as one.
+    Seeds that a job was to run and left no result of (its ``seed`` and ``repeats`` say which) count
+    as failed runs; a job that does not say so and has no result counts as one.
     """
-    return [
-        _run(sweep, job, run) for job in sweep["jobs"] for run in [*job["runs"], *_lost(job)]
-    ]
+    return [_run(sweep, job, run) for job in sweep["jobs"] for run in [*job["runs"], *_lost(job)]]
 
 
 def _lost(job: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -153,6 +166,7 @@ def _run(sweep: Sweep, job: Mapping[str, Any], found: Mapping[str, Any]) -> Run:
         row=str(job["row"]),
         factors=job["factors"],
         seed=found.get("seed"),
+        mode=factor_text(job["factors"].get("filter") or _filter_of(job)),
         converged=found.get("status") == CONVERGED,
         reason=str(found.get("reason") or job["reason"] or "no reason given"),
         truth=_values(job.get("truth"), p),
@@ -181,6 +195,14 @@ def _table(rows: Sequence[Sequence[float | None]] | None, p: int) -> FloatArray:
 def factor_names(sweep: Sweep) -> list[str]:
     """Names of everything varied, in the order in which the jobs bring them up."""
     return list(dict.fromkeys(name for job in sweep["jobs"] for name in job["factors"]))
+
+
+def kind_of(sweep: Sweep) -> str:
+    """The kind that decides on tables and figures, or nothing if its factors are not all there."""
+    kind = str(sweep["sweep"]["kind"])
+    needed = FACTORS.get(kind)
+    complete = needed is not None and all(needed <= set(job["factors"]) for job in sweep["jobs"])
+    return kind if complete else ""
 
 
 def factor_label(name: str) -> str:
@@ -311,7 +333,9 @@ def cost_rows(sweep: Sweep) -> list[dict[str, Any]]:
     return rows
 
 
-def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str], notes: Sequence[str]) -> str:
+def csv_text(
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[str], notes: Sequence[str]
+) -> str:
     """CSV with comment lines above it; a missing value is an empty cell."""
     stream = io.StringIO()
     for note in notes:

@@ -1,4 +1,4 @@
-"""Figures of sweeps over settings: covariances, discrepancies, filters; and what every sweep costs."""
+"""Figures of sweeps over settings (covariances, discrepancies, filters) and of any sweep's cost."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from mvest.reporting.markup import number
 from mvest.reporting.sweep_rows import (
     Run,
     Sweep,
@@ -32,6 +33,7 @@ from mvest.reporting.sweep_style import (
     log_axis,
     panels,
 )
+from mvest.typing import FloatArray
 
 __all__ = ["cost_figure", "covariance_figure", "discrepancy_figure", "filter_figure"]
 
@@ -64,7 +66,7 @@ def covariance_figure(sweep: Sweep) -> Figure | None:
             if row == len(by_mode) - 1:
                 one.set_xlabel("scale")
             if column == 0:
-                one.set_ylabel(f"{factor_text(mode)} mode\n[% of truth]")
+                one.set_ylabel(f"{mode} mode\n[% of truth]")
     for row in range(len(by_mode)):
         one = axes[row, -1]
         label_ends(one, float(one.get_xlim()[1]), _ends(one, names), gap=0.09)
@@ -254,7 +256,7 @@ def cost_figure(sweep: Sweep) -> Figure | None:
     timed = [row for row in rows if row["whole job [s]"] is not None]
     if not timed:
         return None
-    figure, axes = panels(1, 2, 0.42 * len(groups) + 1.8, sharey=True)
+    figure, axes = panels(1, 2, 0.3 * len(groups) + 1.5, sharey=True)
     order = list(groups)[::-1]
     for y, group in enumerate(order):
         jobs = [rows[k] for k in groups[group]]
@@ -279,7 +281,7 @@ def cost_figure(sweep: Sweep) -> Figure | None:
     headline(
         figure,
         f"What the sweep costs: {len(timed)} jobs, {total} of computing",
-        "Dots: single runs or jobs. Bars: median, with its value."
+        "Bars and numbers: medians. Dots: single runs or jobs."
         + (f" By {name.replace('_', ' ')}." if name else ""),
     )
     return figure
@@ -295,18 +297,19 @@ def _splitting_factor(sweep: Sweep) -> str | None:
     return None
 
 
-def _strip(axes: Any, y: int, values: Any, colour: str) -> None:
+def _strip(axes: Any, y: int, values: FloatArray, colour: str) -> None:
     if not len(values):
         axes.annotate(
             "no result", (0.03, y), xycoords=("axes fraction", "data"), va="center", color=BAD,
             fontsize=SMALL,
         )  # fmt: skip
         return
-    height = y + (np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(1))
-    axes.plot(values, height, ".", color=GREY, markersize=7, alpha=0.4, mew=0)
     middle = float(np.median(values))
-    axes.plot([middle, middle], [y - 0.32, y + 0.32], color=colour, linewidth=3)
+    axes.barh(y, middle, height=0.62, color=colour, alpha=0.35)
+    if len(values) > 1:
+        height = y + np.linspace(-0.24, 0.24, len(values))
+        axes.plot(values, height, ".", color=GREY, markersize=6, alpha=0.5, mew=0)
     axes.annotate(
-        f"{middle:.3g}", (middle, y + 0.32), xytext=(3, 0), textcoords="offset points", va="center",
-        fontsize=SMALL, color=colour,
+        number(middle), (float(values.max()), y), xytext=(5, 0), textcoords="offset points",
+        va="center", fontsize=SMALL,
     )  # fmt: skip

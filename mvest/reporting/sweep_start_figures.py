@@ -1,8 +1,8 @@
-"""Figures of a sweep over initial guesses: the basin of convergence, and how the estimates got there."""
+"""Figures of a sweep over initial guesses: the basin of convergence, and the way into it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullLocator
 
-from mvest.reporting.sweep_rows import Run, Sweep, factor_names, factor_text, runs_of, short_names
+from mvest.reporting.sweep_rows import Run, Sweep, factor_names, runs_of, short_names
 from mvest.reporting.sweep_statistics import BASIN_PERCENT, converged, grouped, in_basin
 from mvest.reporting.sweep_style import (
     BAD,
@@ -51,7 +51,7 @@ def basin_figure(sweep: Sweep) -> Figure | None:
         _map(one, group, starts, shown)
         inside = sum(map(in_basin, group))
         one.set_title(
-            f"{factor_text(mode)}: {inside} of {len(group)} starts\nwithin {BASIN_PERCENT:g} %",
+            f"{mode}: {inside} of {len(group)} starts\nwithin {BASIN_PERCENT:g} %",
             fontsize=TEXT,
         )
         one.set_xlabel(f"initial guess, {names[0]} [MPa]")
@@ -71,48 +71,79 @@ def basin_figure(sweep: Sweep) -> Figure | None:
 
 
 def _map(axes: Any, runs: Sequence[Run], starts: Sequence[str], shown: ScalarMappable) -> None:
-    """Cells between the midpoints of neighbouring guesses; guesses off a grid get small cells."""
-    points = np.array([[float(run.factors[name]) for name in starts] for run in runs])
-    ticks = [np.unique(points[:, k]) for k in range(2)]
-    edges = [_edges(values) for values in ticks]
-    cells: dict[tuple[int, int], Run] = {}
-    for run, point in zip(runs, points, strict=True):
-        cells[(int(np.searchsorted(ticks[0], point[0])), int(np.searchsorted(ticks[1], point[1])))] = (
-            run
-        )
-    # Guesses that form no grid leave gaps; there the cells would say something about other guesses.
-    small = max(len(values) for values in ticks) <= MOST_NUMBERS
-    for (i, j), run in cells.items():
-        corner = edges[0][i], edges[1][j]
-        size = edges[0][i + 1] - edges[0][i], edges[1][j + 1] - edges[1][j]
-        middle = ticks[0][i], ticks[1][j]
-        error = run.largest_error
-        if not run.converged or np.isnan(error):
-            axes.add_patch(
-                Rectangle(corner, *size, facecolor="0.92", edgecolor="0.6", hatch="////", lw=0)
-            )
-            axes.plot(*middle, marker="x", color="black", markersize=8, mew=1.8)
-            continue
-        colour = shown.to_rgba(error)
-        axes.add_patch(Rectangle(corner, *size, facecolor=colour, edgecolor="white", lw=0.5))
-        if small:
-            light = float(np.dot(colour[:3], (0.299, 0.587, 0.114)))
-            axes.annotate(
-                plain_number(error), middle, ha="center", va="center", fontsize=SMALL - 1,
-                color="black" if light > 0.5 else "white",
-            )  # fmt: skip
-    _outline(axes, {place for place, run in cells.items() if in_basin(run)}, edges)
-    for k, axis in enumerate((axes.xaxis, axes.yaxis)):
-        axis.axes.set(**{f"{'xy'[k]}scale": "log" if _is_geometric(ticks[k]) else "linear"})
-        axis.set_minor_locator(NullLocator())
-        chosen = ticks[k] if len(ticks[k]) <= 2 * MOST_NUMBERS else ticks[k][:: len(ticks[k]) // 8]
-        axis.set_ticks(chosen, [plain_number(value) for value in chosen])
-    axes.set_xlim(edges[0][0], edges[0][-1])
-    axes.set_ylim(edges[1][0], edges[1][-1])
+    """Cells where the guesses form a grid, single marks where they do not."""
     axes.grid(False)
+    places: dict[tuple[float, ...], Run] = {}
+    for run in runs:
+        place = tuple(float(run.factors[name]) for name in starts)
+        # Of several runs from one guess the worst is shown.
+        if place not in places or _badness(run) > _badness(places[place]):
+            places[place] = run
+    ticks = [np.unique([place[k] for place in places]) for k in range(2)]
+    scales = ["log" if _is_geometric(values) else "linear" for values in ticks]
+    axes.set(xscale=scales[0], yscale=scales[1])
+    if len(places) > 0.5 * len(ticks[0]) * len(ticks[1]):
+        _grid(axes, places, ticks, shown)
+    else:
+        _marks(axes, places, shown)
     truth = runs[0].truth
     if np.isfinite(truth).all() and len(truth) == 2:
         axes.plot(*truth, marker="*", markersize=17, color=BAD, mec="white", mew=1.2, zorder=6)
+
+
+def _badness(run: Run) -> float:
+    return run.largest_error if run.converged and np.isfinite(run.largest_error) else np.inf
+
+
+def _grid(
+    axes: Any,
+    places: Mapping[tuple[float, ...], Run],
+    ticks: Sequence[FloatArray],
+    shown: ScalarMappable,
+) -> None:
+    edges = [_edges(values) for values in ticks]
+    numbered = max(len(values) for values in ticks) <= MOST_NUMBERS
+    inside = set()
+    for middle, run in places.items():
+        i, j = (int(np.searchsorted(values, m)) for values, m in zip(ticks, middle, strict=True))
+        corner = edges[0][i], edges[1][j]
+        size = edges[0][i + 1] - corner[0], edges[1][j + 1] - corner[1]
+        error = _badness(run)
+        if in_basin(run):
+            inside.add((i, j))
+        if np.isinf(error):
+            cell = Rectangle(corner, *size, facecolor="0.92", edgecolor="0.6", hatch="////", lw=0)
+            axes.plot(*middle, marker="x", color="black", markersize=8, mew=1.8)
+        else:
+            colour = shown.to_rgba(np.array([error]))[0]
+            cell = Rectangle(corner, *size, facecolor=colour, edgecolor="white", lw=0.5)
+            if numbered:
+                light = float(np.dot(colour[:3], (0.299, 0.587, 0.114)))
+                axes.annotate(
+                    plain_number(error), middle, ha="center", va="center", fontsize=SMALL - 1,
+                    color="black" if light > 0.5 else "white",
+                )  # fmt: skip
+        axes.add_patch(cell)
+    _outline(axes, inside, edges)
+    for values, axis in zip(ticks, (axes.xaxis, axes.yaxis), strict=True):
+        axis.set_minor_locator(NullLocator())
+        step = 1 if len(values) <= 2 * MOST_NUMBERS else len(values) // MOST_NUMBERS
+        axis.set_ticks(values[::step], [plain_number(value) for value in values[::step]])
+    axes.set_xlim(edges[0][0], edges[0][-1])
+    axes.set_ylim(edges[1][0], edges[1][-1])
+
+
+def _marks(axes: Any, places: Mapping[tuple[float, ...], Run], shown: ScalarMappable) -> None:
+    for place, run in places.items():
+        error = _badness(run)
+        if np.isinf(error):
+            axes.plot(*place, marker="x", color="black", markersize=8, mew=1.8)
+            continue
+        ring = {"mec": BAD, "mew": 2.2} if in_basin(run) else {"mec": "white", "mew": 0.5}
+        colour = shown.to_rgba(np.array([error]))[0]
+        axes.plot(*place, marker="s", markersize=12, color=colour, **ring)
+    for axis in (axes.xaxis, axes.yaxis):
+        log_axis(axis)
 
 
 def _is_geometric(values: FloatArray) -> bool:
@@ -166,7 +197,7 @@ def paths_figure(sweep: Sweep) -> Figure | None:
             if column == 0:
                 one.set_ylabel(f"{name} [MPa]" if _moduli(sweep) else name)
             if k == 0:
-                one.set_title(factor_text(mode), fontsize=TEXT)
+                one.set_title(mode, fontsize=TEXT)
             if k == len(names) - 1:
                 one.set_xlabel("iteration")
     one = axes[0, -1]

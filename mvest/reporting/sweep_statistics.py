@@ -56,7 +56,8 @@ class Accuracy:
     reported : float
         Mean of the standard deviations that the filter reports.
     bias, rmse, bound : float
-        Of estimate minus truth, and the mean Cramér–Rao standard deviation; in the parameter's unit.
+        Of estimate minus truth, and the mean Cramér–Rao standard deviation; in the parameter's
+        unit.
     bias_percent, rmse_percent, worst_percent : float
         The same in percent of the truth, and the largest error without sign.
     ratio, ratio_std : float
@@ -94,7 +95,9 @@ def grouped(runs: Sequence[Run], names: Sequence[str]) -> dict[tuple[Any, ...], 
     """Runs that agree in the named factors, groups in order of first appearance."""
     groups: dict[tuple[Any, ...], list[Run]] = {}
     for run in runs:
-        groups.setdefault(tuple(run.factors.get(name) for name in names), []).append(run)
+        # Every run has a filter, also where it is not varied.
+        values = (run.mode if name == "filter" else run.factors.get(name) for name in names)
+        groups.setdefault(tuple(values), []).append(run)
     return groups
 
 

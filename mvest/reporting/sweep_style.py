@@ -93,7 +93,7 @@ def log_axis(axis: Any) -> None:
 
 
 def levels(n: int) -> list[Any]:
-    """n colours in order from dark to light, light enough to part and dark enough to see."""
+    """N colours in order from dark to light, light enough to part and dark enough to see."""
     return [colormaps["viridis"](value) for value in np.linspace(0.0, 0.85, max(n, 1))]
 
 
@@ -129,7 +129,7 @@ def label_ends(
 
 
 def _apart(places: FloatArray, gap: float) -> FloatArray:
-    """Positions in the same order, at least ``gap`` apart, moved as little as a sweep upwards allows."""
+    """Positions in the same order, at least ``gap`` apart and below 1."""
     order = np.argsort(places, kind="stable")
     moved = places[order].copy()
     for k in range(1, len(moved)):

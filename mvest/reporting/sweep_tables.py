@@ -19,6 +19,7 @@ from mvest.reporting.sweep_rows import (
     factor_label,
     factor_names,
     factor_text,
+    kind_of,
     runs_of,
     unit_of,
 )
@@ -58,7 +59,7 @@ def summary(sweep: Sweep) -> tuple[list[Row], list[Reading]]:
     runs = runs_of(sweep)
     if not runs:
         return [], []
-    rows, reading = by_kind.get(sweep["sweep"]["kind"], _settings)(sweep, runs)
+    rows, reading = by_kind.get(kind_of(sweep), _settings)(sweep, runs)
     plain_paper, paper = _paper_rows(sweep, reading[0])
     columns = list(dict.fromkeys(name for row in [*rows, *plain_paper] for name in row))
     return [{name: row.get(name) for name in columns} for row in plain_paper + rows], (
@@ -71,7 +72,7 @@ def table_note(sweep: Sweep) -> str:
     common = (
         "All observations are simulated. Runs that failed are counted and enter no other number. "
     )
-    kind = sweep["sweep"]["kind"]
+    kind = kind_of(sweep)
     if kind == "initial_guess":
         return common + (
             f"Estimates are mean ± SD over the starts that converged; a start is within "
@@ -194,10 +195,18 @@ def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
                 | _coverage_row(levels)
                 | verdicts
             )
+            judged = [text or MISSING for text in verdicts.values()]
             reading.append(
-                {"setting": words, "parameter": name}
-                | _noise_reading(unit_of(name) if mixed else "", common, found, levels[-1])
-                | {column: text or MISSING for column, text in verdicts.items()}
+                {
+                    "setting": words,
+                    "parameter": name,
+                    "n": str(found.n) + (f" (+{found.failed} failed)" if found.failed else ""),
+                    "RMSE / bound": with_std(found.ratio, found.ratio_std),
+                    f"≤ {BOUND_FACTOR:g}": judged[0],
+                    "95 % interval covers [%]": _share(levels[-1]),
+                    f"{100 * COVERAGE_RANGE[0]:.0f}–{100 * COVERAGE_RANGE[1]:.0f} %": judged[1],
+                }
+                | _noise_reading(unit_of(name) if mixed else "", common, found)
             )
     return rows, reading
 
@@ -235,25 +244,19 @@ def _within_bound(found: Accuracy) -> str:
     return "yes" if found.ratio <= BOUND_FACTOR else "no"
 
 
-def _noise_reading(own: str, common: str, found: Accuracy, covered: Coverage) -> Reading:
-    """Cells of one row; the unit stands in the header if all parameters share it."""
+def _noise_reading(own: str, common: str, found: Accuracy) -> Reading:
+    """Cells with a unit; it stands in the header if all parameters share it."""
     unit = own.strip().strip("[]")
     values = {
-        "estimate": with_std(found.mean, found.spread),
-        "bias": number(found.bias, 2),
         "RMSE": number(found.rmse, 2),
         "bound": number(found.bound, 2),
+        "bias": number(found.bias, 2),
+        "estimate": with_std(found.mean, found.spread),
     }
     return {
-        "n": str(found.n) if not found.failed else f"{found.n} (+{found.failed} failed)",
-        **{
-            f"{name}{common}": text if text == MISSING else f"{text} {unit}".rstrip()
-            for name, text in values.items()
-        },
-        "largest error [%]": number(found.worst_percent),
-        "RMSE / bound": with_std(found.ratio, found.ratio_std),
-        "coverage of 95 % [%]": _share(covered),
-    }
+        f"{name}{common}": text if text == MISSING else f"{text} {unit}".rstrip()
+        for name, text in values.items()
+    } | {"largest error [%]": number(found.worst_percent)}
 
 
 def _share(found: Coverage) -> str:

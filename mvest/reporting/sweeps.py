@@ -27,6 +27,7 @@ from mvest.reporting.sweep_rows import (
     csv_text,
     factor_label,
     factor_names,
+    kind_of,
     sweep_line,
     tidy_rows,
 )
@@ -39,7 +40,7 @@ from mvest.reporting.sweep_setting_figures import (
 from mvest.reporting.sweep_start_figures import basin_figure, paths_figure
 from mvest.reporting.sweep_tables import summary, table_note
 
-__all__ = ["SWEEPS", "Picture", "pictures_of", "read_sweeps", "write_sweep"]
+__all__ = ["COST", "SWEEPS", "Picture", "pictures_of", "read_sweeps", "write_sweep"]
 
 SWEEPS = "sweeps"
 """Folder of the collected sweeps within the results."""
@@ -90,15 +91,13 @@ PICTURES: dict[str, tuple[Picture, ...]] = {
             discrepancy_figure,
         ),
     ),
-    "filter": (
-        Picture("", "Error, coverage and forward solves of each filter.", filter_figure),
-    ),
+    "filter": (Picture("", "Error, coverage and forward solves of each filter.", filter_figure),),
 }
 
 
 def pictures_of(sweep: Sweep) -> tuple[Picture, ...]:
     """The figures that a sweep of this kind may have, its cost last."""
-    return (*PICTURES.get(sweep["sweep"]["kind"], ()), COST)
+    return (*PICTURES.get(kind_of(sweep), ()), COST)
 
 
 def read_sweeps(results: Path) -> list[Sweep]:

@@ -127,7 +127,8 @@ def write_tables(folder: Path, name: str, records: Sequence[Record]) -> list[Pat
     reading = readable(records)
     csv = "".join(f"# {line}\n" for line in lines) + frame(records).to_csv(index=False)
     notes = "\n".join(f"<sub>{line}</sub>  " for line in lines)
-    markdown = f"# {records[0]['title']}\n\n{markdown_rows(_plain(reading))}\n\n{_truth(records)}\n\n{notes}\n"
+    table = markdown_rows(_plain(reading))
+    markdown = f"# {records[0]['title']}\n\n{table}\n\n{_truth(records)}\n\n{notes}\n"
     tex = "".join(f"% {line}\n" for line in lines) + _latex(reading)
     return [
         write_text(folder / f"{name}.csv", csv),

@@ -26,7 +26,13 @@ def _hash(*what: Any) -> str:
 
 
 def run(
-    seed: int, estimate: Any, std: Any, *, bound: Any = None, start: Any = (5.0, 3.0), **changes: Any
+    seed: int,
+    estimate: Any,
+    std: Any,
+    *,
+    bound: Any = None,
+    start: Any = (5.0, 3.0),
+    **changes: Any,
 ) -> dict[str, Any]:
     """A converged run that approaches its estimate by a factor of 5 a round."""
     estimate, std = np.asarray(estimate, float), np.asarray(std, float)
@@ -56,10 +62,8 @@ def run(
 
 
 def failed_run(seed: int, reason: str, **changes: Any) -> dict[str, Any]:
-    nothing = dict.fromkeys(
-        ("estimate", "std", "relative_error", "bound", "distance_mm", "distance_to_truth_mm")
-        + ("nis", "nis_band", "iterates", "iterate_std")
-    )
+    absent = "estimate std relative_error bound distance_mm distance_to_truth_mm nis nis_band"
+    nothing = dict.fromkeys([*absent.split(), "iterates", "iterate_std"])
     entry: dict[str, Any] = {
         "seed": seed,
         "status": "failed",
@@ -140,7 +144,11 @@ def initial_guess() -> dict[str, Any]:
                 start = np.array([a, b])
                 far = float(np.linalg.norm(np.log(start / TRUTH)))
                 factors = {"start_anterior": a, "start_posterior": b, "filter": mode}
-                extra = {"initial": [a, b], "filter": mode, "P0": 9.0 if mode == "iterated" else 0.01}
+                extra = {
+                    "initial": [a, b],
+                    "filter": mode,
+                    "P0": 9.0 if mode == "iterated" else 0.01,
+                }
                 if (mode == "paper" and b < 0.6 and a > 3) or (a == 12.0 and b == 8.0):
                     reason = FAILED["model"] if mode == "paper" else FAILED["memory"]
                     runs = [failed_run(1, reason)] if mode == "paper" else []
@@ -201,7 +209,8 @@ def noise(seeds: int = 40) -> dict[str, Any]:
             if kind == "dropout" and level == 1.5:
                 runs, reason = [], FAILED["memory"]
             model = {"element": "hex18", "cells": [36, 4, 1], "noise_mm": level}
-            jobs.append(job({"kind": kind, "noise_mm": level}, runs, reason, model=model))
+            more = {"model": model, "seed": 1, "repeats": seeds}
+            jobs.append(job({"kind": kind, "noise_mm": level}, runs, reason, **more))
     return sweep("noise", jobs, title="Noise of the observation")
 
 
