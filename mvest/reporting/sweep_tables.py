@@ -331,14 +331,22 @@ def _reasons(runs: Sequence[Run]) -> str:
 
 
 def failure_rows(sweep: Sweep) -> list[Reading]:
-    """Every run that failed and why; jobs without a single run say so."""
+    """What failed and why, one row for all seeds of a job that failed for the same reason."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs_of(sweep):
+        if not run.converged:
+            groups.setdefault((run.job, run.reason), []).append(run)
     return [
-        {
-            "run": run.row,
-            "seed": "all (nothing was written)" if run.seed is None else str(run.seed),
-            "reason": run.reason,
-            "job": run.job,
-        }
-        for run in runs_of(sweep)
-        if not run.converged
+        {"run": lost[0].row, "seed": _seeds(lost), "reason": reason, "job": job}
+        for (job, reason), lost in groups.items()
     ]
+
+
+def _seeds(runs: Sequence[Run]) -> str:
+    """Seeds in a few characters: ``1 to 40``, ``13, 26, 39``."""
+    seeds = [run.seed for run in runs if run.seed is not None]
+    if not seeds:
+        return "all (no result)"
+    if len(seeds) > 2 and seeds == list(range(seeds[0], seeds[0] + len(seeds))):
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(str(seed) for seed in seeds)
