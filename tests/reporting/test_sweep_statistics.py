@@ -42,6 +42,14 @@ def test_errors_by_hand() -> None:
     assert found.reported == pytest.approx(0.1)
 
 
+def test_what_a_failed_run_left_behind_is_no_estimate() -> None:
+    astray = failed_run(9, "too many rounds", estimate=[60.0, 20.0], std=[0.1, 0.1])
+    runs = runs_of(sweep("x", [job({}, [run(1, TRUTH, [0.1, 0.1]), astray])]))
+    found = accuracy(runs, 0)
+    assert (found.n, found.failed, found.worst_percent) == (1, 1, 0.0)
+    assert coverage(runs, 0).n == 1
+
+
 def test_without_a_bound_or_a_run_there_is_no_ratio() -> None:
     assert math.isnan(accuracy(group([0.1], bound=None), 0).ratio)
     nothing = accuracy(group([], failed=3), 0)

@@ -21,9 +21,9 @@ from tests.reporting.synthetic_sweeps import (
 
 
 def noisy() -> dict:
-    """White noise near the bound, correlated noise three times above it."""
+    """White noise near the bound, correlated noise with twice its errors."""
     jobs = []
-    for kind, factor in (("white", 1.0), ("correlated", 3.0)):
+    for kind, factor in (("white", 1.0), ("correlated", 2.0)):
         errors = [factor * e for e in (0.05, -0.05, 0.15, -0.15)]
         runs = [
             run(s, np.add(TRUTH, [e, 0.0]), [0.1, 0.1], bound=[0.1, 0.1])
@@ -42,17 +42,17 @@ def test_noise_table_answers_both_questions_in_columns() -> None:
         ("correlated", 0.5, "E_f.posterior"),
     ]
     white, _, correlated, _ = rows
-    # Mean square (2 x 0.0025 + 2 x 0.0225) / 4 = 0.0125, nine times that for the other.
+    # Mean square (2 x 0.0025 + 2 x 0.0225) / 4 = 0.0125, four times that for the other.
     assert white["RMSE [MPa]"] == pytest.approx(math.sqrt(0.0125))
     assert white["RMSE / bound"] == pytest.approx(math.sqrt(1.25))
-    assert correlated["RMSE / bound"] == pytest.approx(3 * math.sqrt(1.25))
+    assert correlated["RMSE / bound"] == pytest.approx(2 * math.sqrt(1.25))
     assert [r["RMSE within 1.5 x bound"] for r in rows] == ["yes", "yes", "no", "yes"]
-    # 0.15 is within 1.96 x 0.1; 0.15, 0.15, 0.45, 0.45 are half of them.
+    # 0.15 is within 1.96 x 0.1; of 0.1, 0.1, 0.3, 0.3 one half is.
     assert white["coverage of 95 % [%]"] == 100
     assert correlated["coverage of 95 % [%]"] == 50
     assert (white["runs"], white["failed"]) == (4, 1)
     assert reading[0]["n"] == "4 (+1 failed)"
-    assert reading[2]["RMSE / bound"] == "3.35 ± 1.2"
+    assert reading[2]["RMSE / bound"] == "2.24 ± 0.79"
     assert reading[2]["≤ 1.5"] == "no"
     assert reading[2]["90–98 %"] == "no"
     assert reading[0]["RMSE [MPa]"] == "0.11"
@@ -68,7 +68,7 @@ def test_without_noise_nothing_is_judged() -> None:
 def test_noise_conclusions_follow_from_the_numbers() -> None:
     said = conclusions(noisy())
     assert "in 3 of 4 combinations" in said[0]
-    assert "largest ratio is 3.35 (correlated noise of 0.5 mm, anterior)" in said[0]
+    assert "largest ratio is 2.24 (correlated noise of 0.5 mm, anterior)" in said[0]
     assert "smallest coverage is 50 % (correlated noise of 0.5 mm, anterior)" in said[1]
     assert said[-1] == "2 of 10 runs failed: 2 × no."
 
