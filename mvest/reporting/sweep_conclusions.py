@@ -8,12 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from mvest.reporting.markup import number
+from mvest.reporting.sweep_families import (
+    covariance_lines,
+    discrepancies,
+    filter_conditions,
+    is_own_model,
+    noise_groups,
+)
 from mvest.reporting.sweep_rows import (
     FACTORS,
     Run,
     Sweep,
     factor_names,
-    factor_text,
     kind_of,
     runs_of,
     short_names,
@@ -129,36 +135,48 @@ def _initial_guess(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 
 def _covariance(sweep: Sweep, runs: list[Run]) -> list[str]:
-    effects = []
-    for (varied, mode), group in grouped(runs, ["varied", "filter"]).items():
-        good = [run for run in converged(group) if np.isfinite(run.largest_error)]
-        if not good:
+    """Which covariance moves the error most, along lines where the others are kept."""
+    swings: list[tuple[float, str]] = []
+    growths: list[tuple[float, str]] = []
+    quiet: dict[str, bool] = {}
+    for line in covariance_lines(runs):
+        good = [(value, group) for value, group in line.points if converged(group)]
+        errors = [
+            max(accuracy(group, k).rmse_percent for k in range(len(sweep["parameters"])))
+            for _, group in good
+        ]
+        if len(good) < 2 or not np.isfinite(errors).all():
             continue
-        errors = [run.largest_error for run in good]
-        scales = [float(run.factors["scale"]) for run in good]
-        std = np.array([run.std for run in good])
-        growth = float(np.max(std.max(axis=0) / std.min(axis=0)))
-        what = "P0, Q and R together" if varied == "all" else str(varied)
-        effects.append((max(errors), min(errors), growth, min(scales), max(scales), what, mode))
-    if not effects:
-        return []
-    effects.sort(key=lambda effect: -effect[0])
-    most, least, _, low, high, varied, mode = effects[0]
-    sentences = [
-        f"The error depends most on {varied}: scaled from {low:g} to {high:g} times in the {mode} "
-        f"mode, the largest error of a modulus lies between {number(least)} and {number(most)} %."
-    ]
-    quiet = [f"{e[5]} ({e[6]} mode)" for e in effects if e[0] <= BASIN_PERCENT]
-    if quiet:
-        sentences.append(
-            f"The error stays within {BASIN_PERCENT:g} % at every scale tried of {_listed(quiet)}."
+        kept = f", {line.others}" if line.others and line.others != "all runs" else ""
+        where = f"{_quantity(line.quantity)} in the {line.mode} mode"
+        swing = max(errors) - min(errors)
+        swings.append(
+            (
+                swing,
+                f"{where}: from {good[0][0]:g} to {good[-1][0]:g}{kept}, the largest error of a "
+                f"modulus lies between {number(min(errors))} and {number(max(errors))} %",
+            )
         )
-    grown = max(effects, key=lambda effect: effect[2])
+        std = np.array([np.mean([run.std for run in converged(g)], axis=0) for _, g in good])
+        growths.append((float(np.max(std.max(axis=0) / std.min(axis=0))), where))
+        quiet[where] = quiet.get(where, True) and max(errors) <= BASIN_PERCENT
+    if not swings:
+        return []
+    sentences = [f"The error depends most on {max(swings)[1]}."]
+    if still := [where for where, all_small in quiet.items() if all_small]:
+        sentences.append(
+            f"It stays within {BASIN_PERCENT:g} % at every value tried of {_listed(still)}."
+        )
+    growth, where = max(growths)
     sentences.append(
-        f"The reported standard deviation depends most on {grown[5]} ({grown[6]} mode): it changes "
-        f"by a factor of {number(grown[2])}."
+        f"The reported standard deviation depends most on {where}: it changes by a factor of "
+        f"{number(growth)}."
     )
     return sentences
+
+
+def _quantity(name: str) -> str:
+    return "P0, Q and R together" if name == "all" else name
 
 
 def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
@@ -166,12 +184,11 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
     ratios: list[tuple[float, str]] = []
     verdicts: Counter[str] = Counter()
     worst_coverage: list[tuple[float, str]] = []
-    for (kind, level), group in grouped(runs, ["kind", "noise_mm"]).items():
-        if not level:
-            continue  # Without noise there is nothing that an interval should cover.
+    groups = [group for group in noise_groups(runs) if group.level]
+    for group in groups:  # Without noise there is nothing that an interval should cover.
         for k, name in enumerate(names):
-            where = f"{factor_text(kind)} noise of {factor_text(level)} mm, {name}"
-            found, covered = accuracy(group, k), coverage(group, k)
+            where = f"{group.label}; {name}"
+            found, covered = accuracy(group.runs, k), coverage(group.runs, k)
             if np.isfinite(found.ratio):
                 ratios.append((found.ratio, where))
             if covered.n:
@@ -195,32 +212,28 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
             f"{verdicts['no']} it does not, in {verdicts['too few runs to tell']} there are too "
             f"few runs to tell; the smallest coverage is {100 * least[0]:.0f} % ({least[1]})."
         )
-    for (kind,), group in grouped(runs, ["kind"]).items():
-        if not (noisy := [run for run in group if run.factors.get("noise_mm")]):
-            continue
-        level = max(run.factors["noise_mm"] for run in noisy)
-        top = [run for run in noisy if run.factors["noise_mm"] == level]
+    strongest = {group.kind: group for group in groups if converged(group.runs)}
+    for group in strongest.values():
         errors = [
-            f"{number(accuracy(top, k).rmse_percent, 2)} % ({name})" for k, name in enumerate(names)
+            f"{number(accuracy(group.runs, k).rmse_percent, 2)} % ({name})"
+            for k, name in enumerate(names)
         ]
-        if converged(top):
-            sentences.append(
-                f"At {factor_text(level)} mm of {factor_text(kind)} noise the root mean square "
-                f"error is {_listed(errors)}."
-            )
+        sentences.append(f"Under “{group.label}” the root mean square error is {_listed(errors)}.")
     return sentences
 
 
 def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
     names = short_names(sweep["parameters"])
     effects = []
-    for (what,), group in grouped(runs, ["discrepancy"]).items():
+    groups = discrepancies(runs)
+    for what, group in groups.items():
         found = [accuracy(group, k) for k in range(len(names))]
         if found[0].n and np.isfinite([f.bias_percent for f in found]).all():
             k = int(np.argmax([abs(f.bias_percent) for f in found]))
             effects.append((abs(found[k].bias_percent), found[k].bias_percent, names[k], what))
     effects.sort(key=lambda effect: -effect[0])
-    real = [effect for effect in effects if effect[3] != "none"]
+    own = {what for what, group in groups.items() if is_own_model(group)}
+    real = [effect for effect in effects if effect[3] not in own]
     if not real:
         return ["No discrepancy left a result, so nothing can be said about what dominates."]
     first = real[0]
@@ -230,13 +243,13 @@ def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
     if len(real) > 1:
         following = _listed([f"“{e[3]}” ({e[1]:+.3g} %, {e[2]})" for e in real[1:4]])
         sentences.append(f"Next come {following}.")
-    alone = [effect for effect in effects if effect[3] == "none"]
+    alone = [effect for effect in effects if effect[3] in own]
     if alone:
         sentences.append(f"Without any discrepancy the error is {number(alone[0][0])} %.")
     checked = [
         coverage(group, k)
-        for (what,), group in grouped(runs, ["discrepancy"]).items()
-        if what != "none"
+        for what, group in groups.items()
+        if what not in own
         for k in range(len(names))
     ]
     checked = [found for found in checked if found.n]
@@ -250,35 +263,41 @@ def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 
 def _filter(sweep: Sweep, runs: list[Run]) -> list[str]:
-    entries = []
-    for (name,), group in grouped(runs, ["filter"]).items():
-        good = converged(group)
-        errors = [accuracy(group, k).rmse_percent for k in range(len(sweep["parameters"]))]
-        if good and np.isfinite(errors).all():
-            solves = spread_of([run.forward_solves for run in good])["mean"]
-            entries.append((max(errors), solves, factor_text(name)))
-    if not entries:
-        return []
-    best, least = min(entries), min(entries, key=lambda entry: entry[1])
-    sentences = [
-        f"The smallest error is that of “{best[2]}”: {number(best[0])} % (root mean square, worst "
-        f"modulus), with {number(best[1])} forward solves."
-    ]
-    if least[2] != best[2]:
+    """The best and the cheapest filter under each condition."""
+    sentences = []
+    for condition, filters in filter_conditions(runs).items():
+        entries = []
+        for name, group in filters.items():
+            good = converged(group)
+            errors = [accuracy(group, k).rmse_percent for k in range(len(sweep["parameters"]))]
+            if good and np.isfinite(errors).all():
+                solves = spread_of([run.forward_solves for run in good])["mean"]
+                entries.append((max(errors), solves, name))
+        if not entries:
+            continue
+        best, least = min(entries), min(entries, key=lambda entry: entry[1])
+        where = f" ({condition})" if condition else ""
         sentences.append(
-            f"“{least[2]}” takes the fewest forward solves ({number(least[1])}), at an error of "
-            f"{number(least[0])} %."
+            f"The smallest error{where} is that of “{best[2]}”: {number(best[0])} % (root mean "
+            f"square, worst modulus), with {number(best[1])} forward solves."
         )
-    worst = max(entries)
-    if len(entries) > 2:
-        sentences.append(f"The largest error is that of “{worst[2]}”: {number(worst[0])} %.")
+        if least[2] != best[2]:
+            sentences.append(
+                f"“{least[2]}” takes the fewest forward solves{where}: {number(least[1])}, at an "
+                f"error of {number(least[0])} %."
+            )
+        if len(entries) > 2:
+            worst = max(entries)
+            sentences.append(
+                f"The largest error{where} is that of “{worst[2]}”: {number(worst[0])} %."
+            )
     return sentences
 
 
 def _anything(sweep: Sweep, runs: list[Run]) -> list[str]:
     worst = _worst(runs)
     kind, needed = sweep["sweep"]["kind"], FACTORS.get(str(sweep["sweep"]["kind"]))
-    missing = sorted((needed or set()) - set(factor_names(sweep)))
+    missing = sorted(needed[0] - set(factor_names(sweep))) if needed else []
     why = (
         f"This sweep of the kind “{kind}” lacks the factor {_listed(missing)} in a job and has"
         if needed and missing

@@ -48,16 +48,19 @@ CONVERGED = "converged"
 NUMBER_FORMAT = ".10g"
 UNITS = {"mm": "mm", "mpa": "MPa", "mmhg": "mmHg", "s": "s", "percent": "%"}
 """Endings of factor names that say a unit."""
+COVARIANCE_UNITS = {"P0": "filter coordinates²", "Q": "filter coordinates²", "R": "mm²"}
+"""Coordinates are MPa, or their logarithms where the filter works in these."""
 
 
-FACTORS: dict[str, set[str]] = {
-    "initial_guess": set(),
-    "covariance": {"varied", "scale"},
-    "noise": {"kind", "noise_mm"},
-    "discrepancy": {"discrepancy"},
-    "filter": {"filter"},
+FACTORS: dict[str, tuple[set[str], ...]] = {
+    "initial_guess": (set(),),
+    "covariance": ({"varied", "scale"}, {"P0", "Q", "R"}),
+    "noise": ({"kind", "noise_mm"},),
+    "discrepancy": ({"discrepancy"}, {"truth"}),
+    "filter": ({"filter"},),
 }
-"""Kinds of sweeps with tables and figures of their own, and what these are drawn over."""
+"""Kinds of sweeps with tables and figures of their own, and the factors that these need (the first
+set, or any other)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,15 +203,19 @@ def factor_names(sweep: Sweep) -> list[str]:
 def kind_of(sweep: Sweep) -> str:
     """The kind that decides on tables and figures, or nothing if its factors are not all there."""
     kind = str(sweep["sweep"]["kind"])
-    needed = FACTORS.get(kind)
-    complete = needed is not None and all(needed <= set(job["factors"]) for job in sweep["jobs"])
-    return kind if complete else ""
+    complete = all(
+        any(needed <= set(job["factors"]) for needed in FACTORS.get(kind, ()))
+        for job in sweep["jobs"]
+    )
+    return kind if complete and kind in FACTORS else ""
 
 
 def factor_label(name: str) -> str:
     """A factor's name with its unit: ``noise_mm`` as ``noise [mm]``."""
     if name.startswith("start_"):
         return f"{name.replace('_', ' ')} [MPa]"
+    if name in COVARIANCE_UNITS:
+        return f"{name} [{COVARIANCE_UNITS[name]}]"
     stem, _, ending = name.rpartition("_")
     unit = UNITS.get(ending.lower())
     return f"{stem.replace('_', ' ')} [{unit}]" if stem and unit else name.replace("_", " ")

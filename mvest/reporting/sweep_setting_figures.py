@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,13 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from mvest.reporting.markup import number
+from mvest.reporting.sweep_families import (
+    Line,
+    covariance_lines,
+    discrepancies,
+    filter_conditions,
+    is_own_model,
+)
 from mvest.reporting.sweep_rows import (
     Run,
     Sweep,
@@ -20,7 +27,7 @@ from mvest.reporting.sweep_rows import (
     runs_of,
     short_names,
 )
-from mvest.reporting.sweep_statistics import accuracy, converged, coverage, grouped, spread_of
+from mvest.reporting.sweep_statistics import accuracy, converged, coverage, spread_of
 from mvest.reporting.sweep_style import (
     BAD,
     COLOURS,
@@ -28,10 +35,12 @@ from mvest.reporting.sweep_style import (
     MARKERS,
     SMALL,
     TEXT,
+    WIDTH,
     headline,
-    label_ends,
     log_axis,
     panels,
+    plain_axes,
+    plain_number,
 )
 from mvest.typing import FloatArray
 
@@ -43,78 +52,76 @@ SMALLEST_PERCENT = 1e-5
 
 
 def covariance_figure(sweep: Sweep) -> Figure | None:
-    """Error and reported standard deviation against the scale, a panel per varied covariance."""
+    """Error and reported standard deviation along each covariance, a row per filter mode."""
     runs = runs_of(sweep)
-    by_mode = grouped(runs, ["filter"])
-    varied = list(dict.fromkeys(run.factors.get("varied") for run in runs))
-    if not any(np.isfinite(run.error).any() for run in runs if run.converged):
+    lines = covariance_lines(runs)
+    modes = list(dict.fromkeys(line.mode for line in lines))
+    quantities = list(dict.fromkeys(line.quantity for line in lines))
+    if not lines or not any(np.isfinite(run.error).any() for run in runs if run.converged):
         return None
-    names = short_names(sweep["parameters"])
-    figure, axes = panels(
-        len(by_mode), len(varied), 2.5 * len(by_mode) + 0.7, sharex=True, sharey=True
-    )
-    for row, ((mode,), group) in enumerate(by_mode.items()):
-        for column, what in enumerate(varied):
+    figure, axes = panels(len(modes), len(quantities), 2.5 * len(modes) + 0.7, sharey=True)
+    for row, mode in enumerate(modes):
+        for column, quantity in enumerate(quantities):
             one = axes[row, column]
-            one.set(xscale="log", yscale="log")
-            log_axis(one.xaxis)
+            chosen = [line for line in lines if (line.mode, line.quantity) == (mode, quantity)]
+            values = sorted({v for o in lines if o.quantity == quantity for v, _ in o.points})
+            if all(len(line.points) < 2 for line in chosen):
+                _say(one, "not varied")
+            else:
+                for line in chosen:
+                    _along(one, line, values)
+            one.set_yscale("log")
             log_axis(one.yaxis)
-            chosen = [run for run in group if run.factors.get("varied") == what]
-            _scaled(one, chosen, len(names))
+            one.set_xlim(-0.4, len(values) - 0.6)
+            one.set_xticks(range(len(values)), [plain_number(value) for value in values])
             if row == 0:
-                one.set_title("all three" if what == "all" else factor_text(what), fontsize=TEXT)
-            if row == len(by_mode) - 1:
-                one.set_xlabel("scale")
+                one.set_title("all three" if quantity == "all" else quantity, fontsize=TEXT)
+            if row == len(modes) - 1:
+                one.set_xlabel("scale" if "varied" in runs[0].factors else f"{quantity}")
             if column == 0:
                 one.set_ylabel(f"{mode} mode\n[% of truth]")
-    for row in range(len(by_mode)):
-        one = axes[row, -1]
-        label_ends(one, float(one.get_xlim()[1]), _ends(one, names), gap=0.09)
     headline(
         figure,
         "How much do the filter's covariances matter?",
-        "Full lines: error of each modulus. Dashed lines: standard deviation that the filter "
-        "reports. Crosses at the bottom: failed runs.",
+        "Blue: largest error of a modulus. Orange, dashed: largest standard deviation that the "
+        "filter reports.\nOne line for each setting of the others. Crosses: failed runs.",
     )
     return figure
 
 
-def _scaled(axes: Any, runs: Sequence[Run], parameters: int) -> None:
-    groups = sorted((float(s), group) for (s,), group in grouped(runs, ["scale"]).items())
-    for k in range(parameters):
-        found = [(s, accuracy(group, k), group) for s, group in groups if converged(group)]
-        if not found:
-            continue
-        truth = np.array([np.mean([run.truth[k] for run in group]) for _, _, group in found])
-        scale = np.array([s for s, _, _ in found])
-        error = np.array([a.rmse_percent for _, a, _ in found])
-        std = 100.0 * np.array([a.reported for _, a, _ in found]) / truth
-        style = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4}
-        axes.plot(scale, np.maximum(error, SMALLEST_PERCENT), linewidth=1.6, **style)
-        axes.plot(scale, std, linewidth=1.2, linestyle=(0, (4, 2)), mfc="white", **style)
-    for s, group in groups:
-        if len(converged(group)) < len(group):
-            axes.plot(s, 0.03, "x", color=BAD, markersize=7, mew=2, clip_on=False,
+def _say(axes: Any, words: str) -> None:
+    """Why a panel is empty."""
+    axes.annotate(
+        words, (0.5, 0.5), xycoords="axes fraction", ha="center", va="center", color=GREY,
+        fontsize=SMALL,
+    )  # fmt: skip
+
+
+def _along(axes: Any, line: Line, values: Sequence[float]) -> None:
+    """One line at evenly spaced places, since a covariance may be zero."""
+    found = []
+    for value, group in line.points:
+        place = values.index(value)
+        good = converged(group)
+        if len(good) < len(group):
+            axes.plot(place, 0.03, "x", color="black", markersize=7, mew=2, clip_on=False,
                       transform=axes.get_xaxis_transform(), zorder=6)  # fmt: skip
-
-
-def _ends(axes: Any, names: Sequence[str]) -> list[tuple[float, str, Any]]:
-    """Last point and name of each curve; they come in pairs of error and standard deviation."""
-    lines = [line for line in axes.lines if line.get_marker() in MARKERS]
-    return [
-        (
-            float(line.get_ydata()[-1]),
-            f"{names[MARKERS.index(line.get_marker())]}, {'SD' if position % 2 else 'error'}",
-            line.get_color(),
-        )
-        for position, line in enumerate(lines)
-    ]
+        if good:
+            parameters = range(len(good[0].truth))
+            error = max(accuracy(group, k).rmse_percent for k in parameters)
+            std = max(100.0 * accuracy(group, k).reported / good[0].truth[k] for k in parameters)
+            found.append((place, max(error, SMALLEST_PERCENT), std))
+    if found:
+        place, error, std = np.array(found).T
+        axes.plot(place, std, color=COLOURS[1], marker="s", markersize=4, mfc="white", lw=1.2,
+                  linestyle=(0, (4, 2)), alpha=0.8)  # fmt: skip
+        axes.plot(place, error, color=COLOURS[0], marker="o", markersize=4, lw=1.5, alpha=0.8)
 
 
 def discrepancy_figure(sweep: Sweep) -> Figure | None:
     """Signed error of each modulus per discrepancy, sorted by size, with the 95 % interval."""
     runs = runs_of(sweep)
-    groups = {factor_text(what): g for (what,), g in grouped(runs, ["discrepancy"]).items()}
+    groups = discrepancies(runs)
     p = len(sweep["parameters"])
     size = {
         what: max((abs(accuracy(g, k).bias_percent) for k in range(p)), default=np.nan)
@@ -136,11 +143,10 @@ def discrepancy_figure(sweep: Sweep) -> Figure | None:
         one.grid(axis="y", visible=False)
     axes[0, 0].set_yticks(range(len(order)), order)
     axes[0, 0].set_ylim(-0.6, len(order) - 0.4)
-    largest = max((what for what in order if what != "none"), key=order.index)
-    found = np.isfinite(size[largest])
+    real = [what for what in order if not is_own_model(groups[what]) and np.isfinite(size[what])]
     headline(
         figure,
-        f"The largest error comes from “{largest}”" if found else "Errors by discrepancy",
+        f"The largest error comes from “{real[-1]}”" if real else "Errors by discrepancy",
         "Bars: error of the estimate when the truth has what the model has not. "
         "Black lines: the filter's own 95 % interval.",
     )
@@ -169,31 +175,24 @@ def _discrepancy_bar(axes: Any, y: int, runs: Sequence[Run], k: int) -> None:
 
 
 def filter_figure(sweep: Sweep) -> Figure | None:
-    """Error, coverage where there are repetitions, and forward solves of each filter."""
+    """Error, coverage where there are repetitions, and forward solves; a row per condition."""
     runs = runs_of(sweep)
-    groups = {factor_text(name): g for (name,), g in grouped(runs, ["filter"]).items()}
+    conditions = filter_conditions(runs)
     if not any(np.isfinite(run.error).any() for run in runs if run.converged):
         return None
-    repeated = any(len(group) > 1 for group in groups.values())
-    names, order = short_names(sweep["parameters"]), list(groups)[::-1]
-    figure, axes = panels(1, 3 if repeated else 2, 0.42 * len(order) + 1.7, sharey=True)
-    errors, covered, solves = axes[0, 0], axes[0, 1] if repeated else None, axes[0, -1]
-    for y, name in enumerate(order):
-        _filter_row(errors, covered, solves, y, groups[name], len(names))
-    errors.set_yticks(range(len(order)), order)
-    errors.set_ylim(-0.6, len(order) - 0.4)
-    errors.set_xlabel("error [% of truth]")
-    errors.set(xscale="log")
-    log_axis(errors.xaxis)
-    errors.set_title("error", fontsize=TEXT)
-    if covered is not None:
-        covered.axvline(95, color="black", linestyle="--", linewidth=1)
-        covered.set_xlim(0, 103)
-        covered.set_xlabel("95 % interval covers [% of runs]")
-        covered.set_title("coverage", fontsize=TEXT)
-    solves.margins(x=0.15)
-    solves.set_xlabel("forward solves per run")
-    solves.set_title("cost", fontsize=TEXT)
+    repeated = any(len(g) > 1 for filters in conditions.values() for g in filters.values())
+    names = short_names(sweep["parameters"])
+    rows = [len(filters) for filters in conditions.values()]
+    figure = Figure(
+        figsize=(WIDTH, 0.36 * sum(rows) + 0.75 * len(rows) + 0.8), layout="constrained"
+    )
+    axes = figure.subplots(
+        len(rows), 3 if repeated else 2, squeeze=False, sharex="col", height_ratios=rows
+    )
+    for one in axes.flat:
+        plain_axes(one)
+    for row, (condition, filters) in enumerate(conditions.items()):
+        _condition(axes[row], condition, filters, len(names), last=row == len(rows) - 1)
     words = [f"{COLOUR_WORDS[k % len(COLOURS)]}: {name}" for k, name in enumerate(names)]
     headline(
         figure,
@@ -202,6 +201,35 @@ def filter_figure(sweep: Sweep) -> Figure | None:
         + (". Small dots: seeds; large symbols: their root mean square." if repeated else "."),
     )
     return figure
+
+
+def _condition(
+    axes: Any, condition: str, filters: Mapping[str, list[Run]], parameters: int, *, last: bool
+) -> None:
+    """One row of panels: the filters under one condition."""
+    errors, solves = axes[0], axes[-1]
+    covered = axes[1] if len(axes) == 3 else None
+    order = list(filters)[::-1]
+    for y, name in enumerate(order):
+        _filter_row(errors, covered, solves, y, filters[name], parameters)
+    errors.set_xscale("log")
+    log_axis(errors.xaxis)
+    errors.set_title(condition or "error", fontsize=TEXT, loc="left" if condition else "center")
+    for one in axes:
+        one.set_yticks(range(len(order)), order if one is errors else [""] * len(order))
+        one.set_ylim(-0.6, len(order) - 0.4)
+    solves.margins(x=0.15)
+    if covered is not None:
+        covered.set_xlim(0, 103)
+        if any(len(runs) > 1 for runs in filters.values()):
+            covered.axvline(95, color="black", linestyle="--", linewidth=1)
+        else:
+            _say(covered, "single runs")
+    if last:
+        errors.set_xlabel("error [% of truth]")
+        solves.set_xlabel("forward solves per run")
+        if covered is not None:
+            covered.set_xlabel("95 % interval covers [% of runs]")
 
 
 COLOUR_WORDS = (
@@ -233,7 +261,7 @@ def _filter_row(
             errors.plot(single, np.full(len(single), at), ".", color=GREY, markersize=4, alpha=0.6)
         style = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 7}
         errors.plot(max(found.rmse_percent, SMALLEST_PERCENT), at, **style)
-        if covered is not None and share.n:
+        if covered is not None and share.n > 1:
             covered.plot([100 * share.low, 100 * share.high], [at, at], color=COLOURS[k], lw=1.5)
             covered.plot(100 * share.share, at, **style)
     mean = spread_of([run.forward_solves for run in good])["mean"]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mvest.reporting.markup import MISSING, number, with_std
+from mvest.reporting.sweep_families import SEED, noise_groups, setting_words, varied_names
 from mvest.reporting.sweep_rows import (
     Run,
     Sweep,
@@ -43,9 +44,6 @@ __all__ = ["failure_rows", "summary", "table_note"]
 
 Row = dict[str, Any]
 Reading = dict[str, str]
-SEED = "seed"
-"""A factor of this name is a repetition, not a setting."""
-
 IN_RANGE = f"95 % interval covers {100 * COVERAGE_RANGE[0]:.0f}-{100 * COVERAGE_RANGE[1]:.0f} %"
 WITHIN_BOUND = f"RMSE within {BOUND_FACTOR:g} x bound"
 
@@ -126,27 +124,26 @@ def _paper_rows(sweep: Sweep, like: Reading) -> tuple[list[Row], list[Reading]]:
     return plain, [{name: row.get(name, MISSING) for name in like} for row in words]
 
 
-def _setting(names: Sequence[str], values: Sequence[Any]) -> tuple[Row, str]:
-    """Factor columns, and the same in a few words."""
-    plain = {factor_label(name): value for name, value in zip(names, values, strict=True)}
-    shown = [_words(label, value) for label, value in plain.items() if value is not None]
-    return plain, ", ".join(shown) or "all runs"
+def _common(values: Sequence[Any]) -> Any:
+    """The value that all share, or all of them in one text."""
+    texts = list(dict.fromkeys(factor_text(value) for value in values))
+    return values[0] if len(texts) == 1 else ", ".join(texts)
 
 
-def _words(label: str, value: Any) -> str:
-    """A text says what it is; a number needs its name and unit: ``noise 0.5 mm``."""
-    if isinstance(value, str):
-        return value
-    stem, _, unit = label.partition(" [")
-    return f"{stem} {factor_text(value)} {unit.rstrip(']')}".rstrip()
+def _setting(runs: list[Run], names: Sequence[str], group: list[Run]) -> tuple[Row, str]:
+    """Factor columns of a group, and what in them is not the same throughout in a few words."""
+    plain = {factor_label(name): group[0].factors.get(name) for name in names}
+    return plain, setting_words(group[0], [n for n in names if n in varied_names(runs)])
 
 
 def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     """One row per filter mode and whatever else is varied besides the start."""
     names = [name for name in factor_names(sweep) if not name.startswith("start_") and name != SEED]
     rows, reading = [], []
-    for values, group in grouped(runs, names).items():
-        plain, words = _setting(names, values)
+    for group in grouped(runs, ["filter", *names]).values():
+        plain, words = _setting(runs, names, group)
+        if "filter" not in varied_names(runs):
+            words = group[0].mode if words == "all runs" else f"{group[0].mode}, {words}"
         good, basin = converged(group), sum(in_basin(run) for run in group)
         row: Row = {"setting": words, **plain, "starts": len(group), "converged": len(good)}
         row[f"starts within {BASIN_PERCENT:g} %"] = basin
@@ -180,10 +177,13 @@ def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     mixed = len(units) > 1
     common = "" if mixed else units.pop()
     rows, reading = [], []
-    for values, group in grouped(runs, names).items():
-        plain, words = _setting(names, values)
+    for noise in noise_groups(runs):
+        group, words = noise.runs, noise.label
+        plain = {
+            factor_label(name): _common([run.factors.get(name) for run in group]) for name in names
+        }
         # Without noise every seed gives the same run, and there is nothing to cover.
-        noisy = plain.get(factor_label("noise_mm")) != 0
+        noisy = noise.level > 0
         for k, name in enumerate(sweep["parameters"]):
             found, levels = accuracy(group, k), [coverage(group, k, level) for level in LEVELS]
             verdicts = {
@@ -271,8 +271,8 @@ def _settings(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     groups = grouped(runs, names)
     repeated = any(len(group) > 1 for group in groups.values())
     rows, reading = [], []
-    for values, group in groups.items():
-        plain, words = _setting(names, values)
+    for group in groups.values():
+        plain, words = _setting(runs, names, group)
         good = converged(group)
         row: Row = {"setting": words, **plain, "runs": len(good), "failed": len(group) - len(good)}
         text: Reading = {"setting": words}

@@ -283,3 +283,81 @@ def all_failed(kind: str) -> dict[str, Any]:
 def empty(kind: str) -> dict[str, Any]:
     """The sweep of this kind without a job."""
     return ALL[kind]() | {"jobs": [], "cost": []}
+
+
+def told_noise(seeds: int = 20) -> dict[str, Any]:
+    """As `noise`, with one kind over several levels and others at one, two jobs for each."""
+    rng = np.random.default_rng(5)
+    cases = [("white", level, 0.0, 0.0, 1.0) for level in (0.1, 0.5, 1.0)]
+    cases += [("correlated over 5 mm", 0.0, 0.5, told, 5.0 - 0.8 * told) for told in (0.0, 5.0)]
+    cases += [("white, coaptation hidden", 0.5, 0.0, 0.0, 1.1)]
+    cases += [("white, annulus 1 mm off", 0.5, 0.0, 0.0, 6.0)]
+    jobs = []
+    for kind, level, correlated, told, factor in cases:
+        for first in (1, 1 + seeds):
+            bound = BOUND_PER_MM * max(level, correlated)
+            runs = [
+                run(s, TRUTH + rng.normal(0, factor, 2) * bound, bound, bound=bound)
+                for s in range(first, first + seeds)
+            ]
+            factors = {"kind": kind, "noise_mm": level, "correlated_mm": correlated}
+            factors |= {"R": max(level, correlated) ** 2, "R_correlation_mm": told}
+            jobs.append(job(factors, runs, row=f"{kind} {first}", seed=first, repeats=seeds))
+    return sweep("noise", jobs, title="Estimates from noisy observations")
+
+
+def covariance_values() -> dict[str, Any]:
+    """As `covariance`, over values of P0, Q and R."""
+    jobs = []
+    for mode in ("paper", "iterated"):
+        for p0 in (1e-4, 0.01, 1.0, 9.0):
+            for q in (0.0, 1e-4, 0.01, 1.0) if mode == "paper" else (0.0,):
+                for r in (0.01, 0.25):
+                    std = BOUND_PER_MM * r**0.5
+                    pull = (std / (p0 + 5 * q) ** 0.5) ** 2
+                    estimate = TRUTH * (1 + np.array([0.011, -0.008]))
+                    estimate += pull * (np.array([5.0, 3.0]) - TRUTH) / (1 + pull)
+                    factors = {"filter": mode, "P0": p0, "Q": q, "R": r}
+                    lost = mode == "paper" and p0 == 1e-4 and q == 1.0
+                    runs = [] if lost else [run(1, estimate, std)]
+                    jobs.append(job(factors, runs, FAILED["model"] if lost else "", filter=mode))
+    return sweep("covariance", jobs, title="Estimates under covariances")
+
+
+def filter_conditions() -> dict[str, Any]:
+    """As `filters`, in two coordinates, from two starts, without noise and with it."""
+    rng = np.random.default_rng(4)
+    jobs = []
+    for start, level in (((5.0, 3.0), 0.0), ((9.0, 6.0), 0.0), ((5.0, 3.0), 0.5)):
+        for mode in ("paper", "iterated"):
+            for transform in ("identity", "log"):
+                bound = BOUND_PER_MM * max(level, 1e-4)
+                n = 5 if level else 1
+                runs = [
+                    run(s, TRUTH + rng.normal(0, 1, 2) * bound, bound, bound=bound)
+                    for s in range(1, n + 1)
+                ]
+                factors = {"filter": mode, "transform": transform, "start_anterior": start[0]}
+                factors |= {"start_posterior": start[1], "noise_mm": level}
+                lost = transform == "identity" and start[0] == 9.0
+                reason = FAILED["model"] if lost else ""
+                jobs.append(job(factors, [] if lost else runs, reason, filter=mode))
+    return sweep("filter", jobs, title="Filters side by side")
+
+
+def truths() -> dict[str, Any]:
+    """As `discrepancy`, named by the truth."""
+    whole = discrepancy()
+    for found in whole["jobs"]:
+        name = found["factors"]["discrepancy"]
+        found["factors"] = {"truth": "same model" if name == "none" else name}
+    return whole
+
+
+VARIANTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "told_noise": told_noise,
+    "covariance_values": covariance_values,
+    "filter_conditions": filter_conditions,
+    "truths": truths,
+}
+"""The same kinds with their factors named in other ways."""

@@ -17,15 +17,18 @@ from tests.reporting.synthetic_sweeps import (
     TRUTH,
     all_failed,
     covariance,
+    covariance_values,
     discrepancy,
     empty,
     failed_run,
+    filter_conditions,
     filters,
     initial_guess,
     job,
     noise,
     run,
     sweep,
+    told_noise,
 )
 
 
@@ -136,12 +139,44 @@ def test_calibration_leaves_out_what_has_no_noise() -> None:
 def test_covariance_panels_show_error_and_reported_deviation() -> None:
     figure = covariance_figure(covariance())
     assert [axes.get_title() for axes in figure.axes[:4]] == ["P0", "Q", "R", "all three"]
-    axes = figure.axes[2]
-    curves = [line for line in axes.lines if len(line.get_xdata()) == 5]
+    deviation, error = (line.get_ydata() for line in figure.axes[2].lines)
     # R times 100 makes the reported standard deviation ten times larger.
-    deviation = curves[1].get_ydata()
     assert deviation[-1] / deviation[2] == pytest.approx(10)
+    at_scale_one = covariance()["jobs"][12]["runs"][0]["relative_error"]
+    assert error[2] == pytest.approx(100 * max(abs(e) for e in at_scale_one))
     assert [line.get_marker() for line in figure.axes[6].lines].count("x") == 1
+
+
+def test_values_of_a_covariance_share_a_panel_zero_included() -> None:
+    figure = covariance_figure(covariance_values())
+    assert [axes.get_title() for axes in figure.axes[:3]] == ["P0", "Q", "R"]
+    labels = [label.get_text() for label in figure.axes[1].get_xticklabels()]
+    assert labels == ["0", "1e-4", "0.01", "1"]
+    # Four values of P0 and two of R, of which Q = 1 is lost at the smallest P0.
+    curves = [line for line in figure.axes[1].lines if line.get_marker() == "o"]
+    assert sorted(len(line.get_xdata()) for line in curves) == [3, 3, 4, 4, 4, 4, 4, 4]
+    assert texts(figure.axes[4]) == ["not varied"]
+
+
+def test_kinds_of_a_single_level_stand_side_by_side() -> None:
+    white, others = noise_figure(told_noise(3)).axes[:2]
+    assert white.get_title() == "white"
+    assert others.get_title() == "other errors"
+    (rms,) = [line for line in others.lines if line.get_marker() == "o"]
+    assert list(rms.get_xdata()) == [0, 1, 2, 3]
+    labels = [axes for axes in calibration_figure(told_noise(3)).axes if len(axes.texts) == 4]
+    assert any("coaptation" in text for text in texts(labels[0]))
+
+
+def test_conditions_have_a_row_each() -> None:
+    figure = filter_figure(filter_conditions())
+    assert [axes.get_title(loc="left") for axes in figure.axes[::3]] == [
+        "start anterior 5 MPa, start posterior 3 MPa, noise 0 mm",
+        "start anterior 9 MPa, start posterior 6 MPa, noise 0 mm",
+        "start anterior 5 MPa, start posterior 3 MPa, noise 0.5 mm",
+    ]
+    assert texts(figure.axes[1]) == ["single runs"]
+    assert texts(figure.axes[3]) == ["failed", "failed"]
 
 
 def test_discrepancies_are_sorted_by_their_size() -> None:
@@ -158,11 +193,12 @@ def test_discrepancies_are_sorted_by_their_size() -> None:
 
 
 def test_filters_have_coverage_only_with_repetitions() -> None:
-    assert [axes.get_title() for axes in filter_figure(filters()).axes] == [
-        "error", "coverage", "cost"
+    figure = filter_figure(filters())
+    assert [axes.get_xlabel() for axes in figure.axes] == [
+        "error [% of truth]", "95 % interval covers [% of runs]", "forward solves per run"
     ]  # fmt: skip
     single = filter_figure(filters(1))
-    assert [axes.get_title() for axes in single.axes] == ["error", "cost"]
+    assert len(single.axes) == 2
     assert "failed" in texts(single.axes[0])
 
 

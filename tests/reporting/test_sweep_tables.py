@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from mvest.reporting.sweep_conclusions import conclusions, question
+from mvest.reporting.sweep_families import covariance_lines, discrepancies, noise_groups
+from mvest.reporting.sweep_rows import runs_of
 from mvest.reporting.sweep_tables import failure_rows, summary, table_note
 from tests.reporting.synthetic_sweeps import (
     ALL,
@@ -12,11 +14,14 @@ from tests.reporting.synthetic_sweeps import (
     all_failed,
     empty,
     failed_run,
+    filter_conditions,
     filters,
     initial_guess,
     job,
     run,
     sweep,
+    told_noise,
+    truths,
 )
 
 
@@ -68,8 +73,8 @@ def test_without_noise_nothing_is_judged() -> None:
 def test_noise_conclusions_follow_from_the_numbers() -> None:
     said = conclusions(noisy())
     assert "in 3 of 4 combinations" in said[0]
-    assert "largest ratio is 2.24 (correlated noise of 0.5 mm, anterior)" in said[0]
-    assert "smallest coverage is 50 % (correlated noise of 0.5 mm, anterior)" in said[1]
+    assert "largest ratio is 2.24 (correlated, 0.5 mm; anterior)" in said[0]
+    assert "smallest coverage is 50 % (correlated, 0.5 mm; anterior)" in said[1]
     assert said[-1] == "2 of 10 runs failed: 2 × no."
 
 
@@ -132,10 +137,10 @@ def test_covariance_says_which_matters() -> None:
             estimate = TRUTH * (1 + (error if scale > 1 else 0.01) / 100)
             jobs.append(job(factors, [run(1, estimate, [0.1, std if scale > 1 else 0.1])]))
     said = conclusions(sweep("covariance", jobs))
-    assert "depends most on P0: scaled from 0.1 to 10 times in the paper mode" in said[0]
+    assert "depends most on P0 in the paper mode: from 0.1 to 10" in said[0]
     assert "between 0.01 and 5 %" in said[0]
-    assert said[1].endswith("of R (paper mode).")
-    assert "depends most on R (paper mode): it changes by a factor of 10." in said[2]
+    assert said[1].endswith("of R in the paper mode.")
+    assert "depends most on R in the paper mode: it changes by a factor of 10." in said[2]
 
 
 def test_filters_are_compared_and_failures_keep_their_reason() -> None:
@@ -143,7 +148,61 @@ def test_filters_are_compared_and_failures_keep_their_reason() -> None:
     assert "coverage of 95 % E_f.anterior, low [%]" in rows[0]
     assert reading[-1]["failures"] == FAILED["time"]
     assert reading[-1]["E_f.anterior [MPa]"] == "–"
-    assert "fewest forward solves (2)" in conclusions(filters())[1]
+    assert "takes the fewest forward solves: 2, at" in conclusions(filters())[1]
+
+
+def test_values_of_a_covariance_are_followed_with_the_others_kept() -> None:
+    jobs = []
+    for p0, q, error in ((0.1, 0.0, 4.0), (9.0, 0.0, 1.0), (0.1, 1.0, 3.0), (9.0, 1.0, 0.5)):
+        factors = {"filter": "paper", "P0": p0, "Q": q, "R": 0.01}
+        jobs.append(job(factors, [run(1, TRUTH * (1 + error / 100), [0.1, 0.1])], filter="paper"))
+    whole = sweep("covariance", jobs)
+    lines = covariance_lines(runs_of(whole))
+    assert [(line.quantity, line.others) for line in lines] == [
+        ("P0", "Q 0"), ("P0", "Q 1"), ("Q", "P0 0.1"), ("Q", "P0 9")
+    ]  # fmt: skip
+    # Along P0 the error falls by 3 (Q = 0) and 2.5, along Q by 1 and 0.5.
+    assert (
+        "depends most on P0 in the paper mode: from 0.1 to 9, Q 0, the largest error of a modulus "
+        "lies between 1 and 4 %"
+    ) in conclusions(whole)[0]
+    assert summary(whole)[1][0]["setting"] == "P0 0.1, Q 0"
+
+
+def test_noise_of_one_kind_is_parted_by_what_the_filter_is_told() -> None:
+    groups = noise_groups(runs_of(told_noise(2)))
+    assert [(group.label, len(group.runs)) for group in groups] == [
+        ("white, 0.1 mm", 4),
+        ("white, 0.5 mm", 4),
+        ("white, 1 mm", 4),
+        ("correlated over 5 mm, R correlation 0 mm, 0.5 mm", 4),
+        ("correlated over 5 mm, R correlation 5 mm, 0.5 mm", 4),
+        ("white, coaptation hidden, 0.5 mm", 4),
+        ("white, annulus 1 mm off, 0.5 mm", 4),
+    ]
+    rows, _ = summary(told_noise(2))
+    assert [row["noise [mm]"] for row in rows[6:8]] == [0.0, 0.0]
+    # Correlated errors are errors: what they do to the intervals is judged.
+    assert rows[6]["95 % interval covers 90-98 %"] != ""
+
+
+def test_a_truth_is_a_discrepancy_unless_it_is_the_model() -> None:
+    said, named = conclusions(truths()), conclusions(ALL["discrepancy"]())
+    assert said == named
+    jobs = [
+        job({"truth": "finer mesh", "mesh": mesh}, [run(1, TRUTH * (1 + e / 100), [0.1, 0.1])])
+        for mesh, e in (("medium", 2.0), ("fine", 1.0))
+    ]
+    assert list(discrepancies(runs_of(sweep("discrepancy", jobs)))) == [
+        "finer mesh, medium", "finer mesh, fine"
+    ]  # fmt: skip
+
+
+def test_filters_are_compared_under_equal_conditions() -> None:
+    said = conclusions(filter_conditions())
+    for condition in ("posterior 3 MPa, noise 0 mm", "6 MPa, noise 0 mm", "3 MPa, noise 0.5 mm"):
+        assert sum(f"{condition}) is that of" in s and "smallest" in s for s in said) == 1
+    assert "“paper, log”" in " ".join(said)
 
 
 def test_an_unknown_kind_is_tabulated_and_says_so() -> None:
