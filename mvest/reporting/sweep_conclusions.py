@@ -182,18 +182,24 @@ def _quantity(name: str) -> str:
 def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
     names = short_names(sweep["parameters"])
     ratios: list[tuple[float, str]] = []
+    shares: list[tuple[float, str]] = []
     verdicts: Counter[str] = Counter()
-    worst_coverage: list[tuple[float, str]] = []
+    above: dict[str, None] = {}
+    outside: dict[str, None] = {}
     groups = [group for group in noise_groups(runs) if group.level]
     for group in groups:  # Without noise there is nothing that an interval should cover.
         for k, name in enumerate(names):
-            where = f"{group.label}; {name}"
             found, covered = accuracy(group.runs, k), coverage(group.runs, k)
+            where = f"{group.label}; {name}"
             if np.isfinite(found.ratio):
                 ratios.append((found.ratio, where))
+                if found.ratio > BOUND_FACTOR:
+                    above[f"“{group.label}”"] = None
             if covered.n:
+                shares.append((covered.share, where))
                 verdicts[verdict(covered)] += 1
-                worst_coverage.append((covered.share, where))
+                if verdict(covered) == "no":
+                    outside[f"“{group.label}”"] = None
     sentences = []
     if ratios:
         near = sum(ratio <= BOUND_FACTOR for ratio, _ in ratios)
@@ -203,15 +209,19 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
             f"{near} of {len(ratios)} combinations of noise, level and parameter; the largest "
             f"ratio is {number(largest[0])} ({largest[1]})."
         )
-    if worst_coverage:
+        if above:
+            sentences.append(f"It is above that for {_listed(list(above))}.")
+    if shares:
         low, high = COVERAGE_RANGE
-        least = min(worst_coverage)
+        least = min(shares)
         sentences.append(
             f"The nominal 95 % interval covers the truth in {100 * low:.0f}–{100 * high:.0f} % of "
-            f"the runs in {verdicts['yes']} of {len(worst_coverage)} combinations, in "
-            f"{verdicts['no']} it does not, in {verdicts['too few runs to tell']} there are too "
-            f"few runs to tell; the smallest coverage is {100 * least[0]:.0f} % ({least[1]})."
+            f"the runs in {verdicts['yes']} of {len(shares)} combinations, in {verdicts['no']} it "
+            f"does not, in {verdicts['too few runs to tell']} there are too few runs to tell; the "
+            f"smallest coverage is {100 * least[0]:.0f} % ({least[1]})."
         )
+        if outside:
+            sentences.append(f"It does not for {_listed(list(outside))}.")
     strongest = {group.kind: group for group in groups if converged(group.runs)}
     for group in strongest.values():
         errors = [

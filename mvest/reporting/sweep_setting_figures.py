@@ -214,7 +214,7 @@ def _condition(
         _filter_row(errors, covered, solves, y, filters[name], parameters)
     errors.set_xscale("log")
     log_axis(errors.xaxis)
-    errors.set_title(condition or "error", fontsize=TEXT, loc="left" if condition else "center")
+    errors.set_title(condition, fontsize=TEXT, loc="left")
     for one in axes:
         one.set_yticks(range(len(order)), order if one is errors else [""] * len(order))
         one.set_ylim(-0.6, len(order) - 0.4)

@@ -260,7 +260,7 @@ def _noise_reading(own: str, common: str, found: Accuracy) -> Reading:
 
 
 def _share(found: Coverage) -> str:
-    if not found.n:
+    if found.n < 2:
         return MISSING
     return f"{100 * found.share:.0f} ({100 * found.low:.0f} to {100 * found.high:.0f})"
 

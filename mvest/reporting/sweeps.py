@@ -71,8 +71,8 @@ PICTURES: dict[str, tuple[Picture, ...]] = {
     "covariance": (
         Picture(
             "",
-            "Error of each modulus and standard deviation that the filter reports, against the "
-            "scale of the covariance.",
+            "Largest error of a modulus and largest standard deviation that the filter reports, "
+            "along each covariance.",
             covariance_figure,
         ),
     ),

@@ -74,7 +74,8 @@ def test_noise_conclusions_follow_from_the_numbers() -> None:
     said = conclusions(noisy())
     assert "in 3 of 4 combinations" in said[0]
     assert "largest ratio is 2.24 (correlated, 0.5 mm; anterior)" in said[0]
-    assert "smallest coverage is 50 % (correlated, 0.5 mm; anterior)" in said[1]
+    assert said[1] == "It is above that for “correlated, 0.5 mm”."
+    assert "smallest coverage is 50 % (correlated, 0.5 mm; anterior)" in said[2]
     assert said[-1] == "2 of 10 runs failed: 2 × no."
 
 
