@@ -11,7 +11,9 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
-from mvest.reporting.publish import regenerate
+from mvest.reporting.publish import RECORDS, regenerate
+from mvest.reporting.report import write_report
+from mvest.reporting.sweeps import read_sweeps, write_sweep
 
 __all__ = ["main"]
 
@@ -31,11 +33,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         results = Path(given[0] if given else "results")
-        written = regenerate(results)
+        sweeps = read_sweeps(results)
+        # A folder that holds sweeps alone is complete; an empty one says what to run.
+        single = (results / RECORDS).is_dir() or not sweeps
+        written = regenerate(results) if single else []
         for name, write in OTHER_TABLES.items():
             record = results / f"{name}.json"
             if record.is_file():
                 written += write(results, json.loads(record.read_text(encoding="utf-8")))
+        for sweep in sweeps:
+            written += write_sweep(results, sweep)
+        written.append(write_report(results))
         for path in written:
             print(path)
     except MvestError as error:

@@ -58,7 +58,9 @@ IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
     "hydra-joblib-launcher": ("hydra_plugins",),
     "hydra-submitit-launcher": ("hydra_plugins",),
+    "markdown-it-py": ("markdown_it",),
     "matplotlib": ("matplotlib", "mpl_toolkits"),
+    "pillow": ("PIL",),
     "pynrrd": ("nrrd",),
     "simpleitk": ("SimpleITK",),
 }

@@ -19,7 +19,7 @@ from mvest.errors import InputError
 from mvest.reporting.files import provenance_line, write_with
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["iterates_figure", "save_figure", "valve_figure"]
+__all__ = ["iterates_figure", "save_figure", "save_figure_with", "valve_figure"]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
@@ -117,7 +117,17 @@ def save_figure(base: Path, figure: Figure, record: Mapping[str, Any]) -> list[P
     InputError
         If a file cannot be written.
     """
-    line = provenance_line(record)
+    return save_figure_with(base, figure, provenance_line(record))
+
+
+def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
+    """Write ``base.png`` and ``base.pdf`` with one line in print and in their metadata.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
     note = figure.supxlabel(line, fontsize=5, color="grey", ha="center")
     # Without dates, so that the same result gives the same file.
     metadata = {".png": {"Description": line}, ".pdf": {"Subject": line, "CreationDate": None}}

@@ -16,7 +16,7 @@ from mvest.provenance import write_json
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 from mvest.reporting.tables import write_tables
 
-__all__ = ["publish", "read_record", "read_records", "regenerate"]
+__all__ = ["RECORDS", "publish", "read_record", "read_records", "regenerate"]
 
 RECORDS = "records"
 """Folder of the kept records within the results."""

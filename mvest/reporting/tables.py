@@ -6,7 +6,6 @@ columns that name their unit; Markdown and LaTeX hold the same, rounded for read
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,11 @@ from typing import Any
 import pandas as pd
 
 from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std
 
 __all__ = ["frame", "readable", "text_table", "write_tables"]
 
 Record = Mapping[str, Any]
-
-MISSING = "–"
 
 
 def frame(records: Sequence[Record]) -> pd.DataFrame:
@@ -91,14 +89,14 @@ def readable(records: Sequence[Record]) -> pd.DataFrame:
         text: dict[str, str] = {"run": str(row["run"])}
         for name in records[0]["parameters"]:
             unit = _unit(name)
-            text[f"{name}{unit}"] = _with_std(
+            text[f"{name}{unit}"] = with_std(
                 row[f"estimate {name}{unit}"], row.get(f"std {name}{unit}")
             )
-            text[f"error {name} [%]"] = _number(row[f"error {name} [%]"])
-        text["error of all moduli [%]"] = _with_std(
+            text[f"error {name} [%]"] = number(row[f"error {name} [%]"])
+        text["error of all moduli [%]"] = with_std(
             row["moduli error mean [%]"], row["moduli error SD [%]"]
         )
-        text["distance [mm]"] = _with_std(row["distance mean [mm]"], row["distance SD [mm]"])
+        text["distance [mm]"] = with_std(row["distance mean [mm]"], row["distance SD [mm]"])
         text["element, cells"] = (
             MISSING if row["source"] == "paper" else f"{row['element']}, {row['cells']}"
         )
@@ -129,7 +127,8 @@ def write_tables(folder: Path, name: str, records: Sequence[Record]) -> list[Pat
     reading = readable(records)
     csv = "".join(f"# {line}\n" for line in lines) + frame(records).to_csv(index=False)
     notes = "\n".join(f"<sub>{line}</sub>  " for line in lines)
-    markdown = f"# {records[0]['title']}\n\n{_markdown(reading)}\n\n{_truth(records)}\n\n{notes}\n"
+    table = markdown_rows(_plain(reading))
+    markdown = f"# {records[0]['title']}\n\n{table}\n\n{_truth(records)}\n\n{notes}\n"
     tex = "".join(f"% {line}\n" for line in lines) + _latex(reading)
     return [
         write_text(folder / f"{name}.csv", csv),
@@ -140,8 +139,8 @@ def write_tables(folder: Path, name: str, records: Sequence[Record]) -> list[Pat
 
 def _truth(records: Sequence[Record]) -> str:
     first = records[0]
-    values = "/".join(_number(value) for value in first["truth"] or [])
-    start = "/".join(_number(value) for value in first["initial"])
+    values = "/".join(number(value) for value in first["truth"] or [])
+    start = "/".join(number(value) for value in first["initial"])
     return (
         f"Truth {values}, start {start} for {', '.join(first['parameters'])}. Estimates are given "
         f"with the filter's standard deviation, errors without sign; errors of all moduli and "
@@ -149,17 +148,15 @@ def _truth(records: Sequence[Record]) -> str:
     )
 
 
-def _markdown(table: pd.DataFrame) -> str:
-    header = [str(column) for column in table.columns]
-    rows = [header, ["---"] * len(header), *table.to_numpy().tolist()]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+def _plain(table: pd.DataFrame) -> list[dict[str, str]]:
+    return [dict(zip(table.columns, row, strict=True)) for row in table.to_numpy().tolist()]
 
 
 def _latex(table: pd.DataFrame) -> str:
     """A booktabs table, transposed: quantities are rows, so that it fits a page."""
-    runs = [_tex(text) for text in table["run"]]
+    runs = [latex_text(text) for text in table["run"]]
     body = [
-        " & ".join([_tex(str(name)), *(_tex(text) for text in table[name])]) + r" \\"
+        " & ".join([latex_text(str(name)), *(latex_text(text) for text in table[name])]) + r" \\"
         for name in table.columns[1:]
     ]
     return "\n".join(
@@ -176,35 +173,9 @@ def _latex(table: pd.DataFrame) -> str:
     )
 
 
-def _tex(text: str) -> str:
-    for plain, special in (
-        ("\\", r"\textbackslash{}"), ("%", r"\%"), ("_", r"\_"), ("&", r"\&"), ("#", r"\#"),
-        ("±", r"$\pm$"), ("–", "--"), ("×", r"$\times$"),
-    ):  # fmt: skip
-        text = text.replace(plain, special)
-    return text
-
-
 def _unit(parameter: str) -> str:
     return " [MPa]" if parameter.startswith("E_f.") else ""
 
 
 def _at(values: Sequence[float] | None, k: int) -> float | None:
     return None if values is None or k >= len(values) else values[k]
-
-
-def _absent(value: Any) -> bool:
-    return value is None or (isinstance(value, float) and math.isnan(value))
-
-
-def _number(value: Any, digits: int = 3) -> str:
-    """Significant digits, but never fewer than the whole part has."""
-    if _absent(value):
-        return MISSING
-    if value != 0 and not 1e-3 <= abs(value) < 1e4:
-        return f"{value:.1e}"
-    return f"{value:.{digits}g}" if abs(value) < 100 else f"{value:.0f}"
-
-
-def _with_std(value: Any, std: Any) -> str:
-    return _number(value) if _absent(std) else f"{_number(value)} ± {_number(std, 2)}"

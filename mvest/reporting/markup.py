@@ -1,0 +1,114 @@
+"""Text of tables for readers: Markdown and LaTeX, with every character shown as itself.
+
+Names of runs and reasons of failures are whatever a user typed or a library said, so nothing of
+them may act as markup.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+__all__ = [
+    "MISSING",
+    "latex_rows",
+    "latex_text",
+    "markdown_rows",
+    "markdown_text",
+    "number",
+    "with_std",
+]
+
+MISSING = "–"
+
+LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "{": r"\{",
+        "}": r"\}",
+        "$": r"\$",
+        "%": r"\%",
+        "_": r"\_",
+        "&": r"\&",
+        "#": r"\#",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "±": r"$\pm$",
+        "–": "--",
+        "×": r"$\times$",
+        "≤": r"$\leq$",
+        "≥": r"$\geq$",
+        "²": r"$^2$",
+        "\n": " ",
+        "\r": " ",
+    }
+)
+
+
+def latex_text(text: str) -> str:
+    r"""Text that LaTeX prints as it stands: ``E_f`` as ``E\_f``, ± in its own way."""
+    return text.translate(LATEX)
+
+
+def markdown_text(text: str) -> str:
+    """Text in a cell of a Markdown table: no cell ends early, no tag, link or emphasis begins."""
+    flat = " ".join(text.split())
+    escaped = flat.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    # Units in brackets and underscores within words mean nothing in Markdown and stay legible.
+    return re.sub(r"([\\`*|~$]|(?<!\w)_|_(?!\w)|(?<=\])[(\[:])", r"\\\1", escaped)
+
+
+def markdown_rows(rows: Sequence[Mapping[str, str]]) -> str:
+    """A Markdown table; every row has the keys of the first, in its order."""
+    header = [markdown_text(name) for name in rows[0]]
+    body = [[markdown_text(text) for text in row.values()] for row in rows]
+    return "\n".join(
+        "| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *body)
+    )
+
+
+def latex_rows(rows: Sequence[Mapping[str, str]]) -> str:
+    r"""A booktabs table (``\usepackage{booktabs}``): first column left, the others right."""
+    header = [latex_text(name) for name in rows[0]]
+    body = [" & ".join(_cell(text) for text in row.values()) + r" \\" for row in rows]
+    return "\n".join(
+        [
+            r"\begin{tabular}{l" + "r" * (len(header) - 1) + "}",
+            r"\toprule",
+            " & ".join(header) + r" \\",
+            r"\midrule",
+            *body,
+            r"\bottomrule",
+            r"\end{tabular}",
+            "",
+        ]
+    )
+
+
+def _cell(text: str) -> str:
+    """Text in which numbers have a true minus and powers of ten."""
+    signed = re.sub(r"(?<![\w$.-])-(?=\d)", "$-$", latex_text(text))
+    return re.sub(
+        r"(?<![\w.])(\d(?:\.\d+)?)e([+-]\d+)(?!\w)",
+        lambda found: rf"${found[1]}\times10^{{{int(found[2])}}}$",
+        signed,
+    )
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Significant digits, but never fewer than the whole part has; a dash for what is missing."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return MISSING
+    if value != 0 and not 1e-3 <= abs(value) < 1e4:
+        return f"{value:.1e}"
+    return f"{value:.{digits}g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def with_std(value: Any, std: Any) -> str:
+    """``value ± std``, or the value alone where there is no standard deviation."""
+    return number(value) if number(std) == MISSING else f"{number(value)} ± {number(std, 2)}"

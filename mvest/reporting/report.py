@@ -1,0 +1,222 @@
+"""``report.html``: all published sweeps and the other results on one page that needs nothing else.
+
+Pictures are embedded, there is no script, and nothing is loaded from anywhere. Text that came from
+runs is escaped by the template; Markdown is rendered with raw HTML switched off.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markdown_it import MarkdownIt
+from markupsafe import Markup
+from PIL import Image
+
+from mvest.errors import InputError
+from mvest.reporting.files import write_text
+from mvest.reporting.sweep_conclusions import conclusions, question
+from mvest.reporting.sweep_rows import (
+    Sweep,
+    factor_label,
+    factor_names,
+    factor_text,
+    runs_of,
+    sweep_line,
+)
+from mvest.reporting.sweep_tables import failure_rows, summary, table_note
+from mvest.reporting.sweeps import COST, pictures_of, read_sweeps
+
+__all__ = ["REPORT", "write_report"]
+
+REPORT = "report.html"
+TEMPLATES = Path(__file__).parent / "templates"
+
+WIDEST_PIXELS = 1500
+"""Of an embedded picture: two for each pixel of the page's column."""
+WEBP_QUALITY = 85
+"""Thin lines and small print stay clean from about 80 on."""
+
+MOST_FAILURES = 200
+"""Listed one by one on the page; the tidy table has all."""
+
+ORDER = ("initial_guess", "noise", "covariance", "filter", "discrepancy")
+"""Sweeps of these kinds come first, in this order."""
+
+NOT_SETTINGS = ("paths", "hydra", "sweep", "title", "paper", "parameters", "name", "row", "table",
+                "publish", "force", "dry_run", "time_limit_s", "factors")  # fmt: skip
+"""Parts of a configuration that say where and how it runs or what it is called."""
+
+OTHERS = (
+    ("table1", "Table 1", ("table1", "table1_valve")),
+    ("mesh_independence", "Independence of the mesh", ()),
+    ("strip", "Clamped strips", ()),
+    ("gate", "One closed state", ()),
+    ("closure", "A closing valve", ("closure",)),
+    ("donor", "A recorded donor valve", ("donor",)),
+    ("benchmark", "How fast", ("benchmark",)),
+)
+"""Other results: Markdown file, title where it has none, and the pictures beside it."""
+CAPTIONS = {
+    "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
+    "table1_valve": "The fitted valve, open and closed. Simulated.",
+    "closure": "A valve closing. Simulated.",
+    "donor": "A recorded donor valve and closures of its model.",
+    "benchmark": "Where the time goes.",
+}
+
+
+def write_report(results: Path) -> Path:
+    """Write ``report.html`` from what ``results`` holds; returns its path.
+
+    Pictures are those that `mvest.reporting.sweeps.write_sweep` and the other studies left there;
+    one that does not exist is left out. Equal files give an equal page.
+
+    Raises
+    ------
+    InputError
+        If a published sweep is damaged, a picture cannot be read or the page cannot be written.
+    """
+    sweeps = sorted(read_sweeps(results), key=_place)
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+    )
+    page = environment.get_template("report.html.jinja").render(
+        sweeps=[_sweep_section(results, sweep) for sweep in sweeps],
+        others=[
+            _other_section(results, name, title, pictures)
+            for name, title, pictures in OTHERS
+            if (results / f"{name}.md").is_file()
+        ],
+    )
+    return write_text(results / REPORT, page)
+
+
+def _place(sweep: Sweep) -> tuple[int, str]:
+    kind = sweep["sweep"]["kind"]
+    return (ORDER.index(kind) if kind in ORDER else len(ORDER)), str(sweep["sweep"]["name"])
+
+
+def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
+    base = f"sweep_{sweep['sweep']['name']}"
+    found = [
+        (picture, _embedded(path, picture.caption))
+        for picture in pictures_of(sweep)
+        if (path := results / f"{base}{picture.ending}.png").is_file()
+    ]
+    failures = failure_rows(sweep)
+    endings = (".csv", "_table.csv", "_table.md", "_table.tex", "_cost.csv")
+    return {
+        "anchor": base,
+        "title": str(sweep["title"]),
+        "question": question(sweep),
+        "conclusions": conclusions(sweep),
+        "pictures": [shown for picture, shown in found if picture is not COST],
+        "cost": [shown for picture, shown in found if picture is COST],
+        "table": summary(sweep)[1],
+        "has_paper": bool(sweep.get("paper")),
+        "note": table_note(sweep),
+        "failures": failures[:MOST_FAILURES],
+        "more_failures": max(len(failures) - MOST_FAILURES, 0),
+        "failed": sum(not run.converged for run in runs_of(sweep)),
+        "runs": len(runs_of(sweep)),
+        "factors": _factors(sweep),
+        "settings": _settings(sweep.get("settings") or {}),
+        "provenance": sweep_line(sweep),
+        "cache": _cache(sweep),
+        "files": [
+            f"{base}{ending}" for ending in endings if (results / f"{base}{ending}").is_file()
+        ],
+    }
+
+
+def _factors(sweep: Sweep) -> list[dict[str, str]]:
+    rows = []
+    for name in factor_names(sweep):
+        values = dict.fromkeys(factor_text(job["factors"].get(name)) for job in sweep["jobs"])
+        rows.append({"factor": factor_label(name), "values": ", ".join(values)})
+    seeds = {run.seed for run in runs_of(sweep) if run.seed is not None}
+    if len(seeds) > 1:
+        rows.append({"factor": "seed", "values": f"{min(seeds)} to {max(seeds)}"})
+    return rows
+
+
+def _settings(settings: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Nested settings as rows of dotted names; lists stay in one cell."""
+    rows: list[dict[str, str]] = []
+
+    def walk(value: Any, name: str) -> None:
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                walk(inner, f"{name}.{key}" if name else str(key))
+        else:
+            rows.append({"setting": name, "value": _setting_text(value)})
+
+    walk({key: value for key, value in settings.items() if key not in NOT_SETTINGS}, "")
+    return rows
+
+
+def _setting_text(value: Any) -> str:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "[" + ", ".join(_setting_text(item) for item in value) + "]"
+    return factor_text(value)
+
+
+def _cache(sweep: Sweep) -> str:
+    """How often a simulated truth was taken from the store."""
+    hits, misses = sweep.get("truth_hits"), sweep.get("truth_misses")
+    if hits is None or misses is None or not hits + misses:
+        return ""
+    return f"Of {hits + misses} requests for a simulated truth, {hits} were served from the store."
+
+
+def _other_section(results: Path, name: str, title: str, pictures: Sequence[str]) -> dict[str, Any]:
+    body = (results / f"{name}.md").read_text(encoding="utf-8")
+    heading, _, rest = body.partition("\n")
+    if heading.startswith("# "):
+        title, body = heading.removeprefix("# "), rest
+    # The one tag that these files use for their last lines; any other is shown as text.
+    body = re.sub(r"</?sub>", "", body)
+    # Below the section's own heading.
+    body = re.sub(r"^(#+ )", r"#\1", body, flags=re.MULTILINE)
+    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(body)
+    html = html.replace("<table>", '<div class="scroll tall"><table>')
+    html = html.replace("</table>", "</table></div>")
+    found = [(results / f"{picture}.png", CAPTIONS[picture]) for picture in pictures]
+    return {
+        "anchor": name,
+        "title": title,
+        "body": Markup(html),
+        "pictures": [_embedded(path, caption) for path, caption in found if path.is_file()],
+    }
+
+
+def _embedded(path: Path, caption: str) -> dict[str, Any]:
+    """A picture within the page, no larger than it can be seen there."""
+    try:
+        with Image.open(path) as stored:
+            image = Image.new("RGB", stored.size, "white")
+            full = stored.convert("RGBA")
+            image.paste(full, mask=full)
+    except OSError as error:
+        raise InputError(f"cannot read the picture {path}: {error}") from error
+    if image.width > WIDEST_PIXELS:
+        height = round(image.height * WIDEST_PIXELS / image.width)
+        image = image.resize((WIDEST_PIXELS, height), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    image.save(stream, "WEBP", quality=WEBP_QUALITY, method=6)
+    data = base64.b64encode(stream.getvalue()).decode("ascii")
+    return {
+        "source": f"data:image/webp;base64,{data}",
+        "caption": caption,
+        "width": image.width,
+        "height": image.height,
+    }
