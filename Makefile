@@ -44,14 +44,18 @@ test-all: $(INSTALLED) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES)
 
 BENCH := $(BIN)/python -m pytest tests/benchmark -p no:xdist -o python_files='bench_*.py'
-BENCH_OF ?= not 25k
-bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (BENCH_OF=25k: the largest valves, an hour)
+BENCH_OF ?= not tet4-25k
+bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (BENCH_OF=tet4-25k: the largest of tetrahedra, an hour)
 	@mkdir -p outputs
-	$(BENCH) -k "$(BENCH_OF)" --benchmark-json=outputs/benchmark.json
-	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "3k and (test_closure or test_factorisation)" \
+	$(BENCH) --benchmark-timer=time.process_time -k "not batch and ($(BENCH_OF))" \
+		--benchmark-json=outputs/benchmark.json
+	$(BENCH) -k "batch" --benchmark-json=outputs/benchmark_batch.json
+	MKL_NUM_THREADS=2 OMP_NUM_THREADS=2 $(BENCH) -k "25k and test_factorisation" \
 		--benchmark-json=outputs/benchmark_2_threads.json
 	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
-	$(BIN)/python -m experiments.benchmark outputs/benchmark.json outputs/benchmark_2_threads.json outputs/peers.json
+	$(BIN)/python -m tests.benchmark.profile outputs/profile.json
+	$(BIN)/python -m experiments.benchmark outputs/benchmark.json outputs/benchmark_batch.json \
+		outputs/benchmark_2_threads.json outputs/peers.json outputs/profile.json
 
 lint: $(INSTALLED) ## style and types
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
-"""Table and plot of a benchmark: ``python -m experiments.benchmark RUN.json [PEERS.json]``.
+"""Table and plot of a benchmark: ``python -m experiments.benchmark REPORT.json ...``.
 
-Reads what ``make bench`` has measured and writes ``benchmark.csv``, ``.md`` and ``.png`` to
+Reads what ``make bench`` has measured (kernels and closures, other libraries, the profile of a
+closure) and writes ``benchmark.csv``, ``.md`` and ``.png`` to
 ``results/``. Seconds depend on the machine and on what else it does; the column to compare is the
 time over a calibration kernel that ran in the same process, and its ratio to the stored baseline,
 ``results/benchmark_baseline.csv`` (copy ``benchmark.csv`` there to set a new one).
@@ -158,12 +159,14 @@ def main(arguments: Sequence[str] | None = None, results: Path = Path("results")
         parts = [
             "# Benchmark",
             "Median seconds of the rounds in one process, and the same over a calibration kernel "
-            "of that process. A closure starts from the open valve and ends in equilibrium; "
-            "`parameters` counts the derivatives that it carries.",
+            "of that process: seconds of the CPU with one thread, of the clock with two and for "
+            "batches. A closure starts from the open valve and ends in equilibrium; `parameters` "
+            "counts the derivatives that it carries.",
             _readable(table),
             "## Order of the time in the number of nodes",
             _readable(fitted_orders(table)),
         ]
+        parts += [_profile(entry) for c in contents for entry in c.get("profile", [])]
         if peers:
             parts += ["## The same pressurised sheet elsewhere", _readable(pd.DataFrame(peers))]
         written = [
@@ -179,6 +182,39 @@ def main(arguments: Sequence[str] | None = None, results: Path = Path("results")
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _profile(entry: Mapping[str, Any]) -> str:
+    """Where the time of a closure went, and what its largest parts reached of the machine."""
+    total = entry["seconds"]
+    parts = pd.DataFrame(
+        [
+            {"part": name, "seconds": seconds, "share [%]": 100.0 * seconds / total}
+            for name, seconds in sorted(entry["parts"].items(), key=lambda item: -item[1])
+        ]
+    )
+    bounds = pd.DataFrame(
+        [
+            {
+                "what": row["what"],
+                "reached": row["reached"],
+                "of what this machine can do": row["machine"],
+                "unit": row["bound by"],
+            }
+            for row in entry["bounds"]
+        ]
+    )
+    return "\n\n".join(
+        [
+            f"## Where the time of a guided closure goes: {entry['nodes']} nodes",
+            f"{total:.1f} s of the CPU with two derivatives, guides included; "
+            f"{entry['iterations on the finest mesh']} Newton iterations on the finest mesh.",
+            _readable(parts),
+            "What bounds its parts, one thread (dense products for arithmetic, a long vector sum "
+            "for memory):",
+            _readable(bounds),
+        ]
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -61,9 +61,9 @@ def kalman_update(
         (W S Wᵀ)^(-1/2) = I + U diag(1 / √(1 + s²) − 1) Uᵀ
                         = I − A V diag(1 / (√(1 + s²) (1 + √(1 + s²)))) (A V)ᵀ
 
-    at a cost of n p² and a memory of n p. U is not needed, so that s and V come from the
-    triangular factor of A, which is found block by block (Demmel, Grigori, Hoemmen and Langou
-    2012, SIAM J. Sci. Comput. 34:A206). P⁺ is a product X Xᵀ, hence symmetric positive
+    at a cost of n p² and a memory of n p. U is not needed, so that s and V come from a triangular
+    factor of A: that of W H times L. It is found block by block (Demmel, Grigori, Hoemmen and
+    Langou 2012, SIAM J. Sci. Comput. 34:A206). P⁺ is a product X Xᵀ, hence symmetric positive
     semi-definite whatever the rounding, and Hᵀ R⁻¹ H, whose condition number is the square of
     that of W H, is never formed. P may be singular.
 
@@ -90,18 +90,18 @@ def kalman_update(
         )
     m, L = prior.mean, prior.factor
     e = noise.whiten(innovation)
-    A = noise.whiten(H) @ L
+    WH = noise.whiten(H)
     # All p right singular vectors are needed, also where fewer observations than parameters exist.
-    _, values, Vt = np.linalg.svd(_triangular_factor(A), full_matrices=True)
+    _, values, Vt = np.linalg.svd(_triangular_factor(WH) @ L, full_matrices=True)
     s = np.zeros(p)
     s[: values.size] = values
     root = np.sqrt(1.0 + s**2)
 
-    AV = Vt @ (A.T @ e)
+    AV = Vt @ (L.T @ (WH.T @ e))
     X = (L @ Vt.T) / root
     posterior = Gaussian(m + L @ (Vt.T @ (AV / root**2)), X @ X.T)
 
-    standardised = e - A @ (Vt.T @ (AV / (root * (1.0 + root))))
+    standardised = e - WH @ (L @ (Vt.T @ (AV / (root * (1.0 + root)))))
     nis = float(standardised @ standardised)
     log_det_S = noise.log_determinant + float(np.sum(np.log1p(s**2)))
     log_likelihood = -0.5 * (n * np.log(2.0 * np.pi) + log_det_S + nis)

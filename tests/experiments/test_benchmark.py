@@ -60,14 +60,21 @@ def test_orders_are_fitted_over_the_sizes():
 
 
 def test_the_report_is_written_with_the_peers(tmp_path):
-    run, peers = tmp_path / "run.json", tmp_path / "peers.json"
+    run, peers, profile = (tmp_path / f"{name}.json" for name in ("run", "peers", "profile"))
     run.write_text(json.dumps(report()))
     rows = [{"library": "other", "nodes": 3362, "seconds_per_iteration": 0.1}]
     peers.write_text(json.dumps({"rows": rows}))
-    assert main([str(run), str(peers)], tmp_path) == 0
+    bound = {"what": "factorisation", "bound by": "GFlop/s", "reached": 12.0, "machine": 50.0}
+    parts = {"solves": 1.0, "factorisation": 3.0}
+    entry = {"nodes": 9, "seconds": 4.0, "iterations on the finest mesh": 5, "parts": parts}
+    profile.write_text(json.dumps({"profile": [entry | {"bounds": [bound]}]}))
+    assert main([str(run), str(peers), str(profile)], tmp_path) == 0
     text = (tmp_path / "benchmark.md").read_text()
     assert "closure" in text
     assert "| other | 3362 | 0.1 |" in text
+    # The largest part first, with its share.
+    assert "| factorisation | 3 | 75 |\n| solves | 1 | 25 |" in text
+    assert "| factorisation | 12 | 50 | GFlop/s |" in text
     assert (tmp_path / "benchmark.csv").is_file()
     assert (tmp_path / "benchmark.png").stat().st_size > 10_000
 

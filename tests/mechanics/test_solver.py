@@ -74,7 +74,7 @@ def test_blocks_of_zeros_may_come_to_life(tangent, name):
 @pytest.mark.parametrize("name", available())
 @pytest.mark.parametrize("share", [3e-6, 3e-3])
 def test_weak_couplings_count_whether_or_not_they_are_in_the_factor(name, share):
-    """Many of them together are strong: a factor without the weaker ones is only half the answer."""
+    """Many of them together are strong; a factor without them is only half the answer."""
     n, rng = 400, np.random.default_rng(1)
     weak = share * rng.normal(size=(n, n, 3, 3))
     dense = (weak + weak.transpose(1, 0, 3, 2)).transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)

@@ -1,0 +1,150 @@
+"""Where the time of a guided closure goes, and what bounds its parts.
+
+``python -m tests.benchmark.profile OUT.json`` closes the default valve in two sizes under Python's
+profiler, whose cost is small here since a closure makes few calls, and sets the work that the
+largest parts do per second beside what this machine can do: products of dense matrices for
+arithmetic, a long vector sum for memory. CPU seconds of one thread.
+"""
+
+from __future__ import annotations
+
+import cProfile
+import json
+import pstats
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.mechanics.contact import Contact
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.solver import PardisoSolver
+from mvest.mechanics.system import System
+from mvest.model import ClosureModel
+from tests.benchmark.valves import VALUES, Closed, closed, model
+
+SIZES = ("3k", "25k")
+
+PARTS: dict[str, tuple[Callable[..., Any], ...]] = {
+    "factorisation": (PardisoSolver.factorize,),
+    "solves (GMRES, back-substitution)": (PardisoSolver.solve,),
+    "law, enhanced strains": (Solid.evaluate,),
+    "element tangents": (Solid.tangents,),
+    "contact search": (Contact.search,),
+    "contact Hessian": (Contact.add_tangent,),
+    "collision detection": (Contact.largest_step, Contact.intersects),
+    "sparsity pattern": (System._build_pattern,),
+    "assembly, other forces": (System.evaluate,),
+}
+"""Disjoint parts of a closure; the last one is what its function spends outside the others."""
+
+INSIDE = ("law, enhanced strains", "element tangents", "contact Hessian", "sparsity pattern")
+"""Parts that the evaluation of the system calls."""
+
+
+def machine() -> dict[str, float]:
+    """What one thread can do: GFlop/s of dense products, GB/s of a vector sum."""
+    a, v = np.random.default_rng(0).normal(size=(1500, 1500)), np.ones(20_000_000)
+    w = np.empty_like(v)
+    return {
+        "GFlop/s": 2 * 1500**3 / _seconds(lambda: a @ a) / 1e9,
+        "GB/s": 24 * len(v) / _seconds(lambda: np.add(v, w, out=w)) / 1e9,
+    }
+
+
+def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
+    call()
+    taken = []
+    for _ in range(repeats):
+        start = time.process_time()
+        call()
+        taken.append(time.process_time() - start)
+    return float(np.median(taken))
+
+
+def shares(valve: ClosureModel) -> dict[str, Any]:
+    """Seconds of each part of one closure, on the finest mesh and on its guides."""
+    valve.close(1.01 * VALUES)  # builds the mechanics, which later closures find there
+    profiler = cProfile.Profile(time.process_time)
+    start = time.process_time()
+    profiler.enable()
+    result = valve.close(VALUES).simulation
+    profiler.disable()
+    total = time.process_time() - start
+    assert result.converged, result.reason.value
+    stats = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
+
+    def spent(functions: tuple[Callable[..., Any], ...]) -> float:
+        codes = [f.__code__ for f in functions]
+        keys = [(c.co_filename, c.co_firstlineno, c.co_name) for c in codes]
+        return sum(stats[key][3] for key in keys if key in stats)
+
+    seconds = {name: spent(functions) for name, functions in PARTS.items()}
+    seconds["assembly, other forces"] -= sum(seconds[name] for name in INSIDE)
+    seconds["rest"] = total - sum(seconds.values())
+    iterations = sum(len(r.residuals) - 1 for r in result.records)
+    return {"seconds": total, "iterations on the finest mesh": iterations, "parts": seconds}
+
+
+def bounds(case: Closed) -> list[dict[str, Any]]:
+    """Work per second of factorisation, matrix-vector product and element tangents."""
+    system = case.system
+    state = system.solid.evaluate(case.x, case.strain, 0.0)
+    at = (case.x, case.loads, case.pairs, case.strain, 0.0)
+    blocks = system.evaluate(*at, tangent=True).blocks
+    assert blocks is not None
+    matrix = system.matrix(blocks, 0.0)
+    solver = PardisoSolver()
+    solver._solver.set_iparm(19, -1)  # count the operations
+    solver.factorize(matrix)
+    # PARDISO counts millions of operations on blocks, 3 x 3 x 3 each.
+    operations = 27e6 * solver._solver.get_iparm(19)
+    v = np.random.default_rng(0).normal(size=matrix.shape[0])
+    _, points = system.solid.volumes.shape
+    width = 3 * system.solid.mesh.elements.shape[1]
+    # B^T C B of a symmetric result, B of 6 rows; the geometric part is small beside it.
+    per_point = 2 * (6 * 6 * width + 6 * width * (width + 1) // 2)
+    return [
+        {
+            "what": "factorisation",
+            "bound by": "GFlop/s",
+            "reached": operations / _seconds(lambda: solver.factorize(matrix), 3) / 1e9,
+        },
+        {
+            "what": "product of matrix and vector",
+            "bound by": "GB/s",
+            "reached": (matrix.data.nbytes + matrix.indices.nbytes)
+            / _seconds(lambda: matrix @ v)
+            / 1e9,
+        },
+        {
+            "what": "element tangents",
+            "bound by": "GFlop/s",
+            "reached": per_point
+            * points
+            * len(system.solid.mesh.elements)
+            / _seconds(lambda: system.solid.tangents(state))
+            / 1e9,
+        },
+    ]
+
+
+def main(arguments: list[str]) -> None:
+    """Measure, and write the record where told."""
+    limits = machine()
+    found = []
+    for size in SIZES:
+        case = closed("hex18", size)  # compiles, and builds what the bounds are measured on
+        valve = model("hex18", size).fresh()
+        entry = {"size": size, "nodes": case.nodes, **shares(valve), "bounds": bounds(case)}
+        for row in entry["bounds"]:
+            row["machine"] = limits[row["bound by"]]
+        found.append(entry)
+    Path(arguments[0]).write_text(json.dumps({"profile": found}, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
