@@ -19,7 +19,7 @@ from mvest.valve.anatomy import LeafletSurface, Valve
 from mvest.valve.annulus import annulus_plane
 from mvest.valve.measurements import measure_closure
 
-__all__ = ["make_record", "measure_frames", "write_fields"]
+__all__ = ["make_record", "measure_frames", "repeat_entry", "write_fields"]
 
 SCHEMA = 1
 """Version of the layout of ``result.json``."""
@@ -97,6 +97,31 @@ def make_record(
             "seed": config["seed"],
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
+    }
+
+
+def repeat_entry(seed: int, result: StudyResult) -> dict[str, Any]:
+    """Plain data of the estimate from one seed; lists are in the order of the parameters."""
+    filtered = result.filtered
+    innovation, bound = _innovation(result), _identifiability(result)
+    return {
+        "seed": seed,
+        "status": "converged" if result.converged else "failed",
+        "reason": result.reason,
+        "detail": result.detail,
+        "estimate": _list(result.estimate),
+        "std": _list(result.std),
+        "relative_error": _list(result.relative_error),
+        "bound": None if bound is None else bound["cramer_rao_std"],
+        "distance_mm": _spread(result.distance),
+        "distance_to_truth_mm": _spread(result.distance_to_truth),
+        "nis": None if innovation is None else innovation["nis"],
+        "nis_band": None if innovation is None else innovation["nis_band"],
+        "iterations": None if filtered is None else filtered.iterations,
+        "forward_solves": None if filtered is None else filtered.forward_solves,
+        "iterates": [] if filtered is None else _list(filtered.iterates),
+        "iterate_std": [] if filtered is None else _list(filtered.iterate_std),
+        "seconds": result.seconds,
     }
 
 
@@ -179,6 +204,10 @@ def _list(values: FloatArray | None) -> list[Any] | None:
 
 def _spread(values: FloatArray | None) -> dict[str, float] | None:
     if values is None:
+        return None
+    # A vertex that is not seen has no distance.
+    values = values[np.isfinite(values)]
+    if not values.size:
         return None
     return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
 

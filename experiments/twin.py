@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,16 @@ import numpy as np
 
 from experiments.build import Twin, build_twin
 from experiments.progress import SolveBar
-from experiments.record import make_record, measure_frames, write_fields
+from experiments.record import make_record, measure_frames, repeat_entry, write_fields
 from mvest.model import ClosureModel
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
-from mvest.study import ObservedFrames, StudyResult, estimate, simulate_observation
+from mvest.study import (
+    ObservedFrames,
+    SharedStart,
+    StudyResult,
+    estimate,
+    simulate_observation,
+)
 
 __all__ = ["run_twin"]
 
@@ -34,11 +41,13 @@ def run_twin(
     twin = build_twin(config)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
-    result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
+    seeds = range(config["seed"], config["seed"] + config["repeats"])
+    results = _estimate_twin(twin, seeds)
+    result = results[0]
     confirmed = _confirm(twin, result) if config["confirm"] else None
     mesh = twin.model.mesh
     closure = None
-    if result.fitted is not None:
+    if config["measure"] and result.fitted is not None:
         thickness = float(twin.valve.surface.thickness.mean())
         reach = twin.model.settings.contact.activation_distance * thickness
         closure = measure_frames(twin.valve, result, reach)
@@ -56,10 +65,13 @@ def run_twin(
         truth_values=twin.truth_values,
         started=started,
     )
+    record["repeats"] = [repeat_entry(s, r) for s, r in zip(seeds, results, strict=True)]
     record["confirmed_mm"] = confirmed
     if confirmed is not None:
         record["forward_solves"] += 1
     files: list[Path] = []
+    if not config["figures"]:
+        return record, files
     if record["iterates"]:
         files += save_figure(folder / "iterates", iterates_figure(record), record)
     if result.fitted is not None:
@@ -69,24 +81,31 @@ def run_twin(
     return record, files
 
 
-def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
+def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
+    """One estimate for each seed; simulation and first closure are common to all."""
     with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
         twin.truth_model.on_step = bar.step
-        data = simulate_observation(
-            twin.source,
-            twin.case.parameters,
-            twin.truth_values,
-            frames=twin.frames,
-            variance=twin.variance,
-            noise_mm=twin.noise_mm,
-            rng=rng,
-        )
-    if data.observation is None:
-        return StudyResult.failed(twin.case, data.reason, 0.0)
-    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES) as bar:
+        truth = twin.source(twin.truth_values)
+    start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
+    case = replace(twin.case, model=SharedStart(twin.model, start))
+    results = []
+    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)) as bar:
         twin.model.on_step = bar.step
-        result = estimate(twin.case, data.observation)
-    return result.against(data.truth)
+        for seed in seeds:
+            data = simulate_observation(
+                lambda m: truth,
+                twin.case.parameters,
+                twin.truth_values,
+                frames=twin.frames,
+                variance=twin.variance,
+                correlation=twin.correlation,
+                errors=twin.errors,
+                rng=np.random.default_rng(seed),
+            )
+            if data.observation is None:
+                return [StudyResult.failed(twin.case, data.reason, 0.0) for _ in seeds]
+            results.append(estimate(case, data.observation).against(data.truth))
+    return results
 
 
 def _confirm(twin: Twin, result: StudyResult) -> float | None:

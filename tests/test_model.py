@@ -14,6 +14,7 @@ from mvest.errors import InputError
 from mvest.mechanics.contact import Contact, ContactSettings
 from mvest.mechanics.steps import NewtonSettings, Reason
 from mvest.model import (
+    ClosedState,
     ClosureModel,
     ClosureProtocol,
     MechanicsSettings,
@@ -68,7 +69,7 @@ def closed():
 
 def continued(model, start, m, sensitivities=False):
     """The equilibrium at ``m`` that is reached from the nodal positions ``start``."""
-    model._closed = start
+    model.restart(ClosedState(np.ones(len(m)), start))
     simulation = model.close(m, sensitivities=sensitivities).simulation
     assert simulation.converged
     # Two frames, the start and the equilibrium: the whole closure was not run again.
@@ -261,7 +262,7 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     # Unless it is not to be repeated: then the failure is the result.
     starts.clear()
     alone = replace(model, repeat=False)
-    alone._closed = first.frames[-1]
+    alone.restart(ClosedState(AT, first.frames[-1]))
     failed = alone.close(AT, sensitivities=False).simulation
     assert len(starts) == 1
     assert failed.reason is Reason.NO_CONVERGENCE
@@ -298,7 +299,7 @@ def test_another_mesh_and_other_settings_make_another_system():
 
 def test_a_prediction_is_the_open_and_the_closed_frame_and_their_derivative(closed):
     model, simulation = closed
-    model._closed = simulation.frames[-1]
+    model.restart(ClosedState(AT, simulation.frames[-1]))
     prediction = model(AT)
     assert prediction.converged
     n = len(model.valve.surface.vertices)

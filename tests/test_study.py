@@ -8,6 +8,7 @@ import pytest
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
 from mvest.model import TissueSettings
+from mvest.observation_errors import WhiteNoise
 from mvest.study import (
     Case,
     Observation,
@@ -52,7 +53,7 @@ def observe(model=None, noise_mm: float = 0.0, seed: int = 1, **more) -> TwinDat
         NAMES,
         TRUTH,
         variance=more.pop("variance", 0.01),
-        noise_mm=noise_mm,
+        errors=(WhiteNoise(noise_mm), *more.pop("errors", ())),
         rng=np.random.default_rng(seed),
         **more,
     )
