@@ -19,7 +19,18 @@ from mvest.valve.template import TemplateParameters
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "register"]
 
-NOT_THE_RESULT = ("hydra", "paths", "tracking")
+NOT_THE_RESULT = (
+    "hydra",
+    "paths",
+    "tracking",
+    "sweep",
+    "factors",
+    "figures",
+    "force",
+    "dry_run",
+    "time_limit_s",
+    "isolate",
+)
 """Parts of a configuration that change no number of the result, left out of its hash."""
 
 
@@ -155,7 +166,17 @@ class Config:
     continuation: bool = True  # later closures start from the last closed state
     guided: bool = False  # the first closure is followed on coarser meshes
     confirm: bool = True  # close the fitted valve anew from the open state
+    measure: bool = True  # orifice, coaptation and passing ball of the fitted valve: seconds
     seed: int = 1
+    figures: bool = True  # draw the run; a sweep need not draw every job
+    force: bool = False  # run again what is done
+    dry_run: bool = False  # only say what would run, and how long it would take
+    time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
+    isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
+    factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
+    # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of
+    # which it is the union; empty for a run by itself.
+    sweep: dict[str, Any] = field(default_factory=dict)
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
