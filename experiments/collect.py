@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
+from itertools import pairwise
 from typing import Any
 
-from experiments.folder import finished_record, read_result
+from experiments.folder import last_record
 from experiments.plan import Plan, PlannedJob
 from experiments.request import model_settings
 from mvest.provenance import config_hash, provenance
@@ -18,9 +18,23 @@ SCHEMA = 1
 """Version of the layout of ``sweep.json``."""
 
 RUN = (
-    ("seed", "status", "reason", "detail", "estimate", "std", "relative_error", "bound")
-    + ("distance_mm", "distance_to_truth_mm", "nis", "nis_band", "iterations", "forward_solves")
-    + ("iterates", "iterate_std", "seconds")
+    "seed",
+    "status",
+    "reason",
+    "detail",
+    "estimate",
+    "std",
+    "relative_error",
+    "bound",
+    "distance_mm",
+    "distance_to_truth_mm",
+    "nis",
+    "nis_band",
+    "iterations",
+    "forward_solves",
+    "iterates",
+    "iterate_std",
+    "seconds",
 )
 """What is kept of each seed of a job."""
 
@@ -87,7 +101,7 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
     """
     computing = {}
     for job in plan.to_run:
-        record = read_result(job.folder, job.config_hash)
+        record = last_record(job.folder, job.config_hash)
         if record is not None and record["status"] == "converged":
             computing[job.config_hash[:16]] = float(
                 record.get("seconds_computing", record["seconds"])
@@ -98,7 +112,7 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
     found = {}
     for ends in processes.values():
         ordered = sorted(ends, key=lambda end: float(end["finished"]))
-        for before, end in zip(ordered, ordered[1:], strict=False):
+        for before, end in pairwise(ordered):
             if end["hash"] in computing:
                 spent = float(end["finished"]) - float(before["finished"])
                 found[str(end["hash"])] = spent - computing[str(end["hash"])]
@@ -110,9 +124,7 @@ def _entry(
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """A job's part of the file, and its record if there is one."""
     values, settings = job.values, job.values["filter"]
-    record = finished_record(job.folder, job.config_hash) or read_result(
-        job.folder, job.config_hash
-    )
+    record = last_record(job.folder, job.config_hash)
     entry = {
         "hash": job.config_hash[:16],
         "row": values["row"],

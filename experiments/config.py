@@ -26,6 +26,7 @@ NOT_THE_RESULT = (
     "sweep",
     "factors",
     "figures",
+    "publish",
     "force",
     "dry_run",
     "time_limit_s",

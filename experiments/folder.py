@@ -24,6 +24,7 @@ __all__ = [
     "clear",
     "finished_record",
     "is_done",
+    "last_record",
     "lock",
     "mark_done",
     "read_result",
@@ -34,6 +35,22 @@ __all__ = [
 
 DONE, RESULT, CONFIG, LOG = "done", "result.json", "config.json", "log.txt"
 """Files of a job: its marker, its record, its configuration, and what it said."""
+
+ABSENT = (
+    "estimate",
+    "std",
+    "relative_error",
+    "moduli_error_percent",
+    "distance_mm",
+    "distance_to_truth_mm",
+    "closure",
+    "iterates",
+    "iterate_std",
+    "innovation",
+    "identifiability",
+    "confirmed_mm",
+)
+"""What the record of a lost job has no value for."""
 
 
 def lock(folder: Path) -> FileLock:
@@ -67,6 +84,18 @@ def result_time(folder: Path) -> int | None:
 def finished_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
     """The record of a job that is done; None if it has to be run."""
     return read_result(folder, config_hash) if is_done(folder) else None
+
+
+def last_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+    """What the last attempt ended with; None if it did not get to its end.
+
+    A record of success without the marker comes from a process that died before everything else was
+    on disk.
+    """
+    record = read_result(folder, config_hash)
+    if record is None or is_done(folder) == (record["status"] == "converged"):
+        return record
+    return None
 
 
 def mark_done(folder: Path) -> None:
@@ -122,11 +151,6 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
         If it cannot be written.
     """
     values = request.values
-    absent = (
-        ("estimate", "std", "relative_error", "moduli_error_percent", "distance_mm")
-        + ("distance_to_truth_mm", "closure", "iterates", "iterate_std", "innovation")
-        + ("identifiability", "confirmed_mm")
-    )
     record: dict[str, Any] = {
         **{key: values[key] for key in ("title", "row", "table", "paper", "parameters", "factors")},
         "schema": 1,
@@ -136,7 +160,7 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
         "detail": "",
         "truth": values["truth"].get("values"),
         "initial": values["filter"].get("initial"),
-        **dict.fromkeys(absent),
+        **dict.fromkeys(ABSENT),
         "moduli": [],
         "iterations": 0,
         "forward_solves": 0,

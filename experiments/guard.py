@@ -1,7 +1,7 @@
 """Runs a job in a process apart, so that its death costs its own row and nothing else.
 
 Every worker of a launcher keeps one such process and gives it job after job: what is imported and
-compiled is paid for once. A process that was killed, ran out of memory or over its time is replaced.
+compiled is paid for once. A process that was killed, or ran out of memory or time, is replaced.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from experiments.config import hash_of
-from experiments.folder import RESULT, finished_record, read_result
+from experiments.folder import RESULT, last_record
 from experiments.request import model_settings, plain
 from mvest.errors import ConfigurationError
 from mvest.provenance import git_state, write_json
@@ -249,9 +249,9 @@ def _planned(
         HydraConfig.instance().set_config(config)
         folder = Path(str(config.hydra.sweep.dir)) / str(config.hydra.sweep.subdir)
     config_hash, values = hash_of(config), plain(config)
-    done = finished_record(folder, config_hash)
-    record = done or read_result(folder, config_hash)
-    return PlannedJob(config_hash, folder, tuple(overrides), values, record, done is not None)
+    record = last_record(folder, config_hash)
+    done = record is not None and record["status"] == "converged"
+    return PlannedJob(config_hash, folder, tuple(overrides), values, record, done)
 
 
 def _require_different(jobs: Sequence[PlannedJob]) -> None:

@@ -10,7 +10,7 @@ from types import TracebackType
 
 from tqdm import tqdm
 
-from experiments.folder import is_done, read_result, result_time
+from experiments.folder import last_record, result_time
 from experiments.plan import Plan, PlannedJob
 from mvest.mechanics.solid import kernels_are_compiled
 
@@ -117,13 +117,10 @@ class SweepBar:
     def look(self) -> None:
         """See which jobs have ended since the last look."""
         for job, before in list(self._waiting.items()):
-            done = is_done(job.folder) and not job.values["force"]
-            changed = result_time(job.folder) not in (None, before)
-            if not done and not changed:
+            if result_time(job.folder) in (None, before):
                 continue
-            # The marker follows the result: what has a converged one without it is still writing.
-            record = read_result(job.folder, job.config_hash)
-            if record is None or (record["status"] == "converged" and not is_done(job.folder)):
+            record = last_record(job.folder, job.config_hash)
+            if record is None:
                 continue
             del self._waiting[job]
             if record["status"] == "converged":

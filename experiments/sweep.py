@@ -102,7 +102,7 @@ class PlanRuns(Callback):
 class LaunchSweep(Callback):
     """Runs a planned sweep and collects its results."""
 
-    def on_multirun_start(self, config: DictConfig, config_name: str, **_: Any) -> None:
+    def on_multirun_start(self, config: DictConfig, **more: Any) -> None:
         """Launch what is to be run, collect, and end the application."""
         callbacks = Callbacks(config)
         context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
@@ -110,7 +110,7 @@ class LaunchSweep(Callback):
             status = run_sweep(config, PLANNED.get(), context)
         except REFUSED as error:
             raise StopApplication(2, error) from error
-        callbacks.on_multirun_end(config=config, config_name=config_name)
+        callbacks.on_multirun_end(config=config, **more)
         raise StopApplication(status)
 
 
@@ -148,7 +148,7 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
             interrupted = error
         except Exception as error:
             # A launcher raises whatever its system tells it; the jobs that ended are on disk.
-            lost = f"{type(error).__name__}: {_first_line(error)}"
+            lost = f"{type(error).__name__}: {_first_sentence(error)}"
     path = plan.folder / FILE
     found = collect(plan, returned, _measured(path))
     write_json(path, found)
@@ -240,8 +240,8 @@ def _tell(plan: Plan) -> NoReturn:
     raise StopApplication(0)
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [""])[0]
+def _first_sentence(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [""])[0].split(". ")[0]
 
 
 def sweep_task(config: DictConfig) -> dict[str, Any] | None:
