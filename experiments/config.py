@@ -6,6 +6,7 @@ it is written down here.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,7 @@ from mvest.model import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.template import TemplateParameters
 
-__all__ = ["NOT_THE_RESULT", "hash_of", "register"]
+__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
 NOT_THE_RESULT = (
     "hydra",
@@ -182,11 +183,21 @@ class Config:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
+def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
+    """A configuration, without some of its parts, as resolved plain data."""
+    found: dict[str, Any] = {}
+    for key in map(str, config):
+        if key not in without:
+            # Part by part: a copy without the others would take longer than everything else here.
+            value = MISSING if OmegaConf.is_missing(config, key) else config[key]
+            is_part = OmegaConf.is_config(value)
+            found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
+    return found
+
+
 def hash_of(config: DictConfig) -> str:
     """SHA-256 of everything in a configuration that can change the result."""
-    keys = [str(key) for key in config if key not in NOT_THE_RESULT]
-    plain = OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
-    return config_hash(plain)  # type: ignore[arg-type]
+    return config_hash(plain(config, NOT_THE_RESULT))
 
 
 def register() -> None:

@@ -49,7 +49,7 @@ class WorkerProcess:
     command : sequence of str
     """
 
-    def __init__(self, command: Sequence[str] = WORKER) -> None:
+    def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._process: subprocess.Popen[str] | None = None
         atexit.register(self.close)
@@ -121,7 +121,7 @@ class WorkerProcess:
 @cache
 def own_worker() -> WorkerProcess:
     """The one that this process keeps."""
-    return WorkerProcess()
+    return WorkerProcess(WORKER)
 
 
 def run_guarded(config: DictConfig) -> dict[str, Any]:

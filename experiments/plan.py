@@ -23,9 +23,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
-from experiments.config import hash_of
+from experiments.config import hash_of, plain
 from experiments.folder import RESULT, last_record
-from experiments.request import model_settings, plain
+from experiments.request import model_settings
 from mvest.errors import ConfigurationError
 from mvest.provenance import git_state, write_json
 

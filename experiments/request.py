@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from experiments.config import NOT_THE_RESULT, hash_of
+from experiments.config import NOT_THE_RESULT, hash_of, plain
 
-__all__ = ["Request", "as_published", "model_settings", "plain"]
+__all__ = ["Request", "as_published", "model_settings"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +65,6 @@ class Request:
             "folder": str(self.folder),
             "publish_as": self.publish_as,
         }
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration, without Hydra's own part, as resolved plain data."""
-    kept = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    return OmegaConf.to_container(kept, resolve=True)  # type: ignore[return-value]
 
 
 def model_settings(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -135,7 +135,8 @@ class StoredModel:
 def _read(path: Path, parameters: int) -> Prediction | None:
     """A stored prediction; None if there is none, or only what a broken disk left of it."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here: NumPy leaves what it opened and could not read to the garbage collector.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             y = stored["y"]
     except FileNotFoundError:
         return None
