@@ -18,7 +18,6 @@ from mvest.estimation import (
     Identity,
     IteratedFilter,
     Log,
-    ObservationModel,
     PaperFilter,
     Transform,
     observation_noise,
@@ -71,7 +70,7 @@ class Twin:
         The estimator's.
     truth_model : ClosureModel
         The observation's; an object of its own.
-    source : ObservationModel
+    source : StoredModel
         ``truth_model`` behind its store on disk.
     truth_values : (p,)
     valve : Valve
@@ -85,7 +84,7 @@ class Twin:
     case: Case
     model: ClosureModel
     truth_model: ClosureModel
-    source: ObservationModel
+    source: StoredModel
     truth_values: FloatArray
     valve: Valve
     variance: float | FloatArray
@@ -217,7 +216,9 @@ def observation_errors(
 
 def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
     """The estimator's mechanics with the truth's changes."""
-    unknown = [name for name in truth["fixed"] if name not in FACTORS and not name.startswith("E_f.")]
+    unknown = [
+        name for name in truth["fixed"] if name not in FACTORS and not name.startswith("E_f.")
+    ]
     if unknown:
         raise ConfigurationError(
             f"truth.fixed has {', '.join(unknown)}; known: {', '.join(FACTORS)}"

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from experiments.config import NOT_THE_RESULT, hash_of, register
+from experiments.config import register
 from experiments.donor import run_donor
+from experiments.folder import (
+    CONFIG,
+    RESULT,
+    clear,
+    finished_record,
+    lock,
+    mark_done,
+    require_writable,
+)
 from experiments.gate import run_closure_study, run_gate_study
+from experiments.guard import run_apart
 from experiments.progress import announce_compilation
+from experiments.request import Request
 from experiments.tracking import log_run
 from experiments.twin import run_twin
-from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.errors import ConfigurationError, MvestError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
@@ -27,7 +36,7 @@ from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
 
-__all__ = ["FailedRunError", "run_job"]
+__all__ = ["STUDIES", "FailedRunError", "Study", "compute", "require_study", "run_job"]
 
 # Workers of a launcher import this module before they compose their configuration.
 register()
@@ -42,11 +51,46 @@ class FailedRunError(Exception):
         self.folder = folder
 
     def __str__(self) -> str:
-        return f"{self.reason} (recorded in {self.folder / 'result.json'})"
+        return f"{self.reason} (recorded in {self.folder / RESULT})"
 
 
 def run_job(config: DictConfig) -> None:
-    """Run one composed configuration in Hydra's output folder.
+    """Run one composed configuration by itself in Hydra's output folder, unless it is done.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible or a file cannot be written.
+    FailedRunError
+        If the computation found no estimate; the run is recorded all the same.
+    """
+    request = Request.of(config)
+    values, folder = request.values, request.folder
+    study = require_study(values)
+    require_writable(folder)
+    if values["time_limit_s"] is not None:
+        # Only another process can be stopped at any moment.
+        record = run_apart(request)
+        print(study.text(record) if record["repeats"] else record["reason"])
+        _raise_failure(record, folder)
+        return
+    with lock(folder):
+        done = None if values["force"] else finished_record(folder, request.config_hash)
+        if done is None:
+            clear(folder)
+            compute(request)
+            return
+    print(study.text(done))
+    source = done["provenance"]
+    print(
+        f"Done on {source['finished']} by commit {(source['git']['sha'] or 'unknown')[:12]}, in "
+        f"{folder}; force=true runs it again"
+    )
+    _publish(request, done)
+
+
+def compute(request: Request) -> dict[str, Any]:
+    """Run a job in its folder, which exists: its record, which is then on disk with its figures.
 
     Raises
     ------
@@ -56,40 +100,46 @@ def run_job(config: DictConfig) -> None:
         If the computation found no estimate; the run is recorded all the same.
     """
     started = time.time()
-    hydra = HydraConfig.get()
-    folder = Path(hydra.runtime.output_dir)
-    values: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-    if values["study"] not in STUDIES:
-        raise ConfigurationError(
-            f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
-        )
-    require_writable(folder)
+    values, folder = request.values, request.folder
+    study = require_study(values)
     announce_compilation()
-    kind = STUDIES[values["study"]]
-    record, files = kind.run(values, hash_of(config), folder, started)
+    record, files = study.run(values, request.config_hash, folder, started)
+    record["factors"] = values["factors"]
 
-    write_json(folder / "config.json", values)
-    write_json(folder / "result.json", record)
-    tables = kind.tables(folder, record)
-    print(kind.text(record))
+    write_json(folder / CONFIG, values)
+    write_json(folder / RESULT, record)
+    tables = study.tables(folder, record) if values["figures"] else []
+    print(study.text(record))
     print(f"Written to {folder}")
-    if values["publish"] and record["status"] == "converged":
-        if _as_published(hydra.overrides.task, hydra.sweeper.get("params")):
-            target = Path(values["paths"]["results"])
-            kind.publish(target, _slug(values, hydra), record, folder)
-            print(f"Results in {target}")
-        else:
-            print(f"{values['paths']['results']} left as it is: this run has overrides")
+    _publish(request, record)
     if values["tracking"]["enabled"]:
-        artifacts = [folder / "result.json", folder / "config.json", *tables, *files]
+        artifacts = [folder / RESULT, folder / CONFIG, *tables, *files]
         try:
             log_run(record, values, artifacts, started)
         except MvestError as error:
             print(f"warning: {error}; the result is in {folder}", file=sys.stderr)
+    _raise_failure(record, folder)
+    mark_done(folder)
+    return record
+
+
+def _publish(request: Request, record: Mapping[str, Any]) -> None:
+    """Let the results take over a run of an experiment as it is configured."""
+    values = request.values
+    if not values["publish"] or values["sweep"] or record["status"] != "converged":
+        return
+    results = Path(values["paths"]["results"])
+    if request.publish_as is None:
+        print(f"{results} left as it is: this run has overrides")
+        return
+    require_study(values).publish(results, request.publish_as, record, request.folder)
+    print(f"Results in {results}")
+
+
+def _raise_failure(record: Mapping[str, Any], folder: Path) -> None:
     if record["status"] != "converged":
-        raise FailedRunError(
-            record["reason"] + f" ({record['detail']})" * bool(record["detail"]), folder
-        )
+        detail = f" ({record['detail']})" if record["detail"] else ""
+        raise FailedRunError(record["reason"] + detail, folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,26 +193,16 @@ STUDIES: dict[str, Study] = {
 """Kinds of studies that a configuration can name."""
 
 
-def _as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
-    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
-    allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
-    keys = (re.split(r"[=.]", override.lstrip("+~"), maxsplit=1)[0] for override in overrides)
-    return all(key in allowed for key in keys)
+def require_study(values: Mapping[str, Any]) -> Study:
+    """The kind of study that a configuration names.
 
-
-def _slug(values: Mapping[str, Any], hydra: Any) -> str:
-    """Name of a published record: the experiment's, with its row if it has several."""
-    if str(hydra.mode).endswith("MULTIRUN"):
-        return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
-    return str(values["name"])
-
-
-def require_writable(folder: Path) -> None:
-    """Refuse a folder that cannot be written, before anything is computed."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
+    Raises
+    ------
+    ConfigurationError
+        If there is no such kind.
+    """
+    if values["study"] not in STUDIES:
+        raise ConfigurationError(
+            f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
+        )
+    return STUDIES[values["study"]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,10 +42,12 @@ def run_twin(
     twin = build_twin(config)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
+    began = time.perf_counter()
     seeds = range(config["seed"], config["seed"] + config["repeats"])
     results = _estimate_twin(twin, seeds)
     result = results[0]
     confirmed = _confirm(twin, result) if config["confirm"] else None
+    computing = time.perf_counter() - began
     mesh = twin.model.mesh
     closure = None
     if config["measure"] and result.fitted is not None:
@@ -67,6 +70,8 @@ def run_twin(
     )
     record["repeats"] = [repeat_entry(s, r) for s, r in zip(seeds, results, strict=True)]
     record["confirmed_mm"] = confirmed
+    record["seconds_computing"] = computing
+    record["truth_store"] = "hit" if twin.source.hits else "miss"
     if confirmed is not None:
         record["forward_solves"] += 1
     files: list[Path] = []
