@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,23 @@ from mvest.estimation import (
     Identity,
     IteratedFilter,
     Log,
-    ObservationModel,
     PaperFilter,
     Transform,
     observation_noise,
 )
 from mvest.mechanics.solver import linear_solver
 from mvest.model import ClosureModel, MechanicsSettings
+from mvest.observation_errors import (
+    AnnulusOffset,
+    CoaptationDropout,
+    CorrelatedNoise,
+    ObservationError,
+    SpatialCorrelation,
+    WhiteNoise,
+)
 from mvest.study import Case
 from mvest.typing import FloatArray
-from mvest.valve.anatomy import Valve
+from mvest.valve.anatomy import LeafletSurface, Valve
 from mvest.valve.mesh import SolidMesh
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template, TemplateParameters
@@ -63,25 +70,27 @@ class Twin:
         The estimator's.
     truth_model : ClosureModel
         The observation's; an object of its own.
-    source : ObservationModel
+    source : StoredModel
         ``truth_model`` behind its store on disk.
     truth_values : (p,)
     valve : Valve
         The observed surface.
     variance : float or (f,) mm²
+    correlation : SpatialCorrelation or None
     frames : tuple of str
-    noise_mm : float
+    errors : tuple of ObservationError
     """
 
     case: Case
     model: ClosureModel
     truth_model: ClosureModel
-    source: ObservationModel
+    source: StoredModel
     truth_values: FloatArray
     valve: Valve
     variance: float | FloatArray
+    correlation: SpatialCorrelation | None
     frames: tuple[str, ...]
-    noise_mm: float
+    errors: tuple[ObservationError, ...]
 
 
 def build_twin(config: Values) -> Twin:
@@ -108,12 +117,20 @@ def build_twin(config: Values) -> Twin:
     linear_solver(settings.solver)
     if not truth["dt_factor"] > 0:
         raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
+    if config["repeats"] < 1:
+        raise ConfigurationError(f"repeats = {config['repeats']}, expected at least 1")
+    true_settings = truth_mechanics(settings, truth)
+    _require_tissue(true_settings, parameters, values)
 
     template = template_of(config)
     observation = config["observation"]
     valve = template.valve(observation["columns"], observation["rows"])
     points = config["mechanics"]["contact_points"]
     contact_valve = template.valve(points["columns"], points["rows"])
+    correlations = Correlations(valve.surface)
+    errors = observation_errors(observation, correlations)
+    told_length = config["filter"]["R_correlation_mm"]
+    correlation = correlations(told_length) if told_length else None
     element = config["mechanics"]["element"]
     store = Path(config["paths"]["outputs"]) / "meshes"
     mesh = build_mesh(template, config["mesh"], element, store)
@@ -125,6 +142,7 @@ def build_twin(config: Values) -> Twin:
         parameters,
         dict(config["fixed"]),
         continuation=config["continuation"],
+        reach=np.inf if config["continuation_reach"] is None else config["continuation_reach"],
     )
     if config["guided"]:
         model.guide = guide_of(model, template, config["mesh"])
@@ -132,12 +150,11 @@ def build_twin(config: Values) -> Twin:
     changed = truth_mesh(config["mesh"], truth)
     other = truth["element"] or element
     same = changed == dict(config["mesh"]) and other == element
-    protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
     truth_model = ClosureModel(
         valve,
         contact_valve,
         mesh if same else build_mesh(template, changed, other, store),
-        replace(settings, protocol=protocol),
+        true_settings,
         parameters,
         {**config["fixed"], **truth["fixed"]},
     )
@@ -147,6 +164,7 @@ def build_twin(config: Values) -> Twin:
         "mesh": changed if changed["source"] == "tetwild" else _cells(changed),
         "element": other,
         "dt_factor": truth["dt_factor"],
+        "tissue": {region: asdict(tissue) for region, tissue in true_settings.tissue.items()},
         "fixed": truth_model.fixed,
         "observed": [observation["columns"], observation["rows"]],
         "parameters": list(parameters),
@@ -161,9 +179,61 @@ def build_twin(config: Values) -> Twin:
         values,
         valve,
         variance,
+        correlation,
         tuple(observation["frames"]),
-        observation["noise_mm"],
+        errors,
     )
+
+
+class Correlations:
+    """Correlations between the vertices of a surface, each length factorised once."""
+
+    def __init__(self, surface: LeafletSurface) -> None:
+        self.surface = surface
+        self._made: dict[float, SpatialCorrelation] = {}
+
+    def __call__(self, length: float) -> SpatialCorrelation:
+        """The correlation of one length, mm."""
+        if length not in self._made:
+            self._made[length] = SpatialCorrelation(self.surface.vertices, length)
+        return self._made[length]
+
+
+def observation_errors(
+    settings: Values, correlations: Correlations
+) -> tuple[ObservationError, ...]:
+    """The configured errors that are not zero, in the order in which they arise."""
+    offset = settings["annulus_offset_mm"]
+    made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
+    made.append(WhiteNoise(settings["noise_mm"]))
+    if settings["correlated_mm"]:
+        correlation = correlations(settings["correlation_length_mm"])
+        made.append(CorrelatedNoise(settings["correlated_mm"], correlation))
+    if settings["dropout_mm"]:
+        made.append(CoaptationDropout(settings["dropout_mm"], correlations.surface))
+    return tuple(made)
+
+
+def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
+    """The estimator's mechanics with the truth's changes."""
+    unknown = [
+        name for name in truth["fixed"] if name not in FACTORS and not name.startswith("E_f.")
+    ]
+    if unknown:
+        raise ConfigurationError(
+            f"truth.fixed has {', '.join(unknown)}; known: {', '.join(FACTORS)}"
+        )
+    tissue = dict(settings.tissue)
+    for region, ratio in truth["ratio"].items():
+        if region not in tissue:
+            raise ConfigurationError(
+                f"truth.ratio has the region {region!r}; known: {', '.join(tissue)}"
+            )
+        tissue[region] = replace(tissue[region], ratio=ratio)
+    if truth["reading"] is not None:
+        tissue = {r: replace(old, reading=truth["reading"]) for r, old in tissue.items()}
+    protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
+    return replace(settings, tissue=tissue, protocol=protocol)
 
 
 def template_of(config: Values) -> Template:

@@ -6,6 +6,7 @@ it is written down here.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,9 +18,21 @@ from mvest.model import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.template import TemplateParameters
 
-__all__ = ["NOT_THE_RESULT", "hash_of", "register"]
+__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
-NOT_THE_RESULT = ("hydra", "paths", "tracking")
+NOT_THE_RESULT = (
+    "hydra",
+    "paths",
+    "tracking",
+    "sweep",
+    "factors",
+    "figures",
+    "publish",
+    "force",
+    "dry_run",
+    "time_limit_s",
+    "isolate",
+)
 """Parts of a configuration that change no number of the result, left out of its hash."""
 
 
@@ -51,6 +64,7 @@ class FilterConfig:
     P0: Any = MISSING  # variance, variances or matrix
     Q: Any = 0.01  # the same, added each round of the paper's mode
     R: Any = 0.01  # mm², one or one for each observed frame
+    R_correlation_mm: float = 0.0  # correlation length of R along the leaflets; 0: independent
     transform: str = "identity"  # or log
     tolerance: float = 1e-4
     max_iterations: int = 30
@@ -58,12 +72,17 @@ class FilterConfig:
 
 @dataclass
 class ObservationConfig:
-    """What is seen of the valve."""
+    """What is seen of the valve, and how it differs from what is there."""
 
     frames: list[str] = field(default_factory=lambda: ["open", "closed"])
     columns: int = 112
     rows: int = 29
-    noise_mm: float = 0.0
+    label: str = "none"  # what a table calls its errors
+    noise_mm: float = 0.0  # SD of independent errors of each coordinate
+    correlated_mm: float = 0.0  # SD of errors that are alike at neighbouring vertices
+    correlation_length_mm: float = 5.0
+    dropout_mm: float = 0.0  # closed vertices this near to another leaflet are not seen
+    annulus_offset_mm: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
 
 @dataclass
@@ -81,6 +100,7 @@ class TruthConfig:
     """What the synthetic observation is made from; null means as the estimator's model."""
 
     values: list[float] = MISSING
+    label: str = MISSING  # what a table calls it
     refine: int = 1  # cells of the truth's mesh per cell of the estimator's, in each direction
     source: str | None = None
     columns: int | None = None
@@ -88,7 +108,9 @@ class TruthConfig:
     layers: int | None = None
     element: str | None = None
     dt_factor: float = 1.0
-    fixed: dict[str, float] = field(default_factory=dict)
+    reading: str | None = None  # of the Poisson ratio
+    ratio: dict[str, float] = field(default_factory=dict)  # region -> E_f over E_perp
+    fixed: dict[str, float] = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
 
 
 @dataclass
@@ -153,18 +175,40 @@ class Config:
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
     continuation: bool = True  # later closures start from the last closed state
+    continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes
     confirm: bool = True  # close the fitted valve anew from the open state
+    measure: bool = True  # orifice, coaptation and passing ball of the fitted valve: seconds
     seed: int = 1
+    repeats: int = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
+    figures: bool = True  # draw the run; a sweep need not draw every job
+    force: bool = False  # run again what is done
+    dry_run: bool = False  # only say what would run, and how long it would take
+    time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
+    isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
+    factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
+    # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of
+    # which it is the union; empty for a run by itself.
+    sweep: dict[str, Any] = field(default_factory=dict)
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
+def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
+    """A configuration, without some of its parts, as resolved plain data."""
+    found: dict[str, Any] = {}
+    for key in map(str, config):
+        if key not in without:
+            # Part by part: a copy without the others would take longer than everything else here.
+            value = MISSING if OmegaConf.is_missing(config, key) else config[key]
+            is_part = OmegaConf.is_config(value)
+            found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
+    return found
+
+
 def hash_of(config: DictConfig) -> str:
     """SHA-256 of everything in a configuration that can change the result."""
-    keys = [str(key) for key in config if key not in NOT_THE_RESULT]
-    plain = OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
-    return config_hash(plain)  # type: ignore[arg-type]
+    return config_hash(plain(config, NOT_THE_RESULT))
 
 
 def register() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError, MvestError
+from mvest.errors import MvestError, cannot_write
 from mvest.provenance import provenance
 from mvest.study import StudyResult
 from mvest.typing import FloatArray
@@ -19,7 +19,7 @@ from mvest.valve.anatomy import LeafletSurface, Valve
 from mvest.valve.annulus import annulus_plane
 from mvest.valve.measurements import measure_closure
 
-__all__ = ["make_record", "measure_frames", "write_fields"]
+__all__ = ["make_record", "measure_frames", "repeat_entry", "write_fields"]
 
 SCHEMA = 1
 """Version of the layout of ``result.json``."""
@@ -100,6 +100,31 @@ def make_record(
     }
 
 
+def repeat_entry(seed: int, result: StudyResult) -> dict[str, Any]:
+    """Plain data of the estimate from one seed; lists are in the order of the parameters."""
+    filtered = result.filtered
+    innovation, bound = _innovation(result), _identifiability(result)
+    return {
+        "seed": seed,
+        "status": "converged" if result.converged else "failed",
+        "reason": result.reason,
+        "detail": result.detail,
+        "estimate": _list(result.estimate),
+        "std": _list(result.std),
+        "relative_error": _list(result.relative_error),
+        "bound": None if bound is None else bound["cramer_rao_std"],
+        "distance_mm": _spread(result.distance),
+        "distance_to_truth_mm": _spread(result.distance_to_truth),
+        "nis": None if innovation is None else innovation["nis"],
+        "nis_band": None if innovation is None else innovation["nis_band"],
+        "iterations": None if filtered is None else filtered.iterations,
+        "forward_solves": None if filtered is None else filtered.forward_solves,
+        "iterates": [] if filtered is None else _list(filtered.iterates),
+        "iterate_std": [] if filtered is None else _list(filtered.iterate_std),
+        "seconds": result.seconds,
+    }
+
+
 def measure_frames(valve: Valve, result: StudyResult, contact_distance: float) -> dict[str, Any]:
     """Orifice, passing ball, coaptation and intersections of each fitted frame.
 
@@ -170,7 +195,7 @@ def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> No
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
+        raise cannot_write(path, error) from error
 
 
 def _list(values: FloatArray | None) -> list[Any] | None:
@@ -179,6 +204,10 @@ def _list(values: FloatArray | None) -> list[Any] | None:
 
 def _spread(values: FloatArray | None) -> dict[str, float] | None:
     if values is None:
+        return None
+    # A vertex that is not seen has no distance.
+    values = values[np.isfinite(values)]
+    if not values.size:
         return None
     return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
 

@@ -33,6 +33,7 @@ from mvest.valve.embedding import Embedding, embed
 from mvest.valve.mesh import SolidMesh
 
 __all__ = [
+    "ClosedState",
     "ClosureModel",
     "ClosureProtocol",
     "ClosureResult",
@@ -332,6 +333,25 @@ class ClosureResult:
     simulation: Simulation
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedState:
+    """A closed valve from which further closures may be continued.
+
+    Attributes
+    ----------
+    at : (p,)
+        Its parameters.
+    positions : (n, 3) mm
+        Of the mesh's nodes.
+    guide : ClosedState or None
+        That of the model's guide.
+    """
+
+    at: FloatArray
+    positions: FloatArray
+    guide: ClosedState | None = None
+
+
 @dataclass(eq=False)
 class ClosureModel:
     """Predicted positions of the observed vertices as a function of the parameters.
@@ -353,6 +373,10 @@ class ClosureModel:
         equilibrium (where the protocol ends in one), instead of closing the open valve again. The
         closed state is the same as long as there is one only, which the gate (:mod:`mvest.gate`)
         examines.
+    reach : float
+        Largest change of any parameter's logarithm over which a closure is continued; beyond it
+        the valve is closed from the open state. A much softer valve may close in another way, and
+        what is continued from there may keep to that way.
     guide : ClosureModel, optional
         The same valve with the same parameters on a coarser mesh. A closure that would start from
         the open valve is followed there, and its closed state is where the equilibrium on this
@@ -371,16 +395,19 @@ class ClosureModel:
     names: tuple[str, ...]
     fixed: dict[str, float] = field(default_factory=dict)
     continuation: bool = False
+    reach: float = np.inf
     guide: ClosureModel | None = None
     repeat: bool = True
     on_step: Callable[[float, int], None] | None = None
 
-    _closed: FloatArray | None = field(default=None, init=False, repr=False)
+    _closed: ClosedState | None = field(default=None, init=False, repr=False)
     _in_guide: Embedding | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
     _solver: LinearSolver | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if not self.reach >= 0:
+            raise InputError(f"reach of a continuation = {self.reach}, expected >= 0")
         if self.guide is not None and self.guide.names != self.names:
             raise InputError(
                 f"the guide's parameters are {', '.join(self.guide.names)}, expected those of the "
@@ -391,6 +418,37 @@ class ClosureModel:
         """A model of the same that has not built or closed anything, and tells nobody of steps."""
         guide = None if self.guide is None else self.guide.fresh()
         return replace(self, guide=guide, on_step=None)
+
+    @property
+    def closed(self) -> ClosedState | None:
+        """The last closed state."""
+        if self._closed is None or self.guide is None:
+            return self._closed
+        return replace(self._closed, guide=self.guide.closed)
+
+    def restart(self, closed: ClosedState | None) -> None:
+        """Go on from a closed state of this model, or from the open valve, as if it had just begun.
+
+        What the model computes afterwards depends on ``closed`` and on nothing before, to the last
+        bit: also the sparsity pattern and the order of elimination, which follow the contact that
+        was met, begin anew.
+        """
+        self._closed = None if closed is None else replace(closed, guide=None)
+        if self._system is not None:
+            self._system.forget_contact()
+            self._solver = linear_solver(self.settings.solver)
+        if self.guide is not None:
+            self.guide.restart(None if closed is None else closed.guide)
+
+    def _near(self, m: FloatArray) -> bool:
+        """Whether the last closed state is one to continue from to ``m``."""
+        if not self.continuation or self._closed is None:
+            return False
+        if np.isinf(self.reach):
+            return True
+        if np.any(m <= 0) or np.any(self._closed.at <= 0):
+            return False
+        return bool(np.max(np.abs(np.log(m / self._closed.at))) <= self.reach)
 
     def close(
         self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
@@ -448,8 +506,8 @@ class ClosureModel:
         simulation = None
         if steps[-1].static and not every_frame:
             end, last = self.settings.protocol.end, steps[-1]
-            if self.continuation and self._closed is not None:
-                simulation = run([last], self._closed, end)
+            if self._closed is not None and self._near(m):
+                simulation = run([last], self._closed.positions, end)
             elif self.guide is not None:
                 start = self._guided(self.guide, m)
                 if start is not None:
@@ -460,7 +518,7 @@ class ClosureModel:
         if simulation is None or (self.repeat and not simulation.converged):
             simulation = run(steps)
         if simulation.converged:
-            self._closed = simulation.frames[-1]
+            self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -25,9 +26,11 @@ from mvest.estimation import (
     identifiability,
 )
 from mvest.estimation.estimate import OnIterate
+from mvest.estimation.noise import NoiseCovariance, stacked_noise
 from mvest.estimation.prediction import require_finite
-from mvest.model import TissueSettings
-from mvest.typing import FloatArray
+from mvest.model import ClosedState, TissueSettings
+from mvest.observation_errors import ObservationError, SpatialCorrelation, observe
+from mvest.typing import BoolArray, FloatArray
 
 __all__ = [
     "FRAMES",
@@ -35,6 +38,7 @@ __all__ = [
     "Modulus",
     "Observation",
     "ObservedFrames",
+    "SharedStart",
     "StudyResult",
     "Truth",
     "TwinData",
@@ -55,14 +59,18 @@ class Observation:
     frames : tuple of str, (f,)
         Observed frames, the closed one last.
     positions : (f, n, 3) mm
-        Positions of the observed vertices in each frame.
+        Positions of the vertices in each frame; NaN where a vertex is not seen, so that nobody can
+        read what was not observed.
     variance : (f,) mm²
         Variance of each coordinate in each frame that the filter is to assume.
+    correlation : SpatialCorrelation or None
+        Correlation between vertices that the filter is to assume; None for independent errors.
     """
 
     frames: tuple[str, ...]
     positions: FloatArray
     variance: FloatArray
+    correlation: SpatialCorrelation | None = None
 
     def __post_init__(self) -> None:
         require_frames(self.frames)
@@ -72,7 +80,10 @@ class Observation:
                 f"observed positions have shape {positions.shape}, expected "
                 f"({len(self.frames)}, n, 3): one row for each of {', '.join(self.frames)}"
             )
-        require_finite(positions, "the observed positions")
+        unseen: BoolArray = np.all(np.isnan(positions), axis=2)
+        require_finite(np.where(unseen[..., None], 0.0, positions), "the observed positions")
+        if np.all(unseen):
+            raise InputError("no observed position is finite: no vertex is seen")
         try:
             variance = np.broadcast_to(np.asarray(self.variance, float), (len(self.frames),)).copy()
         except ValueError:
@@ -83,14 +94,38 @@ class Observation:
         require_finite(variance, "R")
         if np.any(variance <= 0.0):
             raise InputError(f"R = {variance.min():g} mm^2, expected > 0")
+        told = self.correlation
+        if told is not None and len(told.points) != positions.shape[1]:
+            raise InputError(
+                f"R is correlated between {len(told.points)} vertices, but {positions.shape[1]} "
+                f"are observed"
+            )
         for name, values in (("positions", positions), ("variance", variance)):
             values.setflags(write=False)
             object.__setattr__(self, name, values)
 
     @property
-    def R(self) -> FloatArray:
-        """Variances ``(3 f n,)`` in mm² of the stacked coordinates."""
-        return np.repeat(self.variance, self.positions[0].size)
+    def seen(self) -> BoolArray:
+        """Which vertices are seen in each frame ``(f, n)``."""
+        return np.isfinite(self.positions[:, :, 0])
+
+    @property
+    def y(self) -> FloatArray:
+        """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
+        return self.positions[self.seen].ravel()
+
+    @property
+    def R(self) -> NoiseCovariance:
+        """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
+        counts = 3 * self.seen.sum(axis=1)
+        if self.correlation is None:
+            return np.repeat(self.variance, counts)
+        blocks = [
+            self.correlation.of(seen).noise(float(variance), 3)
+            for seen, variance in zip(self.seen, self.variance, strict=True)
+            if seen.any()
+        ]
+        return stacked_noise(blocks)
 
 
 def require_frames(frames: Sequence[str]) -> None:
@@ -130,10 +165,23 @@ class ObservedFrames:
     """The observed frames of a model that predicts all of ``FRAMES``.
 
     Parameters that no tissue can have, as a filter may try, give a failed prediction.
+
+    Attributes
+    ----------
+    model : ObservationModel
+    frames : tuple of str, (f,)
+    seen : (f, n) or None
+        Vertices that are predicted in each frame; None for all.
     """
 
     model: ObservationModel
     frames: tuple[str, ...]
+    seen: BoolArray | None = None
+    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
+
+    def whole(self, m: FloatArray) -> FloatArray | None:
+        """Positions ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
+        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict the observed frames of parameters ``m (p,)``."""
@@ -143,11 +191,63 @@ class ObservedFrames:
             return Prediction.failed(str(error))
         if not prediction.converged:
             return prediction
-        return Prediction(
-            _selected(prediction.y, self.frames),
-            _selected(prediction.jacobian, self.frames),
-            reason=prediction.reason,
-        )
+        y, jacobian = (_selected(a, self.frames) for a in (prediction.y, prediction.jacobian))
+        whole = y.reshape(len(self.frames), -1, 3)
+        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
+        if self.seen is not None:
+            rows = np.repeat(self.seen, 3)
+            y, jacobian = y[rows], jacobian[rows]
+        return Prediction(y, jacobian, reason=prediction.reason)
+
+
+class Restartable(Protocol):
+    """A model whose next prediction may start from where an earlier one ended."""
+
+    @property
+    def closed(self) -> ClosedState | None:
+        """Where the next prediction would start from."""
+        ...
+
+    def restart(self, closed: ClosedState | None) -> None:
+        """Forget everything but where to start from."""
+        ...
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        ...
+
+
+class SharedStart:
+    """A model for many estimations that all begin with one and the same prediction.
+
+    The prediction at the common start is computed once, and whenever it is asked for the model goes
+    on from there as if nothing else had been computed before. So an estimation gives the same
+    numbers, to the last bit, by itself and after any others.
+
+    Parameters
+    ----------
+    model : Restartable
+        Nobody else may use it meanwhile.
+    start : (p,)
+        Parameters at which every estimation begins.
+    """
+
+    def __init__(self, model: Restartable, start: FloatArray) -> None:
+        self._model = model
+        self._start = np.array(start, dtype=np.float64)
+        self._first: tuple[Prediction, ClosedState | None] | None = None
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        if not np.array_equal(m, self._start):
+            return self._model(m)
+        if self._first is None:
+            self._model.restart(None)
+            prediction = self._model(m)
+            self._first = prediction, self._model.closed
+        prediction, closed = self._first
+        self._model.restart(closed)
+        return prediction
 
 
 def _selected(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:
@@ -225,6 +325,8 @@ class StudyResult:
     converged : bool
     seconds : float
         Wall-clock time of the estimation.
+    fitted : (f, n, 3) mm or None
+        Observed frames as predicted at the estimate, unseen vertices included.
     truth : Truth or None
         Added by ``against``, after the estimation.
     """
@@ -238,6 +340,7 @@ class StudyResult:
     detail: str
     converged: bool
     seconds: float
+    fitted: FloatArray | None = None
     truth: Truth | None = None
 
     @classmethod
@@ -272,22 +375,18 @@ class StudyResult:
         return (self.estimate - self.truth.values) / self.truth.values
 
     @property
-    def fitted(self) -> FloatArray | None:
-        """Observed frames as predicted at the estimate, ``(f, n, 3)`` mm."""
-        if self.filtered is None or self.filtered.prediction is None or self.observation is None:
-            return None
-        return self.filtered.prediction.y.reshape(self.observation.positions.shape)
-
-    @property
     def distance(self) -> FloatArray | None:
-        """Distance ``(n,)`` mm of each vertex, fitted to observed, in the last observed frame."""
+        """Distance ``(n,)`` mm of each vertex, fitted to observed, in the last observed frame.
+
+        NaN where a vertex is not seen.
+        """
         if self.fitted is None or self.observation is None:
             return None
         return np.linalg.norm(self.fitted[-1] - self.observation.positions[-1], axis=1)
 
     @property
     def distance_to_truth(self) -> FloatArray | None:
-        """As ``distance``, to the positions before noise was added."""
+        """As ``distance``, to the positions without errors; also of vertices that are not seen."""
         if self.fitted is None or self.truth is None:
             return None
         return np.linalg.norm(self.fitted[-1] - self.truth.positions[-1], axis=1)
@@ -325,7 +424,8 @@ def simulate_observation(
     *,
     frames: Sequence[str] = FRAMES,
     variance: float | FloatArray,
-    noise_mm: float = 0.0,
+    correlation: SpatialCorrelation | None = None,
+    errors: Sequence[ObservationError] = (),
     rng: np.random.Generator,
 ) -> TwinData:
     """Make a synthetic observation.
@@ -340,9 +440,11 @@ def simulate_observation(
     frames : sequence of str
         Which of ``FRAMES`` are observed.
     variance : float or (f,) mm²
-        What the filter is told about the noise.
-    noise_mm : float
-        Standard deviation of the independent normal noise of each coordinate, mm.
+        What the filter is told about the errors.
+    correlation : SpatialCorrelation, optional
+        What the filter is told about their correlation; None for independent errors.
+    errors : sequence of ObservationError
+        What makes the observation differ from the truth, in this order.
     rng : numpy.random.Generator
 
     Returns
@@ -353,10 +455,8 @@ def simulate_observation(
     Raises
     ------
     InputError
-        On inadmissible noise, frames or values.
+        On inadmissible errors, frames or values.
     """
-    if not (np.isfinite(noise_mm) and noise_mm >= 0.0):
-        raise InputError(f"noise of {noise_mm} mm, expected >= 0")
     values = np.asarray(values, dtype=np.float64)
     if values.shape != (len(parameters),):
         raise InputError(
@@ -369,8 +469,8 @@ def simulate_observation(
     if not prediction.converged:
         return TwinData(None, None, f"no synthetic observation: {prediction.reason}")
     positions = _selected(prediction.y, frames).reshape(len(frames), -1, 3)
-    noise = noise_mm * rng.standard_normal(positions.shape) if noise_mm else 0.0
-    observation = Observation(tuple(frames), positions + noise, np.asarray(variance))
+    seen = observe(positions, errors, rng)
+    observation = Observation(tuple(frames), seen, np.asarray(variance), correlation)
     return TwinData(observation, Truth(tuple(parameters), values, positions), prediction.reason)
 
 
@@ -382,11 +482,13 @@ def estimate(
     Numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
+    predicted = ObservedFrames(case.model, observation.frames, observation.seen)
+    R = observation.R
     filtered = case.filter(
-        ObservedFrames(case.model, observation.frames),
+        predicted,
         case.prior,
-        observation.positions.ravel(),
-        observation.R,
+        observation.y,
+        R,
         names=case.parameters,
         transform=case.transform,
         on_iterate=on_iterate,
@@ -395,7 +497,7 @@ def estimate(
     if filtered.prediction is not None:
         bound = identifiability(
             filtered.prediction.jacobian,
-            observation.R,
+            R,
             np.abs(filtered.mean),
             names=case.parameters,
         )
@@ -409,4 +511,5 @@ def estimate(
         detail=filtered.detail,
         converged=filtered.converged,
         seconds=time.perf_counter() - started,
+        fitted=None if filtered.prediction is None else predicted.whole(filtered.mean),
     )

@@ -40,6 +40,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.batch": (*LEAVES, "mvest.estimation", "mvest.model"),
     "mvest.gate": (*LEAVES, "mvest.model"),
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
+    "mvest.observation_errors": (*LEAVES, "mvest.valve", "mvest.estimation"),
     "mvest.study": (
         *LEAVES,
         "mvest.provenance",
@@ -48,6 +49,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.imaging",
         "mvest.estimation",
         "mvest.model",
+        "mvest.observation_errors",
     ),
     "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
 }

@@ -7,10 +7,12 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
-from mvest.model import TissueSettings
+from mvest.model import ClosedState, TissueSettings
+from mvest.observation_errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.study import (
     Case,
     Observation,
+    SharedStart,
     StudyResult,
     Truth,
     TwinData,
@@ -52,7 +54,7 @@ def observe(model=None, noise_mm: float = 0.0, seed: int = 1, **more) -> TwinDat
         NAMES,
         TRUTH,
         variance=more.pop("variance", 0.01),
-        noise_mm=noise_mm,
+        errors=(WhiteNoise(noise_mm), *more.pop("errors", ())),
         rng=np.random.default_rng(seed),
         **more,
     )
@@ -241,3 +243,109 @@ def test_bad_values_and_shapes_are_refused() -> None:
     assert data.observation is not None
     with pytest.raises(InputError, match="truth is of"):
         estimate(case(), data.observation).against(Truth(("a", "b"), TRUTH, np.zeros((2, 1, 3))))
+
+
+def test_an_unseen_vertex_has_no_say() -> None:
+    # Its position is nowhere to be read, and the estimate is that of the remaining rows.
+    data = observe(noise_mm=0.2)
+    assert data.observation is not None
+    positions = data.observation.positions.copy()
+    hidden = np.arange(VERTICES) % 4 > 0
+    positions[1, hidden] = np.nan
+    masked = Observation(data.observation.frames, positions, data.observation.variance)
+    assert masked.y.shape == masked.R.shape == (3 * (VERTICES + 10),)
+    result = estimate(case(), masked).against(data.truth)
+    sheet = Sheet()
+    rows = np.repeat(np.concatenate([np.ones(VERTICES, bool), ~hidden]), 3)
+
+    def part(m: np.ndarray) -> Prediction:
+        whole = sheet(m)
+        return Prediction(whole.y[rows], whole.jacobian[rows])
+
+    by_hand = IteratedFilter()(part, case().prior, positions.ravel()[rows], 0.01)
+    np.testing.assert_allclose(result.estimate, by_hand.mean, rtol=1e-12)
+    assert np.abs(result.estimate - estimate(case(), data.observation).estimate).max() > 1e-3
+    # What was not seen is fitted all the same, and has no distance to an observation.
+    assert result.fitted is not None
+    assert result.fitted.shape == (2, VERTICES, 3)
+    np.testing.assert_array_equal(np.isnan(result.distance), hidden)
+    assert np.isfinite(result.distance_to_truth).all()
+
+
+def test_an_observation_of_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match="no vertex is seen"):
+        Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
+    half = np.zeros((1, 5, 3))
+    half[0, 2, 1] = np.nan
+    with pytest.raises(InputError, match="must be finite"):
+        Observation(("closed",), half, np.array([1.0]))
+    correlation = SpatialCorrelation(np.eye(3), 5.0)
+    with pytest.raises(InputError, match="between 3 vertices, but 5"):
+        Observation(("closed",), np.zeros((1, 5, 3)), np.array([1.0]), correlation)
+
+
+def test_the_filter_may_be_told_that_errors_are_correlated() -> None:
+    # With correlated errors the white R claims too much; the correlated R is told the truth.
+    points = np.random.default_rng(3).uniform(0.0, 10.0, (VERTICES, 3))
+    correlation = SpatialCorrelation(points, 5.0)
+    errors = [CorrelatedNoise(0.5, correlation)]
+    z = {}
+    for told in (None, correlation):
+        found = []
+        for seed in range(60):
+            sheet = smooth_sheet(points)
+            data = observe(sheet, seed=seed, errors=errors, correlation=told, variance=0.25)
+            assert data.observation is not None
+            result = estimate(case(sheet), data.observation).against(data.truth)
+            found.append((result.estimate - TRUTH) / result.std)
+        z[told is None] = np.std(found)
+    # Standard error of an SD of 120 numbers: 1 / sqrt(240) = 0.065.
+    assert z[False] == pytest.approx(1.0, abs=4 * 0.065)
+    assert z[True] > 1.5
+
+
+def smooth_sheet(points: np.ndarray) -> Sheet:
+    """A sheet whose neighbours move alike, as correlated errors do."""
+    sheet = Sheet()
+    field = np.stack([points[:, 0] + 1.0, np.cos(points[:, 1] / 4.0) + 2.0], axis=-1)
+    sheet.A = np.repeat(field, 3, axis=0) * 20.0
+    return sheet
+
+
+class Wandering:
+    """A model whose predictions remember, beyond what is harmless, where it was before."""
+
+    def __init__(self) -> None:
+        self.sheet = Sheet()
+        self.closed: ClosedState | None = None
+        self.solves = 0
+
+    def restart(self, closed: ClosedState | None) -> None:
+        self.closed = closed
+
+    def __call__(self, m: np.ndarray) -> Prediction:
+        self.solves += 1
+        found = self.sheet(m)
+        memory = 0.0 if self.closed is None else 1e-6 * self.closed.at[0]
+        self.closed = ClosedState(m.copy(), np.zeros((1, 3)))
+        return Prediction(found.y + memory, found.jacobian)
+
+
+def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
+    observations = [observe(noise_mm=0.3, seed=seed).observation for seed in range(4)]
+    start = case().prior.mean
+
+    def estimates(chosen: list[int], shared: bool = True) -> list[bytes]:
+        model = Wandering()
+        used = SharedStart(model, start) if shared else model
+        results = [estimate(case(used), observations[k]) for k in chosen]
+        solves = sum(r.filtered.forward_solves for r in results)
+        assert model.solves == (solves - len(chosen) + 1 if shared else solves)
+        return [r.estimate.tobytes() + r.std.tobytes() for r in results]
+
+    together = estimates([0, 1, 2, 3])
+    assert estimates([2]) + estimates([3, 1]) + estimates([0]) == [
+        together[k] for k in (2, 3, 1, 0)
+    ]
+    # The model is one for which this is not a matter of course.
+    assert estimates([0, 1, 2], shared=False)[2] != estimates([2], shared=False)[0]

@@ -1,14 +1,16 @@
 """Covariance R of the observation noise, used only through W with Wᵀ W = R⁻¹.
 
-An n × n matrix is never formed densely: R is one variance, n variances, or a sparse matrix.
+An n × n matrix is never formed densely: R is one variance, n variances, or a sparse matrix. Noise
+with a structure of its own (see `kronecker_noise`) is given factorised.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import splu, spsolve_triangular
 
 from mvest.errors import InputError
@@ -21,9 +23,6 @@ SparseMatrix: TypeAlias = "sparse.sparray[Any, Any] | sparse.spmatrix[Any]"
 
 CscMatrix: TypeAlias = "sparse.csc_array[np.float64]"
 """A sparse matrix by columns in double precision."""
-
-NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix"
-"""R as one variance, n variances (n,), or a sparse symmetric positive definite (n, n) matrix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +45,17 @@ class ObservationNoise:
     whiten: Callable[[FloatArray], FloatArray]
 
 
+NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix | ObservationNoise"
+"""R as one variance, n variances (n,), a sparse symmetric positive definite (n, n) matrix,
+or factorised already."""
+
+
 def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     """Check a noise covariance and factorise it once.
 
     Parameters
     ----------
-    R : scalar, (n,) or sparse (n, n), in squared units of the observation
+    R : scalar, (n,), sparse (n, n) or ObservationNoise, in squared units of the observation
     size : int
         Number n of observations.
 
@@ -60,6 +64,10 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     InputError
         If R is dense, has the wrong size, or is not symmetric positive definite.
     """
+    if isinstance(R, ObservationNoise):
+        if R.size != size:
+            raise InputError(f"R is of {R.size} observations, expected {size}")
+        return R
     if isinstance(R, sparse.sparray | sparse.spmatrix):
         return _sparse_noise(csc(R), size)
     variance = np.asarray(R, dtype=np.float64)
@@ -79,6 +87,43 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
 
     log_determinant = float(np.sum(np.log(np.broadcast_to(variance, (size,)))))
     return ObservationNoise(size, log_determinant, whiten)
+
+
+def kronecker_noise(variance: float, root: FloatArray, copies: int) -> ObservationNoise:
+    """Noise of points, each observed in several coordinates, R = variance · (L Lᵀ ⊗ I).
+
+    Parameters
+    ----------
+    variance : float
+        In squared units of the observation.
+    root : (k, k)
+        Lower triangular L with a positive diagonal.
+    copies : int
+        Coordinates of each point; they are independent and follow one another in the observation.
+    """
+    k = len(root)
+    scale = 1.0 / np.sqrt(variance)
+
+    def whiten(values: FloatArray) -> FloatArray:
+        by_point = np.reshape(values, (k, -1))
+        solved = solve_triangular(root, by_point, lower=True, check_finite=False)
+        return scale * np.reshape(np.asarray(solved, dtype=np.float64), np.shape(values))
+
+    log_determinant = copies * (k * np.log(variance) + 2.0 * np.sum(np.log(np.diagonal(root))))
+    return ObservationNoise(copies * k, float(log_determinant), whiten)
+
+
+def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
+    """Noise of observations one after another that are independent of each other."""
+    ends = np.cumsum([part.size for part in parts])
+
+    def whiten(values: FloatArray) -> FloatArray:
+        pieces = np.split(values, ends[:-1])
+        return np.concatenate([p.whiten(v) for p, v in zip(parts, pieces, strict=True)])
+
+    return ObservationNoise(
+        int(ends[-1]), float(sum(part.log_determinant for part in parts)), whiten
+    )
 
 
 def csc(matrix: SparseMatrix) -> CscMatrix:

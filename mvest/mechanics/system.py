@@ -149,6 +149,10 @@ class System:
         self.solid.reset()
         self.factors = factors
 
+    def forget_contact(self) -> None:
+        """Drop what earlier contact has left in the sparsity pattern."""
+        self._build_pattern(np.zeros((0, 2), dtype=np.int64))
+
     # -- sparsity ---------------------------------------------------------------------------------
     def _static_groups(self) -> list[IntArray]:
         groups = [self.solid.mesh.elements]

@@ -26,6 +26,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
+UNSEEN = (0.75, 0.75, 0.75)
 DPI = 200
 
 VIEWS = (("from the atrium", 90.0, -90.0), ("from the side", 12.0, -60.0))
@@ -69,7 +70,8 @@ def iterates_figure(record: Mapping[str, Any]) -> Figure:
 def valve_figure(fields: Path) -> Figure:
     """The fitted valve open and closed, from the atrium and from the side.
 
-    The closed valve is coloured by the distance of each vertex from where it was observed.
+    The closed valve is coloured by the distance of each vertex from where it was observed, and grey
+    where it was not seen (NaN).
 
     Parameters
     ----------
@@ -87,13 +89,14 @@ def valve_figure(fields: Path) -> Figure:
     figure = Figure(figsize=(8.4, 6.4), layout="constrained")
     tissue = np.array([_rgb(COLOURS[r % len(COLOURS)]) for r in region])
     unit, factor = next(
-        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * distance.max() >= 0.1),
+        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * np.nanmax(distance) >= 0.1),
         ("nm", 1e6),
     )
     distance = factor * distance
-    norm = Normalize(0.0, max(float(distance.max()), 1e-3))
+    norm = Normalize(0.0, max(float(np.nanmax(distance)), 1e-3))
     shown = ScalarMappable(norm, DISTANCE_MAP)
-    coloured = shown.to_rgba(distance[triangles].mean(axis=1))[:, :3]
+    mean = distance[triangles].mean(axis=1)
+    coloured = np.where(np.isnan(mean)[:, None], UNSEEN, shown.to_rgba(mean)[:, :3])
     columns = (("open", rest, tissue), ("closed", closed, coloured))
     span = (np.minimum(rest.min(0), closed.min(0)), np.maximum(rest.max(0), closed.max(0)))
     axes = []

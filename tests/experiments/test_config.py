@@ -9,6 +9,7 @@ from experiments.build import build_filter, build_twin, truth_mesh
 from experiments.config import hash_of, register
 from experiments.mirror import build
 from mvest.model import MechanicsSettings
+from mvest.observation_errors import WhiteNoise
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
@@ -101,7 +102,7 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     assert type(twin.case.filter).__name__ == "IteratedFilter"
     assert twin.model.mesh.element_type == "tet4"
     assert {tissue.reading for tissue in twin.model.settings.tissue.values()} == {"C"}
-    assert twin.noise_mm == 0.5
+    assert twin.errors == (WhiteNoise(0.5),)
     assert list(twin.variance) == [0.01, 0.25]  # type: ignore[arg-type]
     # Truth and estimator share the mesh here, but no object that could carry a value across.
     assert twin.truth_model is not twin.model

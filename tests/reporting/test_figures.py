@@ -58,6 +58,19 @@ def test_valve_is_drawn_open_and_closed_from_two_sides(fields) -> None:
     assert figure.axes[4].get_ylim() == pytest.approx((0.0, 0.3))
 
 
+def test_unseen_vertices_are_grey(fields) -> None:
+    with np.load(fields) as data:
+        arrays = dict(data)
+    arrays["distance"][arrays["triangles"][0, 0]] = np.nan
+    np.savez(fields, **arrays)
+    figure = valve_figure(fields)
+    closed = figure.axes[1].collections[0].get_facecolor()[:, :3]
+    touched = np.any(arrays["triangles"] == arrays["triangles"][0, 0], axis=1)
+    grey = np.ptp(closed, axis=1) < 1e-9
+    # Faces are drawn by depth; shading keeps grey grey, and the map of distances has no grey.
+    assert grey.sum() == touched.sum() < len(grey)
+
+
 def test_missing_or_damaged_fields_are_named(tmp_path) -> None:
     with pytest.raises(InputError, match="no fields of a valve"):
         valve_figure(tmp_path / "none.npz")
