@@ -31,7 +31,7 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 """The folder of the configuration."""
 
 REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
-"""What a wrong request raises; anything else is a mistake of this program's, and shows its trace."""
+"""What a wrong request raises; anything else is a mistake of ours and keeps its trace."""
 
 TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable with which a user asks for tracebacks."""
