@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import guard, progress
+from experiments import guard, progress, sweep
 from experiments.folder import mark_done, write_failure
 from experiments.job import STUDIES
 from experiments.plan import Plan, PlannedJob
@@ -135,6 +135,31 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     assert "seed=2  [failed before: RuntimeError: it broke]" in out
     assert "about " in out
     assert len(runs()) == 4
+
+
+@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_sweep", "_tell"])
+def test_nothing_is_launched_after_a_mistake_of_ours(run, monkeypatch, broken):
+    # Hydra only warns of what a callback raises, and would then launch every job in its own way.
+    def fail(*_):
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setattr(sweep, broken, fail)
+    dry = ("dry_run=true",) if broken == "_tell" else ()
+    with pytest.raises(ZeroDivisionError):
+        run("sweep=debug", *dry)
+    assert runs() == []
+    assert not list(Path().rglob("result.json"))
+
+
+def test_a_closed_pipe_ends_a_dry_run(run, monkeypatch):
+    def closed(_):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(sweep, "_tell", closed)
+    status, _, err = run("sweep=debug", "dry_run=true")
+    assert status == 2
+    assert "Broken pipe" in err
+    assert not Path("outputs").exists()
 
 
 def test_a_sweep_may_be_the_union_of_grids(run):
