@@ -20,7 +20,7 @@ from experiments.donor import run_donor
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.progress import SolveBar, announce_compilation
 from experiments.record import make_record, measure_frames, write_fields
-from experiments.tracking import log_run
+from experiments.tracking import track_job
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.model import ClosureModel
 from mvest.provenance import write_json
@@ -79,11 +79,11 @@ def run_job(config: DictConfig) -> None:
     require_writable(folder)
     announce_compilation()
     kind = STUDIES[values["study"]]
-    record, files = kind.run(values, hash_of(config), folder, started)
+    record, _ = kind.run(values, hash_of(config), folder, started)
 
     write_json(folder / "config.json", values)
     write_json(folder / "result.json", record)
-    tables = kind.tables(folder, record)
+    kind.tables(folder, record)
     print(kind.text(record))
     print(f"Written to {folder}")
     if values["publish"] and record["status"] == "converged":
@@ -93,12 +93,7 @@ def run_job(config: DictConfig) -> None:
             print(f"Results in {target}")
         else:
             print(f"{values['paths']['results']} left as it is: this run has overrides")
-    if values["tracking"]["enabled"]:
-        artifacts = [folder / "result.json", folder / "config.json", *tables, *files]
-        try:
-            log_run(record, values, artifacts, started)
-        except MvestError as error:
-            print(f"warning: {error}; the result is in {folder}", file=sys.stderr)
+    track_job(folder, values)
     if record["status"] != "converged":
         raise FailedRunError(
             record["reason"] + f" ({record['detail']})" * bool(record["detail"]), folder
