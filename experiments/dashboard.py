@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from experiments.sync import LAST_SWEEP, jobs_in
 from experiments.tracking import RECEIPT, Store, open_store, read_json, telling
 from mvest.errors import InputError, MvestError
 
-__all__ = ["Comparison", "main", "save_comparison", "serve"]
+__all__ = ["Comparison", "command", "main", "save_comparison", "wait_for"]
 
 VIEW = "last_sweep"
 """Key of the saved view, the same for every sweep of an experiment."""

@@ -21,7 +21,7 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.progress import SolveBar, announce_compilation
 from experiments.record import make_record, measure_frames, write_fields
 from experiments.tracking import track_job
-from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.errors import ConfigurationError, InputError
 from mvest.model import ClosureModel
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables

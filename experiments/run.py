@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.job import FailedRunError, run_job
+from experiments.slurm import register_launcher
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -47,6 +48,7 @@ def main() -> int:
                 raise
             ended.append(error)
 
+    register_launcher()
     # Hydra then lets exceptions through, so that they can be told in one line here.
     os.environ[TRACEBACKS] = "1"
     try:

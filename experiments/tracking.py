@@ -38,10 +38,10 @@ __all__ = [
     "SWEEP_UPLOADS",
     "Store",
     "TrackingError",
+    "first_line",
     "is_tracked",
     "open_store",
     "read_json",
-    "first_line",
     "telling",
     "track_job",
     "upload",
@@ -150,8 +150,8 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     """
     if uri is not None and PASSWORD.search(uri):
         raise ConfigurationError(
-            "tracking.uri holds a password, which would be written into every config.json: leave it "
-            "out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
+            "tracking.uri holds a password, which would be written into every config.json; leave "
+            "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
         )
     for name, value in MANNERS.items():
         os.environ.setdefault(name, value)
