@@ -18,7 +18,6 @@ from mvest.estimation import (
     Identity,
     IteratedFilter,
     Log,
-    ObservationModel,
     PaperFilter,
     Transform,
     observation_noise,
@@ -63,7 +62,7 @@ class Twin:
         The estimator's.
     truth_model : ClosureModel
         The observation's; an object of its own.
-    source : ObservationModel
+    source : StoredModel
         ``truth_model`` behind its store on disk.
     truth_values : (p,)
     valve : Valve
@@ -76,7 +75,7 @@ class Twin:
     case: Case
     model: ClosureModel
     truth_model: ClosureModel
-    source: ObservationModel
+    source: StoredModel
     truth_values: FloatArray
     valve: Valve
     variance: float | FloatArray

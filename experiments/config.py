@@ -6,6 +6,7 @@ it is written down here.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,9 +18,21 @@ from mvest.model import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.template import TemplateParameters
 
-__all__ = ["NOT_THE_RESULT", "hash_of", "register"]
+__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
-NOT_THE_RESULT = ("hydra", "paths", "tracking")
+NOT_THE_RESULT = (
+    "hydra",
+    "paths",
+    "tracking",
+    "sweep",
+    "factors",
+    "figures",
+    "publish",
+    "force",
+    "dry_run",
+    "time_limit_s",
+    "isolate",
+)
 """Parts of a configuration that change no number of the result, left out of its hash."""
 
 
@@ -155,16 +168,36 @@ class Config:
     continuation: bool = True  # later closures start from the last closed state
     guided: bool = False  # the first closure is followed on coarser meshes
     confirm: bool = True  # close the fitted valve anew from the open state
+    measure: bool = True  # orifice, coaptation and passing ball of the fitted valve: seconds
     seed: int = 1
+    figures: bool = True  # draw the run; a sweep need not draw every job
+    force: bool = False  # run again what is done
+    dry_run: bool = False  # only say what would run, and how long it would take
+    time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
+    isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
+    factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
+    # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of
+    # which it is the union; empty for a run by itself.
+    sweep: dict[str, Any] = field(default_factory=dict)
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
+def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
+    """A configuration, without some of its parts, as resolved plain data."""
+    found: dict[str, Any] = {}
+    for key in map(str, config):
+        if key not in without:
+            # Part by part: a copy without the others would take longer than everything else here.
+            value = MISSING if OmegaConf.is_missing(config, key) else config[key]
+            is_part = OmegaConf.is_config(value)
+            found[key] = OmegaConf.to_container(value, resolve=True) if is_part else value
+    return found
+
+
 def hash_of(config: DictConfig) -> str:
     """SHA-256 of everything in a configuration that can change the result."""
-    keys = [str(key) for key in config if key not in NOT_THE_RESULT]
-    plain = OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
-    return config_hash(plain)  # type: ignore[arg-type]
+    return config_hash(plain(config, NOT_THE_RESULT))
 
 
 def register() -> None:

@@ -2,45 +2,40 @@
 
 from __future__ import annotations
 
-import re
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from experiments.build import Twin, build_twin
-from experiments.config import NOT_THE_RESULT, hash_of, register
+from experiments.config import register
 from experiments.donor import run_donor
+from experiments.folder import (
+    CONFIG,
+    RESULT,
+    clear,
+    finished_record,
+    lock,
+    mark_done,
+    require_writable,
+)
 from experiments.gate import run_closure_study, run_gate_study
-from experiments.progress import SolveBar, announce_compilation
-from experiments.record import make_record, measure_frames, write_fields
+from experiments.guard import run_apart
+from experiments.progress import announce_compilation
+from experiments.request import Request
 from experiments.tracking import track_job
-from mvest.errors import ConfigurationError, InputError
-from mvest.model import ClosureModel
+from experiments.twin import run_twin
+from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
-from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
-from mvest.study import ObservedFrames, StudyResult, estimate, simulate_observation
 
-__all__ = ["FailedRunError", "run_job"]
-
-TYPICAL_SOLVES = 6
-"""Forward solves that a filter usually needs; only the progress bar's first guess."""
-
-LOCKING = (
-    "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
-    "belong to the mesh, not to the tissue"
-)
+__all__ = ["STUDIES", "FailedRunError", "Study", "compute", "require_study", "run_job"]
 
 # Workers of a launcher import this module before they compose their configuration.
 register()
@@ -55,11 +50,46 @@ class FailedRunError(Exception):
         self.folder = folder
 
     def __str__(self) -> str:
-        return f"{self.reason} (recorded in {self.folder / 'result.json'})"
+        return f"{self.reason} (recorded in {self.folder / RESULT})"
 
 
 def run_job(config: DictConfig) -> None:
-    """Run one composed configuration in Hydra's output folder.
+    """Run one composed configuration by itself in Hydra's output folder, unless it is done.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible or a file cannot be written.
+    FailedRunError
+        If the computation found no estimate; the run is recorded all the same.
+    """
+    request = Request.of(config)
+    values, folder = request.values, request.folder
+    study = require_study(values)
+    require_writable(folder)
+    if values["time_limit_s"] is not None:
+        # Only another process can be stopped at any moment.
+        record = run_apart(request)
+        print(study.text(record) if record["repeats"] else record["reason"])
+        _raise_failure(record, folder)
+        return
+    with lock(folder):
+        done = None if values["force"] else finished_record(folder, request.config_hash)
+        if done is None:
+            clear(folder)
+            compute(request)
+            return
+    print(study.text(done))
+    source = done["provenance"]
+    print(
+        f"Done on {source['finished']} by commit {(source['git']['sha'] or 'unknown')[:12]}, in "
+        f"{folder}; force=true runs it again"
+    )
+    _publish(request, done)
+
+
+def compute(request: Request) -> dict[str, Any]:
+    """Run a job in its folder, which exists: its record, which is then on disk with its figures.
 
     Raises
     ------
@@ -69,77 +99,43 @@ def run_job(config: DictConfig) -> None:
         If the computation found no estimate; the run is recorded all the same.
     """
     started = time.time()
-    hydra = HydraConfig.get()
-    folder = Path(hydra.runtime.output_dir)
-    values: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
-    if values["study"] not in STUDIES:
-        raise ConfigurationError(
-            f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
-        )
-    require_writable(folder)
+    values, folder = request.values, request.folder
+    study = require_study(values)
     announce_compilation()
-    kind = STUDIES[values["study"]]
-    record, _ = kind.run(values, hash_of(config), folder, started)
+    record, _ = study.run(values, request.config_hash, folder, started)
+    record["factors"] = values["factors"]
 
-    write_json(folder / "config.json", values)
-    write_json(folder / "result.json", record)
-    kind.tables(folder, record)
-    print(kind.text(record))
+    write_json(folder / CONFIG, values)
+    write_json(folder / RESULT, record)
+    if values["figures"]:
+        study.tables(folder, record)
+    print(study.text(record))
     print(f"Written to {folder}")
-    if values["publish"] and record["status"] == "converged":
-        if _as_published(hydra.overrides.task, hydra.sweeper.get("params")):
-            target = Path(values["paths"]["results"])
-            kind.publish(target, _slug(values, hydra), record, folder)
-            print(f"Results in {target}")
-        else:
-            print(f"{values['paths']['results']} left as it is: this run has overrides")
+    _publish(request, record)
+    if record["status"] == "converged":
+        mark_done(folder)
     track_job(folder, values)
+    _raise_failure(record, folder)
+    return record
+
+
+def _publish(request: Request, record: Mapping[str, Any]) -> None:
+    """Let the results take over a run of an experiment as it is configured."""
+    values = request.values
+    if not values["publish"] or values["sweep"] or record["status"] != "converged":
+        return
+    results = Path(values["paths"]["results"])
+    if request.publish_as is None:
+        print(f"{results} left as it is: this run has overrides")
+        return
+    require_study(values).publish(results, request.publish_as, record, request.folder)
+    print(f"Results in {results}")
+
+
+def _raise_failure(record: Mapping[str, Any], folder: Path) -> None:
     if record["status"] != "converged":
-        raise FailedRunError(
-            record["reason"] + f" ({record['detail']})" * bool(record["detail"]), folder
-        )
-
-
-def run_twin(
-    config: Mapping[str, Any], config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """A synthetic study: the record, and the figures written to ``folder``."""
-    twin = build_twin(config)
-    if twin.model.mesh.element_type == "tet4":
-        print(LOCKING, file=sys.stderr)
-    result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
-    confirmed = _confirm(twin, result) if config["confirm"] else None
-    mesh = twin.model.mesh
-    closure = None
-    if result.fitted is not None:
-        thickness = float(twin.valve.surface.thickness.mean())
-        reach = twin.model.settings.contact.activation_distance * thickness
-        closure = measure_frames(twin.valve, result, reach)
-    record = make_record(
-        result,
-        config,
-        config_hash=config_hash,
-        meshes={
-            "sha256": mesh.sha256,
-            "nodes": len(mesh.nodes),
-            "elements": len(mesh.elements),
-            "truth_sha256": twin.truth_model.mesh.sha256,
-        },
-        closure=closure,
-        truth_values=twin.truth_values,
-        started=started,
-    )
-    record["confirmed_mm"] = confirmed
-    if confirmed is not None:
-        record["forward_solves"] += 1
-    files: list[Path] = []
-    if record["iterates"]:
-        files += save_figure(folder / "iterates", iterates_figure(record), record)
-    if result.fitted is not None:
-        fields = folder / "fields.npz"
-        write_fields(fields, twin.valve.surface, result)
-        files += save_figure(folder / "valve", valve_figure(fields), record)
-    return record, files
+        detail = f" ({record['detail']})" if record["detail"] else ""
+        raise FailedRunError(record["reason"] + detail, folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,70 +189,16 @@ STUDIES: dict[str, Study] = {
 """Kinds of studies that a configuration can name."""
 
 
-def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
-    with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
-        twin.truth_model.on_step = bar.step
-        data = simulate_observation(
-            twin.source,
-            twin.case.parameters,
-            twin.truth_values,
-            frames=twin.frames,
-            variance=twin.variance,
-            noise_mm=twin.noise_mm,
-            rng=rng,
-        )
-    if data.observation is None:
-        return StudyResult.failed(twin.case, data.reason, 0.0)
-    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES) as bar:
-        twin.model.on_step = bar.step
-        result = estimate(twin.case, data.observation)
-    return result.against(data.truth)
+def require_study(values: Mapping[str, Any]) -> Study:
+    """The kind of study that a configuration names.
 
-
-def _confirm(twin: Twin, result: StudyResult) -> float | None:
-    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
-
-    None where every closure started from the open state, so that there is nothing to confirm, or
-    where the new closure failed.
+    Raises
+    ------
+    ConfigurationError
+        If there is no such kind.
     """
-    usual = twin.model.continuation, twin.model.guide
-    if result.estimate is None or result.fitted is None or usual == (False, None):
-        return None
-    twin.model.continuation, twin.model.guide = False, None
-    with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
-        twin.model.on_step = bar.step
-        anew = ObservedFrames(twin.model, twin.frames)(result.estimate)
-    twin.model.continuation, twin.model.guide = usual
-    if not anew.converged:
-        return None
-    last = anew.y.reshape(result.fitted.shape)[-1]
-    return float(np.linalg.norm(last - result.fitted[-1], axis=1).max())
-
-
-def _steps(model: ClosureModel) -> Sequence[object]:
-    return model.settings.protocol.steps()
-
-
-def _as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
-    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
-    allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
-    keys = (re.split(r"[=.]", override.lstrip("+~"), maxsplit=1)[0] for override in overrides)
-    return all(key in allowed for key in keys)
-
-
-def _slug(values: Mapping[str, Any], hydra: Any) -> str:
-    """Name of a published record: the experiment's, with its row if it has several."""
-    if str(hydra.mode).endswith("MULTIRUN"):
-        return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
-    return str(values["name"])
-
-
-def require_writable(folder: Path) -> None:
-    """Refuse a folder that cannot be written, before anything is computed."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
+    if values["study"] not in STUDIES:
+        raise ConfigurationError(
+            f"study = {values['study']!r}, expected one of {', '.join(STUDIES)}"
+        )
+    return STUDIES[values["study"]]

@@ -1,7 +1,8 @@
 """The one application: ``python -m experiments.run experiment=NAME [overrides] [--multirun]``.
 
-Exit status: 0 done; 1 a run found no estimate (it is recorded, with its reason); 2 the request is
-wrong (one line says how); 130 interrupted (nothing is left half-written).
+Exit status: 0 done; 1 a run, or a job of a sweep, found no estimate (it is recorded, with its
+reason); 2 the request is wrong (one line says how) or nothing can be written; 130 interrupted
+(nothing is left half-written).
 """
 
 from __future__ import annotations
@@ -13,14 +14,13 @@ from itertools import takewhile
 from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
-from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.job import FailedRunError, run_job
 from experiments.slurm import register_launcher
+from experiments.sweep import StopApplication
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -44,8 +44,6 @@ def main() -> int:
         try:
             run_job(config)
         except (MvestError, FailedRunError) as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise
             ended.append(error)
 
     register_launcher()
@@ -55,8 +53,15 @@ def main() -> int:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
+    except StopApplication as stop:
+        if stop.error is None:
+            return stop.status
+        if wants_tracebacks:
+            raise stop.error from None
+        print(f"error: {explain(stop.error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
-        print("interrupted: nothing of this run was kept", file=sys.stderr)
+        print("interrupted: what was not finished was not kept", file=sys.stderr)
         return 130
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)

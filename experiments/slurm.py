@@ -7,7 +7,9 @@ that died comes back as failed, with Slurm's word for why.
 
 from __future__ import annotations
 
+import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -128,13 +130,14 @@ class SlurmLauncher(Launcher):
         array = str(jobs[0].job_id).split("_")[0]
         print(f"Slurm array {array}: {len(jobs)} jobs; `scancel {array}` ends it", file=sys.stderr)
         try:
-            return [
-                _ended(job, overrides) for job, overrides in zip(jobs, job_overrides, strict=True)
-            ]
+            lost = _wait(jobs, array, self._poll_s)
         except KeyboardInterrupt:
-            for job in jobs:
-                job.cancel(check=False)
+            subprocess.run(["scancel", array], check=False)
             raise
+        return [
+            _ended(job, overrides, job in lost)
+            for job, overrides in zip(jobs, job_overrides, strict=True)
+        ]
 
 
 def register_launcher() -> None:
@@ -154,23 +157,55 @@ def _for_executor(settings: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _ended(job: Any, overrides: Sequence[str]) -> JobReturn:
-    """How a job ended, once it has."""
+def _wait(jobs: Sequence[Any], array: str, poll_s: float) -> set[Any]:
+    """Wait until every job has ended; returns those of which Slurm no longer knows anything.
+
+    A job that is cancelled before it starts may never appear in Slurm's accounting, where submitit
+    would look for it for ever. It is lost when the queue does not have it either, twice in a row.
+    """
+    waiting, missed, lost = list(jobs), set(), set()
+    asked = time.monotonic()
+    while waiting:
+        waiting = [job for job in waiting if not job.done()]
+        if waiting and time.monotonic() - asked > poll_s:
+            asked = time.monotonic()
+            queued = _queued(array)
+            if queued is not None:
+                gone = {job for job in waiting if str(job.job_id) not in queued}
+                lost |= gone & missed
+                waiting = [job for job in waiting if job not in lost]
+                missed = gone
+        time.sleep(min(1.0, poll_s))
+    return lost
+
+
+def _queued(array: str) -> set[str] | None:
+    """Ids of the array's jobs that wait or run; None if the queue could not be asked."""
+    asked = subprocess.run(
+        ["squeue", "--noheader", "--array", "--jobs", array, "--format", "%i"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if asked.returncode == 0:
+        return set(asked.stdout.split())
+    # Of an array that ended some minutes ago the queue knows nothing.
+    return set() if "Invalid job id" in asked.stderr else None
+
+
+def _ended(job: Any, overrides: Sequence[str], lost: bool) -> JobReturn:
+    """How a job ended."""
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
-    try:
-        returned: JobReturn = job.results()[0]
-        return returned
-    except (FailedJobError, UncompletedJobError, OSError, EOFError):
-        return JobReturn(
-            overrides=list(overrides),
-            status=JobStatus.FAILED,
-            _return_value=JobDiedError(_obituary(job)),
-        )
-
-
-def _obituary(job: Any) -> str:
-    """Why a job left nothing, in a line."""
-    state = str(job.state).split(" ")[0].upper()
-    words = WORDS.get(state, f"Slurm's state is {state}")
-    return f"Slurm job {job.job_id}: {words}; its output is in {job.paths.stdout}"
+    reason = f"Slurm job {job.job_id}: it was cancelled before it began"
+    if not lost:
+        try:
+            returned: JobReturn = job.results()[0]
+            return returned
+        except (FailedJobError, UncompletedJobError, OSError, EOFError):
+            state = str(job.state).split(" ")[0].upper()
+            words = WORDS.get(state, f"Slurm's state is {state}")
+            reason = f"Slurm job {job.job_id}: {words}; its output is in {job.paths.stdout}"
+    return JobReturn(
+        overrides=list(overrides), status=JobStatus.FAILED, _return_value=JobDiedError(reason)
+    )

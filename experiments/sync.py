@@ -21,6 +21,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from experiments.folder import is_done
 from experiments.tracking import (
     RECEIPT,
     REMEDY,
@@ -67,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for job in jobs_in(folder):
             try:
                 config = read_json(job / "config.json")
-                if config["tracking"]["enabled"]:
+                if config["tracking"]["enabled"] and is_complete(job):
                     key = config["tracking"]["uri"], str(config["name"])
                     groups.setdefault(key, []).append(job)
             except (MvestError, KeyError) as error:
@@ -91,6 +92,11 @@ def jobs_in(folder: Path) -> list[Path]:
         if (path.parent / "config.json").is_file()
     }
     return sorted(found)
+
+
+def is_complete(job: Path) -> bool:
+    """Whether a job has ended: it has failed, or its marker says that everything is on disk."""
+    return is_done(job) or read_json(job / "result.json").get("status") != "converged"
 
 
 def _sync_experiment(uri: str | None, outputs: Path, name: str, jobs: Sequence[Path]) -> int:
@@ -237,6 +243,8 @@ class SweepUploader:
             try:
                 if is_tracked(job) or not read_json(job / "config.json")["tracking"]["enabled"]:
                     self._seen[job] = changed
+                    continue
+                if not is_complete(job):
                     continue
             except InputError as error:
                 tqdm.write(f"warning: not in MLflow: {error}", file=sys.stderr)

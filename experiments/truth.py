@@ -8,14 +8,20 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
+import sys
+import uuid
+import zipfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 
 import mvest
+from mvest.errors import InputError
 from mvest.estimation import ObservationModel, Prediction
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray
@@ -33,12 +39,18 @@ def truth_key(values: Mapping[str, Any]) -> str:
     for part in FORWARD_MODEL:
         place = root / part
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            source.update(_code(path).encode())
+            about = path.stat()
+            source.update(_code(path, about.st_mtime_ns, about.st_size).encode())
     return config_hash({"source": source.hexdigest(), **values})
 
 
-def _code(path: Path) -> str:
-    """What a file does: its syntax tree without comments, layout and docstrings."""
+@cache
+def _code(path: Path, changed: int, size: int) -> str:
+    """What a file does: its syntax tree without comments, layout and docstrings.
+
+    Parsing the library takes longer than some jobs, so a process does it once, unless a file was
+    ``changed`` (ns) or has another ``size``.
+    """
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -55,31 +67,87 @@ def _code(path: Path) -> str:
 class StoredModel:
     """A model whose converged predictions are kept on disk, without their Jacobian.
 
+    Of several processes that need the same one, the first simulates it and the others wait.
+
     Parameters
     ----------
     model : ObservationModel
     folder : Path
     key : str
         See :func:`truth_key`; the parameters are added to it.
+
+    Attributes
+    ----------
+    hits, misses : int
+        How often a prediction was read, and how often simulated.
     """
 
     def __init__(self, model: ObservationModel, folder: Path, key: str) -> None:
         self._model = model
         self._folder = folder
         self._key = key
+        self.hits = 0
+        self.misses = 0
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is zero."""
+        """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is zero.
+
+        Raises
+        ------
+        InputError
+            If the store cannot be written.
+        """
         name = config_hash({"key": self._key, "m": [float(v).hex() for v in m]})
         path = self._folder / f"{name}.npz"
-        if path.is_file():
-            with np.load(path, allow_pickle=False) as stored:
-                y = stored["y"]
-            return Prediction(y, np.zeros((len(y), len(m))))
+        found = _read(path, len(m))
+        if found is None:
+            _make(self._folder)
+            with FileLock(self._folder / f".{name}.lock"):
+                found = _read(path, len(m))
+                if found is None:
+                    self.misses += 1
+                    return self._simulate(m, path)
+        self.hits += 1
+        return found
+
+    def _simulate(self, m: FloatArray, path: Path) -> Prediction:
+        """The model's own prediction, kept if it converged; the caller holds the entry's lock."""
+        for part in self._folder.glob(f"{path.stem}.*.part"):
+            # Left by a process that was killed while it wrote.
+            part.unlink(missing_ok=True)
         prediction = self._model(m)
         if prediction.converged:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with NamedTemporaryFile(dir=self._folder, suffix=".part", delete=False) as part:
-                np.savez(part, y=prediction.y)
-            Path(part.name).replace(path)
+            part = self._folder / f"{path.stem}.{uuid.uuid4().hex}.part"
+            try:
+                try:
+                    with part.open("xb") as stream:
+                        np.savez(stream, y=prediction.y)
+                        stream.flush()
+                        os.fsync(stream.fileno())
+                    part.replace(path)
+                finally:
+                    part.unlink(missing_ok=True)
+            except OSError as error:
+                raise InputError(f"cannot write {path}: {error.strerror or error}") from error
         return prediction
+
+
+def _read(path: Path, parameters: int) -> Prediction | None:
+    """A stored prediction; None if there is none, or only what a broken disk left of it."""
+    try:
+        # Opened here: NumPy leaves what it opened and could not read to the garbage collector.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            y = stored["y"]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        print(f"note: {path} is damaged and is made again", file=sys.stderr)
+        return None
+    return Prediction(y, np.zeros((len(y), parameters)))
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}") from error

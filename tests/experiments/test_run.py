@@ -145,6 +145,10 @@ ERRORS = [
     ("study=magic", "study = 'magic', expected one of twin"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("paths.outputs=file", "file"),
+    ("sweep=nope", "Could not find 'sweep/nope'; known: "),
+    ("sweep.size=full", "sweep.size"),
+    ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
+    ("force=perhaps", "force: Value 'perhaps'"),
 ]  # fmt: skip
 
 
@@ -229,7 +233,7 @@ def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing
     status, _, err = run("experiment=debug", "hydra.run.dir=here")
     assert status == 130
     assert err.startswith("interrupted")
-    assert [path.name for path in (tmp_path / "here").iterdir()] == [".hydra"]
+    assert {path.name for path in (tmp_path / "here").iterdir()} == {".hydra", ".lock"}
     assert not (tmp_path / "outputs").exists()
 
 
@@ -266,6 +270,48 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     assert again == kept
 
 
+def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of_closing) -> None:
+    calls = []
+
+    def counted(m, rest) -> Prediction:
+        calls.append(m)
+        return shrinking(m, rest)
+
+    instead_of_closing(counted)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false")
+    status, first, err = run(*usual)
+    assert status == 0, err
+    (folder,) = (tmp_path / "outputs" / "debug").iterdir()
+    assert (folder / "done").exists()
+    once = len(calls)
+    status, again, _ = run(*usual)
+    assert (status, len(calls)) == (0, once)
+    assert "force=true runs it again" in again
+    assert again.splitlines()[:5] == first.splitlines()[:5]
+    assert run(*usual, "force=true")[0] == 0
+    assert len(calls) > once
+
+
+def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
+    instead_of_closing(shrinking)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "hydra.run.dir=here")
+    assert run(*usual)[0] == 0
+    _, out, _ = run(*usual, "seed=2")
+    assert "force=true" not in out
+    assert json.loads(Path("here/result.json").read_text())["provenance"]["seed"] == 2
+
+
+def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
+    status, out, err = run("experiment=debug", "dry_run=true")
+    assert status == 0, err
+    assert "1 jobs, 0 done" in out
+    assert "time unknown" in out
+    assert not list(tmp_path.iterdir())
+    status, out, err = run("experiment=debug", "dry_run=true", "filter.P0=-1")
+    assert (status, out) == (2, "")
+    assert "filter.P0 = -1" in err
+
+
 @pytest.mark.slow
 def test_an_experiment_of_several_runs_keeps_a_record_of_each(
     run, tmp_path, instead_of_closing
@@ -274,6 +320,7 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(
     status, _, err = run(
         "experiment=mesh_independence",
         "hydra/launcher=basic",
+        "isolate=false",
         "tracking.enabled=false",
         "paths.results=published",
     )

@@ -1,6 +1,9 @@
 """Stored truths: found again, and never in the place of another one."""
 
+import errno
 import shutil
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 import experiments.truth
 import mvest
 from experiments.truth import FORWARD_MODEL, StoredModel, truth_key
+from mvest.errors import InputError
 from mvest.estimation import Prediction
 
 
@@ -39,7 +43,7 @@ def test_the_second_call_reads_from_disk(tmp_path):
     assert second.converged
     assert second.jacobian.shape == (5, 2)
     assert not np.any(second.jacobian)
-    assert [path.suffix for path in folder.iterdir()] == [".npz"]
+    assert [path.suffix for path in folder.iterdir() if path.name[0] != "."] == [".npz"]
 
 
 @pytest.mark.parametrize("change", [("other", AT), ("key", AT * [1, 1 + 1e-15]), ("key", AT[::-1])])
@@ -54,7 +58,7 @@ def test_another_key_or_other_parameters_are_another_truth(tmp_path, change):
 def test_a_failure_is_not_stored(tmp_path):
     failing = Model("it buckled")
     assert StoredModel(failing, tmp_path, "key")(AT).reason == "it buckled"
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("*.npz"))
     assert StoredModel(Model(), tmp_path, "key")(AT).converged
 
 
@@ -74,6 +78,67 @@ def test_what_was_written_half_is_never_read(tmp_path, monkeypatch):
     assert model.calls == 2
     np.testing.assert_array_equal(StoredModel(model, tmp_path, "key")(AT).y, y)
     assert model.calls == 2
+
+
+def test_hits_and_misses_are_counted(tmp_path):
+    first, second = (StoredModel(Model(), tmp_path, "key") for _ in range(2))
+    first(AT)
+    second(AT)
+    assert (first.hits, first.misses, second.hits, second.misses) == (0, 1, 1, 0)
+
+
+def test_one_of_several_simulates_and_the_others_wait(tmp_path):
+    # Locks of threads exclude each other as those of processes do: each opens the file anew.
+    begun = threading.Barrier(4)
+
+    class Slow(Model):
+        def __call__(self, m):
+            time.sleep(0.05)
+            return super().__call__(m)
+
+    models = [Slow() for _ in range(4)]
+
+    def use(model):
+        begun.wait()
+        StoredModel(model, tmp_path, "key")(AT)
+
+    threads = [threading.Thread(target=use, args=(model,)) for model in models]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sum(model.calls for model in models) == 1
+
+
+def test_leftovers_of_a_killed_writer_are_taken_away(tmp_path):
+    StoredModel(Model(), tmp_path, "key")(AT)
+    (entry,) = tmp_path.glob("*.npz")
+    entry.rename(tmp_path / f"{entry.stem}.0123.part")
+    other = tmp_path / "another.0123.part"
+    other.touch()
+    StoredModel(Model(), tmp_path, "key")(AT)
+    assert list(tmp_path.glob("*.part")) == [other]
+    assert entry.exists()
+
+
+def test_a_damaged_entry_is_made_again(tmp_path, capsys):
+    y = StoredModel(Model(), tmp_path, "key")(AT).y
+    (entry,) = tmp_path.glob("*.npz")
+    entry.write_bytes(entry.read_bytes()[:40])
+    again = StoredModel(Model(), tmp_path, "key")
+    np.testing.assert_array_equal(again(AT).y, y)
+    assert again.misses == 1
+    assert "damaged" in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_no_half_entry(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(experiments.truth.os, "fsync", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        StoredModel(Model(), tmp_path, "key")(AT)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".lock"]
 
 
 VALUES = {"mesh": {"columns": 72, "rows": 8}, "element": "hex27", "dt_factor": 0.25}

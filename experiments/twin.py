@@ -1,0 +1,120 @@
+"""A synthetic study: simulate an observation, estimate from it, write down how close it came."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.build import Twin, build_twin
+from experiments.progress import SolveBar
+from experiments.record import make_record, measure_frames, write_fields
+from mvest.model import ClosureModel
+from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+from mvest.study import ObservedFrames, StudyResult, estimate, simulate_observation
+
+__all__ = ["run_twin"]
+
+TYPICAL_SOLVES = 6
+"""Forward solves that a filter usually needs; only the progress bar's first guess."""
+
+LOCKING = (
+    "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
+    "belong to the mesh, not to the tissue"
+)
+
+
+def run_twin(
+    config: Mapping[str, Any], config_hash: str, folder: Path, started: float
+) -> tuple[dict[str, Any], list[Path]]:
+    """A synthetic study: the record, and the figures written to ``folder``."""
+    twin = build_twin(config)
+    if twin.model.mesh.element_type == "tet4":
+        print(LOCKING, file=sys.stderr)
+    began = time.perf_counter()
+    result = _estimate_twin(twin, np.random.default_rng(config["seed"]))
+    confirmed = _confirm(twin, result) if config["confirm"] else None
+    computing = time.perf_counter() - began
+    mesh = twin.model.mesh
+    closure = None
+    if config["measure"] and result.fitted is not None:
+        thickness = float(twin.valve.surface.thickness.mean())
+        reach = twin.model.settings.contact.activation_distance * thickness
+        closure = measure_frames(twin.valve, result, reach)
+    record = make_record(
+        result,
+        config,
+        config_hash=config_hash,
+        meshes={
+            "sha256": mesh.sha256,
+            "nodes": len(mesh.nodes),
+            "elements": len(mesh.elements),
+            "truth_sha256": twin.truth_model.mesh.sha256,
+        },
+        closure=closure,
+        truth_values=twin.truth_values,
+        started=started,
+    )
+    record["confirmed_mm"] = confirmed
+    record["seconds_computing"] = computing
+    record["truth_store"] = "hit" if twin.source.hits else "miss"
+    if confirmed is not None:
+        record["forward_solves"] += 1
+    files: list[Path] = []
+    if not config["figures"]:
+        return record, files
+    if record["iterates"]:
+        files += save_figure(folder / "iterates", iterates_figure(record), record)
+    if result.fitted is not None:
+        fields = folder / "fields.npz"
+        write_fields(fields, twin.valve.surface, result)
+        files += save_figure(folder / "valve", valve_figure(fields), record)
+    return record, files
+
+
+def _estimate_twin(twin: Twin, rng: np.random.Generator) -> StudyResult:
+    with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
+        twin.truth_model.on_step = bar.step
+        data = simulate_observation(
+            twin.source,
+            twin.case.parameters,
+            twin.truth_values,
+            frames=twin.frames,
+            variance=twin.variance,
+            noise_mm=twin.noise_mm,
+            rng=rng,
+        )
+    if data.observation is None:
+        return StudyResult.failed(twin.case, data.reason, 0.0)
+    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES) as bar:
+        twin.model.on_step = bar.step
+        result = estimate(twin.case, data.observation)
+    return result.against(data.truth)
+
+
+def _confirm(twin: Twin, result: StudyResult) -> float | None:
+    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
+
+    None where every closure started from the open state, so that there is nothing to confirm, or
+    where the new closure failed.
+    """
+    usual = twin.model.continuation, twin.model.guide
+    if result.estimate is None or result.fitted is None or usual == (False, None):
+        return None
+    twin.model.continuation, twin.model.guide = False, None
+    with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
+        twin.model.on_step = bar.step
+        anew = ObservedFrames(twin.model, twin.frames)(result.estimate)
+    twin.model.continuation, twin.model.guide = usual
+    if not anew.converged:
+        return None
+    last = anew.y.reshape(result.fitted.shape)[-1]
+    return float(np.linalg.norm(last - result.fitted[-1], axis=1).max())
+
+
+def _steps(model: ClosureModel) -> Sequence[object]:
+    return model.settings.protocol.steps()
