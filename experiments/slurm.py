@@ -163,7 +163,9 @@ def _wait(jobs: Sequence[Any], array: str, poll_s: float) -> set[Any]:
     A job that is cancelled before it starts may never appear in Slurm's accounting, where submitit
     would look for it for ever. It is lost when the queue does not have it either, twice in a row.
     """
-    waiting, missed, lost = list(jobs), set(), set()
+    waiting = list(jobs)
+    missed: set[Any] = set()
+    lost: set[Any] = set()
     asked = time.monotonic()
     while waiting:
         waiting = [job for job in waiting if not job.done()]

@@ -112,7 +112,7 @@ class LaunchSweep(Callback):
         except REFUSED as error:
             raise StopApplication(2, error) from error
         finally:
-            callbacks.on_multirun_end(config=config, config_name=config_name)
+            callbacks.on_multirun_end(config=config, **more)
         raise StopApplication(status)
 
 
@@ -148,6 +148,9 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
                 returned = _launch(config, left, context)
         except KeyboardInterrupt as error:
             interrupted = error
+        except ConfigurationError:
+            # Refused before any job was launched.
+            raise
         except Exception as error:
             # A launcher raises whatever its system tells it; the jobs that ended are on disk.
             lost = f"{type(error).__name__}: {_first_sentence(error)}"
