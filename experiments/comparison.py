@@ -12,7 +12,7 @@ from typing import Any
 
 from mvest.provenance import config_hash
 
-__all__ = ["axes", "inputs", "metrics", "parameters"]
+__all__ = ["axes", "inputs", "metrics", "parameters", "short_names"]
 
 Values = Mapping[str, Any]
 
@@ -42,7 +42,7 @@ def parameters(config: Values, record: Values) -> dict[str, str]:
     """Settings of a run by short dotted names; numbers are texts that read as numbers.
 
     A list gets one name for each of its values: the parameter's where there is one value for each
-    (``initial.E_f.anterior``), a count from 0 otherwise. Of a matrix the diagonal is named. What is
+    (``initial.anterior``), a count from 0 otherwise. Of a matrix the diagonal is named. What is
     varied in a sweep (``factors``) keeps the short names given to it there.
 
     Parameters
@@ -52,7 +52,7 @@ def parameters(config: Values, record: Values) -> dict[str, str]:
     record : mapping
         The contents of ``result.json``.
     """
-    names = list(record["parameters"])
+    names = short_names(record["parameters"])
     left_out = {*NOT_COMPARED, *({"donor"} if config["study"] != "donor" else ())}
     found: dict[str, Any] = {}
     for name, value in _leaves({k: v for k, v in config.items() if k not in left_out}):
@@ -65,6 +65,16 @@ def parameters(config: Values, record: Values) -> dict[str, str]:
     factors = dict(_leaves(config.get("factors") or {}))
     found |= {name: value for name, value in factors.items() if name not in found}
     return {name: _text(value) for name, value in found.items() if value not in (None, "")}
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names of parameters without what all of them begin with: ``E_f.anterior`` -> ``anterior``.
+
+    MLflow's charts cut long names off.
+    """
+    stems = {name.split(".")[0] for name in names}
+    together = len(stems) == 1 and all("." in name for name in names)
+    return [name.split(".", 1)[1] if together else name for name in names]
 
 
 def metrics(record: Values) -> list[tuple[str, float, int]]:
@@ -80,7 +90,7 @@ def metrics(record: Values) -> list[tuple[str, float, int]]:
     done = [run for run in runs if run.get("status") == "converged"]
     found: list[tuple[str, float | None, int]] = []
     errors: list[float] = []
-    for k, name in enumerate(record["parameters"]):
+    for k, name in enumerate(short_names(record["parameters"])):
         estimates = _column(done, "estimate", k)
         error = [100.0 * abs(value) for value in _column(done, "relative_error", k)]
         errors += error
@@ -213,7 +223,16 @@ def axes(runs: Sequence[tuple[Mapping[str, str], Iterable[str]]]) -> tuple[list[
         wanted = [n for n in sorted(measured) if n.startswith("estimate.")] + ["distance.mean"]
     else:
         wanted.append("error.mean")
-    return ordered([*always, *varied]), [name for name in wanted if name in measured]
+    columns = {
+        name: tuple(float(one[name]) for one in settings) for name in ordered([*always, *varied])
+    }
+    # What a sweep calls by a name of its own often is a setting that has an axis already.
+    different = [n for n in columns if n in always or n == _first(columns, columns[n])]
+    return different, [name for name in wanted if name in measured]
+
+
+def _first(columns: Mapping[str, tuple[float, ...]], column: tuple[float, ...]) -> str:
+    return next(name for name, other in columns.items() if other == column)
 
 
 def _leaves(values: Values, prefix: str = "") -> list[tuple[str, Any]]:

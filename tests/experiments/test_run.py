@@ -92,7 +92,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert tags["config_hash"] == provenance["config_hash"]
     assert tags["status"] == "converged"
     assert {"sweep_id", "git_sha", "mesh_hash"} <= set(tags)
-    assert metrics["estimate.E_f.anterior"] == pytest.approx(record["estimate"][0])
+    assert metrics["estimate.anterior"] == pytest.approx(record["estimate"][0])
     assert settings["filter.initial.0"] == "5.0"
     assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 

@@ -109,11 +109,11 @@ def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
     config["filter"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
     found = comparison.parameters(config, make_record())
     assert found["P0"] == "0.01"
-    assert (found["initial.E_f.anterior"], found["initial.E_f.posterior"]) == ("5.0", "3.0")
-    assert (found["Q.E_f.anterior"], found["Q.E_f.posterior"]) == ("0.1", "0.2")
+    assert (found["initial.anterior"], found["initial.posterior"]) == ("5.0", "3.0")
+    assert (found["Q.anterior"], found["Q.posterior"]) == ("0.1", "0.2")
     assert found["noise"] == "0.5"
     assert found["kind"] == "white"
-    assert found["truth.E_f.posterior"] == "2.09"
+    assert found["truth.posterior"] == "2.09"
     assert not [name for name in found if name.startswith(("paths", "tracking", "donor"))]
     assert "truth.source" not in found, "a setting that is not set would make its axis no number"
 
@@ -129,12 +129,12 @@ def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
     ]  # fmt: skip
     found = comparison.metrics(make_record(repeats=runs))
     single = {name: value for name, value, _ in found if not name.startswith(("repeat", "iterate"))}
-    assert single["error.E_f.anterior"] == pytest.approx((4 + 2) / 2)
+    assert single["error.anterior"] == pytest.approx((4 + 2) / 2)
     assert single["error.mean"] == pytest.approx((4 + 2 + 2 + 4) / 4)
-    assert single["estimate.E_f.anterior"] == pytest.approx(6.2)
-    assert single["spread.E_f.anterior"] == pytest.approx(0.4 / 2**0.5)
+    assert single["estimate.anterior"] == pytest.approx(6.2)
+    assert single["spread.anterior"] == pytest.approx(0.4 / 2**0.5)
     assert (single["failed"], single["seconds"], single["iterations"]) == (1, 6.0, 2)
-    seeds = [(v, step) for name, v, step in found if name == "repeat.estimate.E_f.anterior"]
+    seeds = [(v, step) for name, v, step in found if name == "repeat.estimate.anterior"]
     assert seeds == [(6.0, 4), (6.4, 5)]
 
 
@@ -149,8 +149,13 @@ def test_a_failed_run_has_no_errors() -> None:
 def test_axes_are_what_varies_in_the_order_of_a_study() -> None:
     settings = {"noise": "0.5", "filter": "paper", "P0": "0.1", "initial.a": "5", "rows": "3"}
     numbers = ["error.mean", "error.a", "seconds"]
-    runs = [(settings, numbers), ({**settings, "rows": "4", "filter": "iterated"}, numbers)]
-    assert comparison.axes(runs) == (["P0", "initial.a", "noise", "rows"], ["error.a", "error.mean"])
+    settings |= {"cells": "3"}
+    changed = {"rows": "4", "cells": "4", "filter": "iterated"}
+    runs = [(settings, numbers), ({**settings, **changed}, numbers)]
+    assert comparison.axes(runs) == (
+        ["P0", "initial.a", "noise", "rows"],
+        ["error.a", "error.mean"],
+    )
 
 
 # --- upload -------------------------------------------------------------------------------------
@@ -168,7 +173,7 @@ def test_a_job_becomes_one_flat_run(tmp_path) -> None:
     assert (tags["git_sha"], tags["status"], tags["reason"]) == ("a" * 40, "converged", "tolerance")
     assert "mlflow.parentRunId" not in tags
     assert float(run.data.params["P0"]) == 0.01
-    assert run.data.metrics["error.E_f.anterior"] == pytest.approx(4.0)
+    assert run.data.metrics["error.anterior"] == pytest.approx(4.0)
     inputs = {one.tags[0].value: one.dataset for one in run.inputs.dataset_inputs}
     assert inputs["mesh"].digest == "m" * 36
     assert json.loads(inputs["observation"].source)["noise_mm"] == 0.5
@@ -198,7 +203,7 @@ def test_a_new_result_takes_the_place_of_the_old_one(tmp_path) -> None:
     assert not tracking.is_tracked(job)
     assert upload(store, job, None)
     (run,) = stored(tmp_path)
-    assert run.data.metrics["estimate.E_f.anterior"] == 6.1
+    assert run.data.metrics["estimate.anterior"] == 6.1
     assert run.data.tags["sweep_id"] == "sweep-1"
 
 
@@ -319,8 +324,8 @@ def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
 
     store, compared = save_comparison(tmp_path)
     assert len(compared.runs) == 3
-    assert compared.parameters[:2] == ("P0", "initial.E_f.anterior")
-    assert compared.metrics == ("error.E_f.anterior", "error.E_f.posterior", "error.mean")
+    assert compared.parameters[:2] == ("P0", "initial.anterior")
+    assert compared.metrics == ("error.anterior", "error.posterior", "error.mean")
     tags = store.client.get_experiment(store.experiment).tags
     saved = json.loads(tags["mlflow.sharedViewState.last_sweep"])
     assert json.loads(saved["state"]) == view_state(compared)
@@ -358,7 +363,11 @@ def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypat
     def serve() -> subprocess.Popen:
         command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1"]
         command += ["--port", "50917", "--workers", "1", "--backend-store-uri"]
-        command += [f"sqlite:///{tmp_path}/server.db", "--artifacts-destination", f"{tmp_path}/kept"]
+        command += [
+            f"sqlite:///{tmp_path}/server.db",
+            "--artifacts-destination",
+            f"{tmp_path}/kept",
+        ]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         server = subprocess.Popen(command, start_new_session=True, **quiet)
         until = time.monotonic() + 60.0
