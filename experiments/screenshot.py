@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["await_axes", "axis_labels", "browser", "main", "served"]
 
-WINDOW = (1600, 1140)
+WINDOW = (1600, 970)
 """Pixels."""
 
 PATIENCE = 60.0
