@@ -70,8 +70,9 @@ def run_job(config: DictConfig) -> None:
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
         record = run_apart(request)
-        print(study.text(record) if record["repeats"] else record["reason"])
         _raise_failure(record, folder)
+        print(study.text(record))
+        print(f"Written to {folder}")
         return
     with lock(folder):
         done = None if values["force"] else finished_record(folder, request.config_hash)

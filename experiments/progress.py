@@ -136,6 +136,7 @@ class SweepBar:
         while not self._ended.wait(pause):
             looked = time.monotonic()
             self.look()
+            self._bar.refresh()
             # Many folders on a slow disk are looked at less often.
             pause = max(LOOK, 10.0 * (time.monotonic() - looked))
             if self._bar.disable and looked - self._said > SAY:

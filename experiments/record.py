@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError, MvestError
+from mvest.errors import MvestError, cannot_write
 from mvest.provenance import provenance
 from mvest.study import StudyResult
 from mvest.typing import FloatArray
@@ -170,7 +170,7 @@ def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> No
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
+        raise cannot_write(path, error) from error
 
 
 def _list(values: FloatArray | None) -> list[Any] | None:

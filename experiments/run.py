@@ -31,6 +31,9 @@ PRIMARY = "In 'config': "
 CONF = Path(__file__).resolve().parent.parent / "conf"
 """The folder of the configuration."""
 
+REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
+"""What a wrong request raises; anything else is a mistake of ours and keeps its trace."""
+
 TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable with which a user asks for tracebacks."""
 
@@ -56,7 +59,7 @@ def main() -> int:
     except StopApplication as stop:
         if stop.error is None:
             return stop.status
-        if wants_tracebacks:
+        if wants_tracebacks or not isinstance(stop.error, REFUSED):
             raise stop.error from None
         print(f"error: {explain(stop.error)}", file=sys.stderr)
         return 2
@@ -66,7 +69,7 @@ def main() -> int:
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
-    except (MvestError, HydraException, OmegaConfBaseException, OSError) as error:
+    except REFUSED as error:
         if wants_tracebacks:
             raise
         print(f"error: {explain(error)}", file=sys.stderr)

@@ -12,7 +12,8 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from statistics import median
@@ -22,11 +23,9 @@ from hydra._internal.callbacks import Callbacks
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
-from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import HydraContext
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from experiments.check import require_admissible
 from experiments.collect import collect
@@ -46,9 +45,6 @@ FILE = "sweep.json"
 """The results of a sweep, in its folder."""
 
 
-REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
-"""What a wrong request raises."""
-
 PLANNED: ContextVar[Plan] = ContextVar("PLANNED")
 """The plan of the sweep that is being started: Hydra lets callbacks share nothing else."""
 
@@ -61,7 +57,7 @@ class StopApplication(BaseException):
     status : int
         Exit status.
     error : Exception or None
-        What was wrong with the request.
+        What went wrong.
     """
 
     def __init__(self, status: int, error: Exception | None = None) -> None:
@@ -70,32 +66,36 @@ class StopApplication(BaseException):
         self.error = error
 
 
+@contextmanager
+def _nothing_goes_on() -> Iterator[None]:
+    """Whatever is raised ends the application: Hydra would warn, and launch every job itself."""
+    try:
+        yield
+    except Exception as error:
+        raise StopApplication(2, error) from error
+
+
 class PlanRuns(Callback):
     """Finds out what a request means, and refuses a wrong one, before anything is written."""
 
+    @_nothing_goes_on()
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Say what would run, if that is all that is asked."""
         if config.dry_run:
-            try:
-                plan = plan_run(config)
-                require_admissible(plan.jobs[0].values)
-            except REFUSED as error:
-                raise StopApplication(2, error) from error
+            plan = plan_run(config)
+            require_admissible(plan.jobs[0].values)
             _tell(plan)
 
+    @_nothing_goes_on()
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Compose and check every job; say what is done and what is left."""
-        try:
-            plan = make_plan(config, GlobalHydra.instance().config_loader())
-            for job in plan.jobs:
-                _check(job.values, job.overrides)
-            if not config.dry_run:
-                require_writable(plan.folder)
-                plan.write()
-        except REFUSED as error:
-            raise StopApplication(2, error) from error
+        plan = make_plan(config, GlobalHydra.instance().config_loader())
+        for job in plan.jobs:
+            _check(job.values, job.overrides)
         if config.dry_run:
             _tell(plan)
+        require_writable(plan.folder)
+        plan.write()
         print(plan.summary())
         PLANNED.set(plan)
 
@@ -103,14 +103,13 @@ class PlanRuns(Callback):
 class LaunchSweep(Callback):
     """Runs a planned sweep and collects its results."""
 
+    @_nothing_goes_on()
     def on_multirun_start(self, config: DictConfig, **more: Any) -> None:
         """Launch what is to be run, collect, and end the application."""
         callbacks = Callbacks(config)
         context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
         try:
             status = run_sweep(config, PLANNED.get(), context)
-        except REFUSED as error:
-            raise StopApplication(2, error) from error
         finally:
             callbacks.on_multirun_end(config=config, **more)
         raise StopApplication(status)

@@ -21,7 +21,7 @@ import numpy as np
 from filelock import FileLock
 
 import mvest
-from mvest.errors import InputError
+from mvest.errors import InputError, cannot_write
 from mvest.estimation import ObservationModel, Prediction
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray
@@ -128,7 +128,7 @@ class StoredModel:
                 finally:
                     part.unlink(missing_ok=True)
             except OSError as error:
-                raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+                raise cannot_write(path, error) from error
         return prediction
 
 

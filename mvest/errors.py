@@ -4,6 +4,9 @@ A message says what is wrong, where (file, field, element number), and what woul
 computation that does not converge is no exception: it is a result whose `reason` says so.
 """
 
+import errno
+from pathlib import Path
+
 
 class MvestError(ValueError):
     """Root of everything that mvest raises on purpose."""
@@ -27,3 +30,10 @@ class ConfigurationError(InputError):
 
 class MeshingError(MvestError):
     """An admissible surface could not be filled with an admissible mesh."""
+
+
+def cannot_write(path: Path, error: OSError) -> InputError:
+    """What to raise where a file could not be written."""
+    wrong_place = error.errno in (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM)
+    hint = "; its folder must exist and be writable" if wrong_place else ""
+    return InputError(f"cannot write {path}: {error.strerror or error}{hint}")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, cannot_write
 
 KEY_PACKAGES = (
     "mvest",
@@ -180,9 +180,7 @@ def write_json(path: Path, value: Any) -> None:
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror}; its folder must exist and be writable"
-        ) from error
+        raise cannot_write(path, error) from error
 
 
 def _plain(value: Any, where: str) -> Any:

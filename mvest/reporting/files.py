@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mvest.errors import InputError
+from mvest.errors import cannot_write
 
 __all__ = ["provenance_line", "write_text", "write_with"]
 
@@ -42,9 +42,7 @@ def write_with(path: Path, write: Callable[[Path], None]) -> Path:
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror}; its folder must exist and be writable"
-        ) from error
+        raise cannot_write(path, error) from error
     return path
 
 

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import pytest
 
+import experiments.worker as worker_module
 from experiments.folder import is_done, last_record, lock, mark_done
 from experiments.guard import WorkerProcess, run_apart
+from experiments.job import FailedRunError
 from experiments.request import Request
+from mvest.errors import ConfigurationError
 from mvest.provenance import THREAD_VARIABLES, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -199,3 +202,22 @@ def test_a_process_ends_with_the_one_that_started_it(tmp_path):
         time.sleep(0.05)
     else:
         pytest.fail("the process outlived the one that started it")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason", "healthy"),
+    [
+        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0", True),
+        (FailedRunError("it buckled", Path("a")), None, True),
+        (MemoryError(), "out of memory", False),
+        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device", True),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero", False),
+    ],
+)
+def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason, healthy):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr(worker_module, "compute", fail)
+    answered = worker_module.answer(request(tmp_path))
+    assert answered == {"reason": reason, "healthy": healthy}

@@ -233,8 +233,10 @@ def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing
     status, _, err = run("experiment=debug", "hydra.run.dir=here")
     assert status == 130
     assert err.startswith("interrupted")
-    assert {path.name for path in (tmp_path / "here").iterdir()} == {".hydra", ".lock"}
-    assert not (tmp_path / "outputs").exists()
+    assert [path.name for path in (tmp_path / "here").iterdir()] == [".lock"]
+    # Whose turn it was to simulate the truth is all that is known of it.
+    left = [path for path in (tmp_path / "outputs").rglob("*") if path.is_file()]
+    assert [path.suffix for path in left] == [".lock"]
 
 
 def test_an_untracked_result_survives_a_broken_store(run, tmp_path, instead_of_closing) -> None:

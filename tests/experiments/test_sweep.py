@@ -7,12 +7,14 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from experiments import guard, progress
+from experiments import guard, progress, sweep
 from experiments.folder import mark_done, write_failure
+from experiments.job import STUDIES
 from experiments.plan import Plan, PlannedJob
 from experiments.progress import SweepBar
 from experiments.request import Request
@@ -134,12 +136,38 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     assert len(runs()) == 4
 
 
+@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_sweep", "_tell"])
+def test_nothing_is_launched_after_a_mistake_of_ours(run, monkeypatch, broken):
+    # Hydra only warns of what a callback raises, and would then launch every job in its own way.
+    def fail(*_):
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setattr(sweep, broken, fail)
+    dry = ("dry_run=true",) if broken == "_tell" else ()
+    with pytest.raises(ZeroDivisionError):
+        run("sweep=debug", *dry)
+    assert runs() == []
+    assert not list(Path().rglob("result.json"))
+
+
+def test_a_closed_pipe_ends_a_dry_run(run, monkeypatch):
+    def closed(_):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(sweep, "_tell", closed)
+    status, _, err = run("sweep=debug", "dry_run=true")
+    assert status == 2
+    assert "Broken pipe" in err
+    assert not Path("outputs").exists()
+
+
 def test_a_sweep_may_be_the_union_of_grids(run):
-    _, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true")
-    assert "14 jobs" in out
+    status, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true")
+    assert status == 0
+    assert "5 jobs" in out
     # What the command line says holds for every grid.
     _, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true", "filter.initial=[9,9],[1,1]")
-    assert out.count("start_anterior=9.0") == 8
+    assert out.count("start_anterior=9.0") == 3
 
 
 def test_a_sweep_from_the_command_line_is_planned_as_well(run):
@@ -259,6 +287,19 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
     assert err.startswith("interrupted")
     states = [job["status"] for job in collected()["jobs"]]
     assert states == ["converged", "converged", "failed", "failed"]
+
+
+def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
+    told = replace(STUDIES["twin"], text=lambda record: f"told: {record['status']}")
+    monkeypatch.setitem(STUDIES, "twin", told)
+    alone = ("experiment=debug", "time_limit_s=600", "seed=2")
+    Path("raise-2").touch()
+    status, _, err = run(*alone)
+    assert status == 1
+    assert err.startswith("no estimate: RuntimeError: it broke (recorded in ")
+    status, out, err = run(*alone)
+    assert (status, err) == (0, "")
+    assert out.startswith("told: converged")
 
 
 def planned(folder: Path, seed: int) -> PlannedJob:
