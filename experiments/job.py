@@ -25,7 +25,7 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.progress import announce_compilation
 from experiments.request import Request
-from experiments.tracking import track_job
+from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
@@ -66,6 +66,7 @@ def run_job(config: DictConfig) -> None:
     request = Request.of(config)
     values, folder = request.values, request.folder
     study = require_study(values)
+    require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.

@@ -42,6 +42,7 @@ __all__ = [
     "is_tracked",
     "open_store",
     "read_json",
+    "require_no_password",
     "telling",
     "track_job",
     "upload",
@@ -135,6 +136,21 @@ class Store:
         return found
 
 
+def require_no_password(uri: str | None) -> None:
+    """Refuse an address that would carry a password into every ``config.json``.
+
+    Raises
+    ------
+    ConfigurationError
+        If it holds one.
+    """
+    if uri is not None and PASSWORD.search(uri):
+        raise ConfigurationError(
+            "tracking.uri holds a password, which would be written into every config.json; leave "
+            "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
+        )
+
+
 def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     """Open the tracking store and the experiment, both created if need be.
 
@@ -148,11 +164,7 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     ConfigurationError
         If the address holds a password, which would be written down with every result.
     """
-    if uri is not None and PASSWORD.search(uri):
-        raise ConfigurationError(
-            "tracking.uri holds a password, which would be written into every config.json; leave "
-            "it out and put it in ~/.pgpass or MLFLOW_TRACKING_PASSWORD"
-        )
+    require_no_password(uri)
     for name, value in MANNERS.items():
         os.environ.setdefault(name, value)
     from mlflow.tracking import MlflowClient
