@@ -303,7 +303,7 @@ def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read
 
 def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(sync, "INTERVAL", 0.05)
-    make_job(tmp_path, "before")
+    upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, "before"), "an-earlier-sweep")
     plan = {"jobs": [{"folder": name} for name in ("before", "a", "b")]}
     (tmp_path / "debug" / "plan.json").write_text(json.dumps(plan))
     uploader = sync.SweepUploader(None, tmp_path, "debug")
