@@ -15,12 +15,11 @@ TEST_PROCESSES ?= 2
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
-TRACKING := sqlite:///$(CURDIR)/outputs/mlflow.db
 
-.PHONY: help install reproduce tables test test-all bench lint format dashboard lock clean
+.PHONY: help install reproduce tables test test-all bench lint format dashboard sync screenshot slurm-check lock clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@if [ -z "$(PYTHON)" ]; then echo "mvest needs Python 3.11 or newer; name one with make PYTHON=..." >&2; exit 1; fi
@@ -66,9 +65,19 @@ format: $(INSTALLED) ## rewrite the code in the house format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-dashboard: $(INSTALLED) ## MLflow on the recorded runs
-	@mkdir -p outputs
-	$(BIN)/mlflow ui --backend-store-uri $(TRACKING)
+dashboard: $(INSTALLED) ## MLflow's pages, on the comparison of the last sweep (PORT=5000)
+	$(BIN)/python -m experiments.dashboard $(if $(PORT),--port $(PORT))
+
+sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
+	$(BIN)/python -m experiments.sync
+
+screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium with its driver)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e .[browser]
+	$(BIN)/python -m experiments.screenshot
+
+slurm-check: $(INSTALLED) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e .[cluster]
+	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
 lock: $(INSTALLED) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
 	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra viz \

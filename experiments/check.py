@@ -9,6 +9,7 @@ import numpy as np
 
 from experiments.build import build_filter, mechanics_of
 from experiments.job import require_study
+from experiments.tracking import require_no_password
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation import observation_noise
 
@@ -24,6 +25,7 @@ def require_admissible(values: Mapping[str, Any]) -> None:
         If a setting is inadmissible; the message names it.
     """
     require_study(values)
+    require_no_password(values["tracking"]["uri"])
     for name in ("repeats", "time_limit_s"):
         if values.get(name) is not None and not values[name] > 0:
             raise ConfigurationError(f"{name} = {values[name]}, expected > 0")

@@ -22,7 +22,6 @@ from typing import Any
 from omegaconf import DictConfig
 
 from experiments.folder import (
-    RESULT,
     clear,
     finished_record,
     lock,
@@ -31,7 +30,7 @@ from experiments.folder import (
     write_failure,
 )
 from experiments.request import Request
-from experiments.tracking import log_run
+from experiments.tracking import track_job
 from mvest.errors import MvestError
 from mvest.provenance import THREAD_VARIABLES
 
@@ -180,11 +179,7 @@ def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str
                 return record
             reason = "it left no record"
         record = write_failure(request, reason, started)
-    if values["tracking"]["enabled"]:
-        try:
-            log_run(record, values, [request.folder / RESULT], started)
-        except MvestError as error:
-            print(f"warning: {error}; the result is in {request.folder}", file=sys.stderr)
+    track_job(request.folder, values)
     return record
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,9 +25,9 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.progress import announce_compilation
 from experiments.request import Request
-from experiments.tracking import log_run
+from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
-from mvest.errors import ConfigurationError, MvestError
+from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
@@ -67,6 +66,7 @@ def run_job(config: DictConfig) -> None:
     request = Request.of(config)
     values, folder = request.values, request.folder
     study = require_study(values)
+    require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
@@ -104,23 +104,20 @@ def compute(request: Request) -> dict[str, Any]:
     values, folder = request.values, request.folder
     study = require_study(values)
     announce_compilation()
-    record, files = study.run(values, request.config_hash, folder, started)
+    record, _ = study.run(values, request.config_hash, folder, started)
     record["factors"] = values["factors"]
 
     write_json(folder / CONFIG, values)
     write_json(folder / RESULT, record)
-    tables = study.tables(folder, record) if values["figures"] else []
+    if values["figures"]:
+        study.tables(folder, record)
     print(study.text(record))
     print(f"Written to {folder}")
     _publish(request, record)
-    if values["tracking"]["enabled"]:
-        artifacts = [folder / RESULT, folder / CONFIG, *tables, *files]
-        try:
-            log_run(record, values, artifacts, started)
-        except MvestError as error:
-            print(f"warning: {error}; the result is in {folder}", file=sys.stderr)
+    if record["status"] == "converged":
+        mark_done(folder)
+    track_job(folder, values)
     _raise_failure(record, folder)
-    mark_done(folder)
     return record
 
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments.job import FailedRunError, run_job
+from experiments.slurm import register_launcher
 from experiments.sweep import StopApplication
 from mvest.errors import MvestError
 
@@ -48,6 +49,7 @@ def main() -> int:
         except (MvestError, FailedRunError) as error:
             ended.append(error)
 
+    register_launcher()
     # Hydra then lets exceptions through, so that they can be told in one line here.
     os.environ[TRACEBACKS] = "1"
     try:

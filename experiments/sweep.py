@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -28,12 +29,12 @@ from omegaconf import DictConfig
 
 from experiments.check import require_admissible
 from experiments.collect import collect
-from experiments.folder import require_writable
+from experiments.folder import is_done, require_writable, write_failure
 from experiments.guard import run_guarded
 from experiments.job import FailedRunError, run_job
-from experiments.plan import Plan, make_plan, plan_run
+from experiments.plan import Plan, PlannedJob, make_plan, plan_run
 from experiments.progress import SweepBar, announce_compilation
-from experiments.request import as_published
+from experiments.request import Request, as_published
 from mvest.errors import ConfigurationError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reporting.report import write_report
@@ -108,8 +109,10 @@ class LaunchSweep(Callback):
         """Launch what is to be run, collect, and end the application."""
         callbacks = Callbacks(config)
         context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
-        status = run_sweep(config, PLANNED.get(), context)
-        callbacks.on_multirun_end(config=config, **more)
+        try:
+            status = run_sweep(config, PLANNED.get(), context)
+        finally:
+            callbacks.on_multirun_end(config=config, **more)
         raise StopApplication(status)
 
 
@@ -142,9 +145,12 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
         announce_compilation()
         try:
             with SweepBar(plan):
-                returned = _launch(config, [job.overrides for job in left], context)
+                returned = _launch(config, left, context)
         except KeyboardInterrupt as error:
             interrupted = error
+        except ConfigurationError:
+            # Refused before any job was launched.
+            raise
         except Exception as error:
             # A launcher raises whatever its system tells it; the jobs that ended are on disk.
             lost = f"{type(error).__name__}: {_first_sentence(error)}"
@@ -167,16 +173,25 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
 
 
 def _launch(
-    config: DictConfig, jobs: Sequence[Sequence[str]], context: HydraContext
+    config: DictConfig, jobs: Sequence[PlannedJob], context: HydraContext
 ) -> dict[str, dict[str, Any]]:
-    """Hand jobs to the configured launcher; short hash -> how the job ended."""
+    """Hand jobs to the configured launcher; short hash -> how the job ended.
+
+    A job of which the launcher says that it died is recorded here: no one else is left to do it.
+    """
+    began = time.time()
     # Whatever the user has set: a launcher's workers share the machine's cores.
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     task = run_guarded if config.isolate else sweep_task
     launcher = Plugins.instance().instantiate_launcher(
         hydra_context=context, task_function=task, config=config
     )
-    ends = launcher.launch([list(job) for job in jobs], initial_job_idx=0)
+    ends = launcher.launch([list(job.overrides) for job in jobs], initial_job_idx=0)
+    for job, end in zip(jobs, ends, strict=True):
+        if not _completed(end) and not is_done(job.folder):
+            require_writable(job.folder)
+            reason = _first_sentence(end._return_value)
+            write_failure(Request(job.values, job.config_hash, job.folder), reason, began)
     values = [end.return_value for end in ends if _completed(end)]
     return {value["hash"]: value for value in values if value is not None}
 

@@ -59,7 +59,7 @@ NEVER_IN_EXPERIMENTS = ("tests",)
 IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
     "hydra-joblib-launcher": ("hydra_plugins",),
-    "hydra-submitit-launcher": ("hydra_plugins",),
+    "hydra-submitit-launcher": ("hydra_plugins", "submitit"),
     "markdown-it-py": ("markdown_it",),
     "matplotlib": ("matplotlib", "mpl_toolkits"),
     "pillow": ("PIL",),
@@ -265,7 +265,11 @@ def test_what_is_imported_is_declared(project: dict) -> None:
     required = import_names(project["dependencies"])
     extras = project["optional-dependencies"]
     optional = import_names(
-        [text for name in ("viz", "imaging", "cluster") for text in extras[name]]
+        [
+            text
+            for name in ("viz", "imaging", "cluster", "postgres", "browser")
+            for text in extras[name]
+        ]
     )
     messages = [
         message

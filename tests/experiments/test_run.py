@@ -92,8 +92,8 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert tags["config_hash"] == provenance["config_hash"]
     assert tags["status"] == "converged"
     assert {"sweep_id", "git_sha", "mesh_hash"} <= set(tags)
-    assert metrics["estimate.E_f.anterior"] == pytest.approx(record["estimate"][0])
-    assert settings["filter.initial.0"] == "5.0"
+    assert metrics["estimate.anterior"] == pytest.approx(record["estimate"][0])
+    assert settings["initial.anterior"] == "5.0"
     assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 
 
@@ -145,6 +145,7 @@ ERRORS = [
     ("study=magic", "study = 'magic', expected one of twin"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("paths.outputs=file", "file"),
+    ("tracking.uri=http://me:" + "secret@example.org", "tracking.uri holds a password"),
     ("sweep=nope", "Could not find 'sweep/nope'; known: "),
     ("sweep.size=full", "sweep.size"),
     ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
