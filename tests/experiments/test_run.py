@@ -145,7 +145,7 @@ ERRORS = [
     ("study=magic", "study = 'magic', expected one of twin"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("paths.outputs=file", "file"),
-    ("tracking.uri=http://me:" + "secret@example.org", "tracking.uri holds a password"),
+    ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),
     ("sweep=nope", "Could not find 'sweep/nope'; known: "),
     ("sweep.size=full", "sweep.size"),
     ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
