@@ -199,15 +199,20 @@ def _ended(job: Any, overrides: Sequence[str], lost: bool) -> JobReturn:
     """How a job ended."""
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
-    reason = f"Slurm job {job.job_id}: it was cancelled before it began"
-    if not lost:
+    began = job.paths.stdout.exists()
+    words = "it died, of what Slurm's accounting does not say"
+    if lost and not began:
+        words = "it was cancelled before it began"
+    elif not lost:
         try:
             returned: JobReturn = job.results()[0]
             return returned
         except (FailedJobError, UncompletedJobError, OSError, EOFError):
             state = str(job.state).split(" ")[0].upper()
             words = WORDS.get(state, f"Slurm's state is {state}")
-            reason = f"Slurm job {job.job_id}: {words}; its output is in {job.paths.stdout}"
+    reason = f"Slurm job {job.job_id}: {words}"
+    if began:
+        reason += f"; its output is in {job.paths.stdout}"
     return JobReturn(
         overrides=list(overrides), status=JobStatus.FAILED, _return_value=JobDiedError(reason)
     )

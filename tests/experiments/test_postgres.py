@@ -7,6 +7,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,7 @@ PROCESSES, JOBS = 8, 10
 
 UPLOAD = """
 import sys
+import tempfile
 from pathlib import Path
 from experiments.tracking import open_store, upload
 uri, outputs, *jobs = sys.argv[1:]
@@ -40,11 +42,17 @@ def program(name: str) -> str:
 
 
 @pytest.fixture
-def server(tmp_path_factory) -> Iterator[str]:
+def place() -> Iterator[Path]:
+    """A folder that may be given to another account: pytest's own are closed to all others."""
+    with tempfile.TemporaryDirectory(prefix="mvest-postgres-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def server(place) -> Iterator[str]:
     """A throw-away cluster on the loopback address: its address for MLflow."""
     pytest.importorskip("psycopg", reason="the extra postgres is not installed")
     initdb, pg_ctl = program("initdb"), program("pg_ctl")
-    place = tmp_path_factory.mktemp("postgres")
     account: dict = {}
     if os.getuid() == 0:
         # The server refuses to run as root.
@@ -52,8 +60,6 @@ def server(tmp_path_factory) -> Iterator[str]:
             user = pwd.getpwnam("postgres")
         except KeyError:
             pytest.skip("PostgreSQL runs under an account of its own, and there is no postgres")
-        for folder in (place, *place.parents[:3]):
-            folder.chmod(0o755)
         os.chown(place, user.pw_uid, user.pw_gid)
         account = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
     with socket.socket() as probe:

@@ -13,13 +13,19 @@ cores=$(nproc)
 memory=$(($(awk '/MemTotal/ {print $2}' /proc/meminfo) / 1024 * 9 / 10))
 logs=/var/log/slurm
 
+# End the daemons that an earlier call has started, and wait until they are gone.
 stop() {
-    for daemon in slurmctld slurmd slurmdbd; do
-        if [ -f "/run/$daemon.pid" ]; then kill "$(cat "/run/$daemon.pid")" 2>/dev/null || true; fi
-        rm -f "/run/$daemon.pid"
+    local file pid
+    for file in /run/slurmctld.pid /run/slurmd.pid /run/slurmdbd.pid /run/mysqld/slurm-check.pid /run/munge/munged.pid; do
+        [ -s "$file" ] || continue
+        pid=$(cat "$file")
+        kill "$pid" 2>/dev/null || true
+        for _ in $(seq 100); do
+            kill -0 "$pid" 2>/dev/null || break
+            sleep 0.2
+        done
+        rm -f "$file"
     done
-    if [ -f /run/mysqld/slurm-check.pid ]; then kill "$(cat /run/mysqld/slurm-check.pid)" 2>/dev/null || true; fi
-    if [ -f /run/munge/munged.pid ]; then kill "$(cat /run/munge/munged.pid)" 2>/dev/null || true; fi
 }
 
 # Wait until a command succeeds, at most half a minute.
@@ -47,7 +53,6 @@ if [ ${#missing[@]} -gt 0 ]; then
 fi
 
 stop
-sleep 1
 mkdir -p /etc/slurm "$logs" /var/spool/slurmctld /var/spool/slurmd /run/munge /run/mysqld /var/log/munge
 chown munge:munge /run/munge /var/log/munge
 chown mysql:mysql /run/mysqld
