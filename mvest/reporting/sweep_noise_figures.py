@@ -71,18 +71,19 @@ def _families(runs: Sequence[Run], *, noisy: bool = False) -> list[Family]:
 def noise_figure(sweep: Sweep) -> Figure | None:
     """Error against the noise level: a row per parameter, a column per kind of noise.
 
-    Kinds with a single level stand side by side in one column.
+    Kinds with a single level stand side by side in one column, on a scale of their own: errors that
+    the filter is not told about are larger by an order of magnitude.
     """
     runs = runs_of(sweep)
     if not any(np.isfinite(run.error).any() for run in runs if run.converged):
         return None
     families, names = _families(runs), short_names(sweep["parameters"])
     figure, axes = _grid(families, names)
-    top = np.zeros(len(names))
+    top = np.zeros((len(names), len(families)))
     for column, family in enumerate(families):
         for k, name in enumerate(names):
             one = axes[k, column]
-            top[k] = max(top[k], _errors(one, family, k))
+            top[k, column] = _errors(one, family, k)
             if column == 0:
                 one.set_ylabel(f"error, {name} [% of truth]")
             if k == 0:
@@ -93,7 +94,11 @@ def noise_figure(sweep: Sweep) -> Figure | None:
             elif k == len(names) - 1:
                 one.set_xlabel("noise per coordinate [mm]")
     for k in range(len(names)):
-        axes[k, 0].set_ylim(0, 1.05 * top[k] or 1.0)
+        for scale in (True, False):
+            alike = [column for column, f in enumerate(families) if f.is_curve == scale]
+            for column in alike:
+                axes[k, column].set_ylim(0, 1.05 * top[k, alike].max() or 1.0)
+                axes[k, column].tick_params(labelleft=column == alike[0])
         last = [line for line in axes[k, -1].lines if line.get_label() in CURVES]
         ends = [(line.get_ydata()[-1], line.get_label(), line.get_color()) for line in last]
         label_ends(axes[k, -1], float(axes[k, -1].get_xlim()[1]), ends, gap=0.08)
@@ -111,7 +116,7 @@ def _grid(families: Sequence[Family], names: Sequence[str]) -> tuple[Figure, Any
     figure = Figure(figsize=(WIDTH, 2.4 * len(names) + 0.9), layout="constrained")
     widths = [max(3.0, len(f.groups)) if f.is_curve else 1.1 * len(f.groups) for f in families]
     axes = figure.subplots(
-        len(names), len(families), squeeze=False, sharex="col", sharey="row", width_ratios=widths
+        len(names), len(families), squeeze=False, sharex="col", width_ratios=widths
     )
     for one in axes.flat:
         plain_axes(one)
