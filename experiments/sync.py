@@ -194,8 +194,11 @@ class SweepUploader:
             self._upload_pending()
             store = self._open()
             for job in jobs:
-                # Jobs that were done before belong to the sweep that listed them last.
-                if read_json(job / RECEIPT).get("sweep_id") != sweep_id:
+                # Jobs that were done before belong to the sweep that listed them last, also those
+                # that were not to be tracked then.
+                receipt = job / RECEIPT
+                known = read_json(receipt) if receipt.is_file() else {}
+                if known.get("sweep_id") != sweep_id:
                     upload(store, job, sweep_id)
         except MvestError as error:
             self._warn(error)

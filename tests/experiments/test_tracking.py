@@ -304,7 +304,10 @@ def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read
 def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(sync, "INTERVAL", 0.05)
     upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, "before"), "an-earlier-sweep")
-    plan = {"jobs": [{"folder": name} for name in ("before", "a", "b")]}
+    untracked = make_config(tmp_path)
+    untracked["tracking"]["enabled"] = False
+    make_job(tmp_path, "kept-quiet", untracked)
+    plan = {"jobs": [{"folder": name} for name in ("before", "kept-quiet", "a", "b")]}
     (tmp_path / "debug" / "plan.json").write_text(json.dumps(plan))
     uploader = sync.SweepUploader(None, tmp_path, "debug")
     uploader.start()
@@ -318,12 +321,13 @@ def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
     uploader.finish()
     found = {run.data.tags["folder"]: run.data.tags["sweep_id"] for run in stored(tmp_path)}
     sweep = json.loads((tmp_path / "debug" / sync.LAST_SWEEP).read_text())
-    assert sweep["jobs"] == ["a", "b", "before"]
+    # Whoever sweeps with tracking wants to see the whole sweep, whatever its jobs were told before.
+    assert sweep["jobs"] == ["a", "b", "before", "kept-quiet"]
     assert {name for name, one in found.items() if one == sweep["sweep_id"]} == set(sweep["jobs"])
     assert found["of-another-sweep"] == "none"
 
     store, compared = save_comparison(tmp_path)
-    assert len(compared.runs) == 3
+    assert len(compared.runs) == 4
     assert compared.parameters[:2] == ("P0", "initial.anterior")
     assert compared.metrics == ("error.anterior", "error.posterior", "error.mean")
     tags = store.client.get_experiment(store.experiment).tags
