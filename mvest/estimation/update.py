@@ -13,7 +13,7 @@ from mvest.typing import FloatArray
 BLOCK_ROWS = 300
 """Rows of a block of the whitened Jacobian: with 20 parameters it fits a second-level cache."""
 BLOCKS_AT_A_TIME = 30
-"""Blocks that are decomposed in one call, which copies them: that many stay in the cache as well."""
+"""Blocks decomposed in one call, which copies them: so many stay in the cache as well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,7 @@ def _triangular_factor(A: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.qr(A, mode="r"))
     blocks = A[:whole].reshape(-1, rows, p)
     factors = [
-        np.linalg.qr(blocks[k : k + BLOCKS_AT_A_TIME], mode="r").reshape(-1, p)
+        np.asarray(np.linalg.qr(blocks[k : k + BLOCKS_AT_A_TIME], mode="r")).reshape(-1, p)
         for k in range(0, len(blocks), BLOCKS_AT_A_TIME)
     ]
     return _triangular_factor(np.concatenate([*factors, A[whole:]]))
