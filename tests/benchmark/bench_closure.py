@@ -10,7 +10,7 @@ from mvest.mechanics.steps import Step
 from mvest.model import boundary_loading
 from tests.benchmark.valves import CELLS, VALUES, Closed, close, closed, parameters
 
-ROUNDS = {"3k": 5, "7k": 3, "25k": 2}
+ROUNDS = {"2k": 5, "3k": 5, "7k": 3, "25k": 2}
 
 
 @pytest.fixture(scope="module", params=[f"{e}-{s}" for e, s in CELLS])
@@ -117,7 +117,7 @@ def test_closure(case, measure, count):
     if about["size"] == "25k" or (about["size"] == "7k" and count in (6, 20)):
         pytest.skip("large valves are closed from the open state with two derivatives, or guided")
     wanted = parameters(count)
-    rounds = {"3k": 2, "7k": 1}[about["size"]]
+    rounds = {"2k": 2, "3k": 2, "7k": 1}[about["size"]]
     about = about | {"rounds": rounds, "warmup": 0, "parameters": count, "peak_mb": c.peak_mb}
     simulation = measure(lambda: close(c, wanted), **about)
     # Locked tetrahedra have several closed states; guided, they need not end in this one.
