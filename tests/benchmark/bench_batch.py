@@ -17,11 +17,12 @@ def test_batch(measure, processes):
     def run():
         return predict_many(valve, values, processes=processes)
 
-    # The first round starts the processes and builds the mechanics in each; a study does so once.
+    # The first round, not counted, starts the processes; a study does so once. Building the
+    # mechanics in each process is part of a batch.
     predictions = measure(
         run,
         rounds=1,
-        warmup=0,
+        warmup=1,
         element="hex18",
         size="3k",
         points=CLOSURES,
