@@ -114,10 +114,12 @@ def test_guided_closure(case, measure):
 @pytest.mark.parametrize("count", [0, 2, 6, 20])
 def test_closure(case, measure, count):
     c, about = case
-    if about["size"] == "25k" or (about["size"] == "7k" and count in (6, 20)):
-        pytest.skip("large valves are closed from the open state with two derivatives, or guided")
+    if about["size"] in ("2k", "25k") or (about["size"] == "7k" and count in (6, 20)):
+        pytest.skip(
+            "from the open valve in two sizes only, the larger with two derivatives at most"
+        )
     wanted = parameters(count)
-    rounds = {"2k": 2, "3k": 2, "7k": 1}[about["size"]]
+    rounds = {"3k": 2, "7k": 1}[about["size"]]
     about = about | {"rounds": rounds, "warmup": 0, "parameters": count, "peak_mb": c.peak_mb}
     simulation = measure(lambda: close(c, wanted), **about)
     # Locked tetrahedra have several closed states; guided, they need not end in this one.
