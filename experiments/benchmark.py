@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from mvest.errors import InputError, MvestError
 from mvest.reporting.files import write_text, write_with
@@ -118,6 +119,9 @@ def benchmark_figure(table: pd.DataFrame) -> Figure:
             label=f"{what}, {element}: order {order:.2f}",
         )
     axes.set_xlabel("nodes")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("seconds, one thread")
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside right upper", fontsize=7)
