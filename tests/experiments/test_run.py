@@ -332,11 +332,12 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(
     assert kept == [
         "mesh-independence-hex18-structured-36-x-4.json",
         "mesh-independence-hex18-structured-36-x-8.json",
+        "mesh-independence-hex18-structured-40-x-5.json",
         "mesh-independence-hex18-structured-54-x-6.json",
         "mesh-independence-hex18-structured-72-x-8.json",
     ]
     table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
-    assert table.count("hex18 structured") == 4
+    assert table.count("hex18 structured") == 5
 
 
 def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:

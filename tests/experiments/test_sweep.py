@@ -363,12 +363,13 @@ def sweep_process(folder: Path, *more: str) -> subprocess.Popen:
 
 
 def worker_of(folder: Path) -> int:
-    """A process that computes in a folder."""
+    """A process that is in the middle of a job: its output goes to the job's log."""
     while True:
         for place in Path("/proc").glob("[0-9]*"):
             try:
                 here = (place / "cwd").readlink() == folder
-                if here and b"experiments.worker" in (place / "cmdline").read_bytes():
+                busy = here and (place / "fd" / "1").readlink().name == "log.txt"
+                if busy and b"experiments.worker" in (place / "cmdline").read_bytes():
                     return int(place.name)
             except OSError:
                 continue
