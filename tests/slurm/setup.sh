@@ -72,9 +72,10 @@ setsid mariadbd --user=mysql --datadir="$data" --socket="$socket" --pid-file=/ru
     --skip-networking --innodb-buffer-pool-size=128M --innodb-lock-wait-timeout=900 \
     </dev/null >"$logs/mariadbd.log" 2>&1 &
 await mariadb-admin --socket="$socket" ping
+password=$(od -An -N16 -tx1 /dev/urandom | tr -d ' \n')
 mariadb --socket="$socket" <<SQL
 create database if not exists slurm_acct_db;
-create user if not exists 'slurm'@'localhost' identified by 'slurm';
+create or replace user 'slurm'@'localhost' identified by '$password';
 grant all on slurm_acct_db.* to 'slurm'@'localhost';
 SQL
 
@@ -85,7 +86,7 @@ SlurmUser=root
 StorageType=accounting_storage/mysql
 StorageHost=localhost
 StorageUser=slurm
-StoragePass=slurm
+StoragePass=$password
 StorageLoc=slurm_acct_db
 LogFile=$logs/slurmdbd.log
 PidFile=/run/slurmdbd.pid
