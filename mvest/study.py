@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError
 from mvest.estimation import (
     Estimate,
     Filter,
@@ -26,11 +26,11 @@ from mvest.estimation import (
     identifiability,
 )
 from mvest.estimation.estimate import OnIterate
-from mvest.estimation.noise import NoiseCovariance, stacked_noise
 from mvest.estimation.prediction import require_finite
 from mvest.model import ClosedState, TissueSettings
+from mvest.observation import FRAMES, Observation, ObservedFrames, require_frames, select_frames
 from mvest.observation_errors import ObservationError, SpatialCorrelation, observe
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import FloatArray
 
 __all__ = [
     "FRAMES",
@@ -45,93 +45,6 @@ __all__ = [
     "estimate",
     "simulate_observation",
 ]
-
-FRAMES = ("open", "closed")
-"""Frames that a valve model predicts, in the order in which it stacks them."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
-    """What was seen, and how well.
-
-    Attributes
-    ----------
-    frames : tuple of str, (f,)
-        Observed frames, the closed one last.
-    positions : (f, n, 3) mm
-        Positions of the vertices in each frame; NaN where a vertex is not seen, so that nobody can
-        read what was not observed.
-    variance : (f,) mm²
-        Variance of each coordinate in each frame that the filter is to assume.
-    correlation : SpatialCorrelation or None
-        Correlation between vertices that the filter is to assume; None for independent errors.
-    """
-
-    frames: tuple[str, ...]
-    positions: FloatArray
-    variance: FloatArray
-    correlation: SpatialCorrelation | None = None
-
-    def __post_init__(self) -> None:
-        require_frames(self.frames)
-        positions = np.array(self.positions, dtype=np.float64)
-        if positions.ndim != 3 or positions.shape[0] != len(self.frames) or positions.shape[2] != 3:
-            raise InputError(
-                f"observed positions have shape {positions.shape}, expected "
-                f"({len(self.frames)}, n, 3): one row for each of {', '.join(self.frames)}"
-            )
-        unseen: BoolArray = np.all(np.isnan(positions), axis=2)
-        require_finite(np.where(unseen[..., None], 0.0, positions), "the observed positions")
-        if np.all(unseen):
-            raise InputError("no observed position is finite: no vertex is seen")
-        try:
-            variance = np.broadcast_to(np.asarray(self.variance, float), (len(self.frames),)).copy()
-        except ValueError:
-            raise InputError(
-                f"R has shape {np.shape(self.variance)}; expected one variance, or one for each of "
-                f"the {len(self.frames)} observed frames"
-            ) from None
-        require_finite(variance, "R")
-        if np.any(variance <= 0.0):
-            raise InputError(f"R = {variance.min():g} mm^2, expected > 0")
-        told = self.correlation
-        if told is not None and len(told.points) != positions.shape[1]:
-            raise InputError(
-                f"R is correlated between {len(told.points)} vertices, but {positions.shape[1]} "
-                f"are observed"
-            )
-        for name, values in (("positions", positions), ("variance", variance)):
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
-
-    @property
-    def seen(self) -> BoolArray:
-        """Which vertices are seen in each frame ``(f, n)``."""
-        return np.isfinite(self.positions[:, :, 0])
-
-    @property
-    def y(self) -> FloatArray:
-        """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
-        return self.positions[self.seen].ravel()
-
-    @property
-    def R(self) -> NoiseCovariance:
-        """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
-        counts = 3 * self.seen.sum(axis=1)
-        if self.correlation is None:
-            return np.repeat(self.variance, counts)
-        blocks = [
-            self.correlation.of(seen).noise(float(variance), 3)
-            for seen, variance in zip(self.seen, self.variance, strict=True)
-            if seen.any()
-        ]
-        return stacked_noise(blocks)
-
-
-def require_frames(frames: Sequence[str]) -> None:
-    """Raise InputError unless ``frames`` are different frames that a model predicts."""
-    if not frames or not set(frames) <= set(FRAMES) or len(set(frames)) != len(frames):
-        raise InputError(f"observed frames {list(frames)}, expected some of {list(FRAMES)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,46 +71,6 @@ class TwinData:
     observation: Observation | None
     truth: Truth | None
     reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ObservedFrames:
-    """The observed frames of a model that predicts all of ``FRAMES``.
-
-    Parameters that no tissue can have, as a filter may try, give a failed prediction.
-
-    Attributes
-    ----------
-    model : ObservationModel
-    frames : tuple of str, (f,)
-    seen : (f, n) or None
-        Vertices that are predicted in each frame; None for all.
-    """
-
-    model: ObservationModel
-    frames: tuple[str, ...]
-    seen: BoolArray | None = None
-    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
-
-    def whole(self, m: FloatArray) -> FloatArray | None:
-        """Positions ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
-        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict the observed frames of parameters ``m (p,)``."""
-        try:
-            prediction = self.model(m)
-        except MaterialError as error:
-            return Prediction.failed(str(error))
-        if not prediction.converged:
-            return prediction
-        y, jacobian = (_selected(a, self.frames) for a in (prediction.y, prediction.jacobian))
-        whole = y.reshape(len(self.frames), -1, 3)
-        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
-        if self.seen is not None:
-            rows = np.repeat(self.seen, 3)
-            y, jacobian = y[rows], jacobian[rows]
-        return Prediction(y, jacobian, reason=prediction.reason)
 
 
 class Restartable(Protocol):
@@ -248,13 +121,6 @@ class SharedStart:
         prediction, closed = self._first
         self._model.restart(closed)
         return prediction
-
-
-def _selected(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:
-    """Rows of the named frames out of all ``FRAMES``."""
-    size = len(stacked) // len(FRAMES)
-    starts = [size * FRAMES.index(frame) for frame in frames]
-    return np.concatenate([stacked[start : start + size] for start in starts])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -468,7 +334,7 @@ def simulate_observation(
     prediction = model(values)
     if not prediction.converged:
         return TwinData(None, None, f"no synthetic observation: {prediction.reason}")
-    positions = _selected(prediction.y, frames).reshape(len(frames), -1, 3)
+    positions = select_frames(prediction.y, frames).reshape(len(frames), -1, 3)
     seen = observe(positions, errors, rng)
     observation = Observation(tuple(frames), seen, np.asarray(variance), correlation)
     return TwinData(observation, Truth(tuple(parameters), values, positions), prediction.reason)

@@ -41,6 +41,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.gate": (*LEAVES, "mvest.model"),
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
     "mvest.observation_errors": (*LEAVES, "mvest.valve", "mvest.estimation"),
+    "mvest.observation": (*LEAVES, "mvest.estimation", "mvest.observation_errors"),
     "mvest.study": (
         *LEAVES,
         "mvest.provenance",
@@ -49,6 +50,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.imaging",
         "mvest.estimation",
         "mvest.model",
+        "mvest.observation",
         "mvest.observation_errors",
     ),
     "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
