@@ -124,7 +124,7 @@ def _grid(families: Sequence[Family], names: Sequence[str]) -> tuple[Figure, Any
 
 
 def _wrapped(text: str) -> str:
-    return fill(text, 12)
+    return fill(text, 11)
 
 
 def _name_places(axes: Any, labels: Sequence[str], *, shown: bool) -> None:
