@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.valve": LEAVES,
     "mvest.mechanics": (*LEAVES, *VALUE_OBJECTS),
     "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),
+    "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
     "mvest.estimation": LEAVES,
     "mvest.model": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
     "mvest.batch": (*LEAVES, "mvest.estimation", "mvest.model"),
