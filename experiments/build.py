@@ -22,8 +22,9 @@ from mvest.estimation import (
     Transform,
     observation_noise,
 )
+from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
-from mvest.model import ClosureModel, MechanicsSettings
+from mvest.model import ClosureModel
 from mvest.observation_errors import (
     AnnulusOffset,
     CoaptationDropout,

@@ -14,7 +14,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
-from mvest.model import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.template import TemplateParameters
 

@@ -22,7 +22,8 @@ from experiments.progress import SolveBar
 from experiments.record import make_record
 from mvest.errors import ConfigurationError
 from mvest.estimation import Gaussian, IteratedFilter, Prediction, Transform
-from mvest.model import ClosureModel, MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.model import ClosureModel
 from mvest.reporting.donor import donor_figure
 from mvest.reporting.figures import save_figure
 from mvest.study import Case, Observation, StudyResult, estimate

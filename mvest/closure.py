@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.mechanics.system import System
-from mvest.model import ClosureModel, ClosureResult, boundary_loading
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.model import ClosureModel, ClosureResult
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.annulus import annulus_plane

@@ -1,9 +1,7 @@
 """The joint of valve and mechanics: moduli in, geometry of the leaflets and its derivative out.
 
-``build_system`` hangs everything that acts on a valve into a solid mesh. All of it is defined in
-the reference frame and embedded, so the same valve gives the same loads, contact and observations
-in every mesh. ``ClosureModel`` is what a filter sees: a function from parameters to predicted
-positions and their Jacobian.
+``ClosureModel`` is what a filter sees: a function from parameters to predicted positions and their
+Jacobian.
 """
 
 from __future__ import annotations
@@ -17,312 +15,30 @@ import numpy as np
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.prediction import Prediction
-from mvest.mechanics.cables import Cables, Hinge
-from mvest.mechanics.contact import Contact, ContactSettings
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
-from mvest.mechanics.pressure import PressureLoad
-from mvest.mechanics.solid import Solid
+from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
-from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
-from mvest.mechanics.system import Factors, Loads, Parameter, System
+from mvest.mechanics.steps import Simulation, Step
+from mvest.mechanics.system import Factors, Parameter, System
+from mvest.mechanics.valve_system import (
+    HeldState,
+    boundary_loading,
+    build_system,
+    held_loading,
+    material_law,
+)
 from mvest.typing import FloatArray
-from mvest.units import mmhg_to_mpa
 from mvest.valve.anatomy import Valve
 from mvest.valve.embedding import Embedding, embed
 from mvest.valve.mesh import SolidMesh
 
-__all__ = [
-    "ClosedState",
-    "ClosureModel",
-    "ClosureProtocol",
-    "ClosureResult",
-    "MechanicsSettings",
-    "TissueSettings",
-    "build_system",
-]
+__all__ = ["ClosedState", "ClosureModel", "ClosureResult"]
 
 
 REST = (0.05, 0.15)
 """s, steps of time in which a state taken over from another mesh comes to rest under the final
 loads. Damping by stiffness holds what the coarser mesh could not tell; without it the equilibrium
 of large meshes (160 x 19 cells) is not found from there."""
-
-
-@dataclass(frozen=True, slots=True)
-class TissueSettings:
-    """Material of one region apart from E_f, which is estimated.
-
-    Attributes
-    ----------
-    ratio : float
-        E_f over E_perp.
-    nu : float
-        Poisson ratio of the paper.
-    reading : str
-        ``A`` or ``C`` (see :class:`mvest.mechanics.law.PoissonReading`).
-    """
-
-    ratio: float
-    nu: float = 0.488
-    reading: str = "A"
-
-    def __post_init__(self) -> None:
-        known = [reading.value for reading in PoissonReading]
-        if self.reading not in known:
-            raise InputError(
-                f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
-            )
-
-    def material(self, E_f: float) -> TransverselyIsotropic:
-        """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
-        return TransverselyIsotropic.from_ratio(
-            E_f, self.ratio, self.nu, PoissonReading(self.reading)
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class ClosureProtocol:
-    """How the valve is closed, and when it is looked at.
-
-    Attributes
-    ----------
-    pressure_mmHg : float
-        Peak transmitral pressure.
-    ramp : float
-        s over which pressure and boundary motion rise (smooth step).
-    dt : float
-        s, time step during the ramp. The closed state does not depend on it where it is the only
-        one (the gate divides it by up to 16), so that a closure that is wanted for this state alone
-        takes the ramp in one step.
-    growth : float
-        Factor by which steps grow after the ramp, towards equilibrium.
-    end : float
-        s at which the dynamic phase ends.
-    equilibrium : bool
-        Whether a static step to exact equilibrium follows.
-    """
-
-    pressure_mmHg: float = 120.0
-    ramp: float = 0.3
-    dt: float = 0.3
-    growth: float = 1.5
-    end: float = 0.5
-    equilibrium: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.dt > 0:
-            raise InputError(f"time step dt = {self.dt} s, expected > 0")
-        if not np.isfinite(self.pressure_mmHg):
-            raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
-        if not (self.ramp > 0 and self.end >= self.ramp and self.growth >= 1):
-            raise InputError(f"closure protocol {self}: expected 0 < ramp <= end and growth >= 1")
-
-    def steps(self) -> tuple[Step, ...]:
-        """The time steps."""
-        n = max(1, round(self.ramp / self.dt))
-        times = [self.ramp * (k + 1) / n for k in range(n)]
-        dt = self.ramp / n
-        while times[-1] < self.end * (1 - 1e-9):
-            dt *= self.growth
-            times.append(min(times[-1] + dt, self.end))
-        steps = [Step(t) for t in times]
-        if self.equilibrium:
-            steps.append(Step(times[-1] + 1.0, static=True))
-        return tuple(steps)
-
-    def phase(self, t: float) -> float:
-        """Share of the closure at time ``t``: quintic smooth step over the ramp."""
-        u = min(max(t / self.ramp, 0.0), 1.0)
-        return u**3 * (10 - 15 * u + 6 * u * u)
-
-
-@dataclass(frozen=True, slots=True)
-class MechanicsSettings:
-    """Everything about the mechanics that is not the valve, the mesh or an unknown.
-
-    Attributes
-    ----------
-    tissue : dict
-        Region name -> :class:`TissueSettings`.
-    protocol, damping, newton, contact
-        See their classes.
-    density : float
-        t/mm^3.
-    support : str
-        ``hinge`` (thickness-averaged annulus) or ``clamp`` (both faces).
-    support_stiffness : float
-        N/mm per mm of annulus.
-    patch_radius : float
-        mm over which a chord is spread at its insertion.
-    solver : str
-    """
-
-    tissue: dict[str, TissueSettings]
-    protocol: ClosureProtocol = field(default_factory=ClosureProtocol)
-    damping: Damping = field(default_factory=Damping)
-    newton: NewtonSettings = field(default_factory=NewtonSettings)
-    contact: ContactSettings = field(default_factory=ContactSettings)
-    density: float = 1.04e-9
-    support: str = "hinge"
-    support_stiffness: float = 50.0
-    patch_radius: float = 2.0
-    solver: str = "auto"
-
-    def __post_init__(self) -> None:
-        for name in ("density", "support_stiffness", "patch_radius"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"mechanics {name} = {getattr(self, name)}, expected > 0")
-        if self.support not in ("hinge", "clamp"):
-            raise InputError(f"annulus support {self.support!r}, expected hinge or clamp")
-
-
-def build_system(
-    valve: Valve,
-    contact_valve: Valve,
-    mesh: SolidMesh,
-    settings: MechanicsSettings,
-    moduli: dict[str, float],
-    factors: Factors | None = None,
-) -> System:
-    """A system of the valve in the given mesh.
-
-    Parameters
-    ----------
-    valve : Valve
-        Carries chordae, annulus and motion.
-    contact_valve : Valve
-        The same valve in the resolution at which contact is sampled.
-    mesh : SolidMesh
-    settings : MechanicsSettings
-    moduli : dict
-        Region -> E_f, MPa.
-    factors : Factors, optional
-    """
-    solid = Solid(mesh, material_law(mesh, settings, moduli), density=settings.density)
-    surface = contact_valve.surface
-    midpoints = embed(mesh, surface.vertices)
-    chordae = valve.chordae
-    cables = Cables(
-        _patches(midpoints, contact_valve, settings.patch_radius, chordae.insertion),
-        chordae.tip,
-        chordae.rest_length,
-        chordae.axial_stiffness,
-        chordae.toe_strain,
-    )
-    contact = Contact(
-        midpoints,
-        midpoints(mesh.nodes),
-        surface.areas,
-        surface.thickness,
-        surface.triangles,
-        settings.contact,
-    )
-    return System(
-        solid,
-        pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
-        cables=cables,
-        contact=contact,
-        hinge=_support(mesh, contact_valve, settings),
-        factors=factors,
-    )
-
-
-def material_law(mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]) -> BiotLaw:
-    """The law of the mesh with one modulus E_f (MPa) per region.
-
-    Raises
-    ------
-    InputError
-        If a region has no tissue or no modulus.
-    MaterialError
-        If a modulus is inadmissible.
-    """
-    materials = []
-    for region in mesh.region_names:
-        if region not in settings.tissue or region not in moduli:
-            raise InputError(
-                f"region {region!r} of the mesh has no tissue or modulus; given are "
-                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(moduli))}"
-            )
-        materials.append(settings.tissue[region].material(moduli[region]))
-    return BiotLaw.of(tuple(materials))
-
-
-def _patches(points: Embedding, valve: Valve, radius: float, insertion: FloatArray) -> Embedding:
-    """Leaflet ends of the chordae: averages over material points within ``radius`` mm.
-
-    Weights ``area (1 - (d / radius)^2)^2``, of fixed physical size whatever the mesh.
-    """
-    vertices, areas = valve.surface.vertices, valve.surface.areas
-    members, factors = [], []
-    for centre in insertion:
-        d = np.linalg.norm(vertices - centre, axis=1)
-        reach = max(radius, 1.05 * float(d.min()))
-        inside = np.flatnonzero(d < reach)
-        weight = areas[inside] * (1 - (d[inside] / reach) ** 2) ** 2
-        members.append(inside)
-        factors.append(weight / weight.sum())
-    width = max((len(m) for m in members), default=1)
-    groups = np.zeros((len(members), width), dtype=np.int64)
-    coefficients = np.zeros((len(members), width))
-    for k, (m, f) in enumerate(zip(members, factors, strict=True)):
-        groups[k, : len(m)] = m
-        coefficients[k, : len(m)] = f
-    return points.average(coefficients, groups)
-
-
-def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hinge:
-    """Hinge or clamp along the annulus, with a fixed stiffness per length."""
-    surface, loop = valve.surface, valve.annulus
-    middle = surface.vertices[loop]
-    half = 0.5 * surface.thickness[loop, None] * surface.normals[loop]
-    ahead = np.linalg.norm(np.roll(middle, -1, axis=0) - middle, axis=1)
-    share = 0.5 * (ahead + np.roll(ahead, 1)) * settings.support_stiffness
-    n = len(loop)
-    three = embed(mesh, np.concatenate([middle - half, middle, middle + half]))
-    if settings.support == "hinge":
-        groups = np.stack([np.arange(n), np.arange(n) + n, np.arange(n) + 2 * n], axis=1)
-        simpson = np.tile([1 / 6, 4 / 6, 1 / 6], (n, 1))
-        return Hinge(three.average(simpson, groups), share)
-    if settings.support == "clamp":
-        faces = np.concatenate([np.arange(n), np.arange(n) + 2 * n])
-        points = Embedding(three.nodes[faces], three.weights[faces], three.host[faces])
-        return Hinge(points, np.tile(0.5 * share, 2))
-    raise InputError(f"annulus support {settings.support!r}, expected hinge or clamp")
-
-
-def boundary_loading(
-    system: System, valve: Valve, contact_valve: Valve, settings: MechanicsSettings
-) -> Callable[[float], Loads]:
-    """Time -> loads: pressure, annulus and papillary tips of the protocol."""
-    protocol = settings.protocol
-    assert system.hinge is not None
-    start = system.hinge.points(system.solid.mesh.nodes)
-    motion = contact_valve.motion
-    shift = motion.annulus - motion.annulus[0]
-    copies = len(start) // shift.shape[1]
-    shift = np.tile(shift, (1, copies, 1))
-    peak = mmhg_to_mpa(protocol.pressure_mmHg)
-
-    def loading(t: float) -> Loads:
-        phase = protocol.phase(t)
-        return Loads(
-            pressure=peak * phase,
-            tips=_interpolate(motion.phase, motion.papillary_tips, phase),
-            hinge=start + _interpolate(motion.phase, shift, phase),
-        )
-
-    return loading
-
-
-def _interpolate(phases: FloatArray, frames: FloatArray, phase: float) -> FloatArray:
-    """Piecewise monotone cubic between key frames (linear for two)."""
-    if len(phases) == 2:
-        return (1 - phase) * frames[0] + phase * frames[1]
-    from scipy.interpolate import PchipInterpolator
-
-    return np.asarray(PchipInterpolator(phases, frames, axis=0)(phase))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -520,6 +236,38 @@ class ClosureModel:
         if simulation.converged:
             self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
+
+    def held(self, m: FloatArray, state: HeldState) -> FloatArray | None:
+        """Observed vertices ``(n, 3)`` mm of the closed valve in equilibrium under other loads.
+
+        The valve is closed with parameters ``m (p,)`` first, and goes from there to ``state``; None
+        if either equilibrium is not found.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        closure = self.close(m, sensitivities=False)
+        if not closure.simulation.converged:
+            return None
+        system = closure.system
+        assert system.hinge is not None
+        loading = held_loading(system, self.contact_valve, state)
+        end = self.settings.protocol.end
+        simulation = simulate(
+            system,
+            loading,
+            # Damping by stiffness helps the leaflets slide over each other to where they are held.
+            [*(Step(end + t) for t in accumulate(REST)), Step(end + sum(REST) + 1.0, static=True)],
+            damping=self.settings.damping,
+            newton=self.settings.newton,
+            final_only=True,
+            solver=self._solver,
+            initial_positions=closure.simulation.frames[-1],
+            initial_time=end,
+        )
+        return self.observed(simulation.frames[-1]) if simulation.converged else None
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
         """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""

@@ -27,7 +27,8 @@ from mvest.estimation import (
 )
 from mvest.estimation.estimate import OnIterate
 from mvest.estimation.prediction import require_finite
-from mvest.model import ClosedState, TissueSettings
+from mvest.mechanics.settings import TissueSettings
+from mvest.model import ClosedState
 from mvest.observation import FRAMES, Observation, ObservedFrames, require_frames, select_frames
 from mvest.observation_errors import ObservationError, SpatialCorrelation, observe
 from mvest.typing import FloatArray

@@ -7,7 +7,8 @@ import pytest
 
 from mvest.closure import measure_steps
 from mvest.mechanics.cables import cable_force
-from mvest.model import ClosureModel, ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.model import ClosureModel
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template
 

@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
     "mvest.estimation": LEAVES,
     "mvest.model": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation"),
+    "mvest.registration": (*LEAVES, "mvest.estimation", "mvest.model"),
     "mvest.batch": (*LEAVES, "mvest.estimation", "mvest.model"),
     "mvest.gate": (*LEAVES, "mvest.model"),
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),

@@ -11,19 +11,14 @@ import pytest
 
 import mvest.model
 from mvest.errors import InputError
+from mvest.mechanics import valve_system
 from mvest.mechanics.contact import Contact, ContactSettings
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import NewtonSettings, Reason
-from mvest.model import (
-    REST,
-    ClosedState,
-    ClosureModel,
-    ClosureProtocol,
-    MechanicsSettings,
-    TissueSettings,
-    boundary_loading,
-    build_system,
-)
+from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
+from mvest.model import REST, ClosedState, ClosureModel
 from mvest.valve.anatomy import Motion
+from mvest.valve.embedding import embed
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template
 
@@ -219,6 +214,40 @@ def test_a_guided_closure_ends_in_the_state_of_one_from_the_open_valve(closed, m
     alone = guided.close(AT, sensitivities=False).simulation
     assert len(alone.times) > 2
     np.testing.assert_allclose(alone.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+
+
+def test_a_valve_held_under_the_loads_of_the_closed_frame_stays_closed(closed):
+    model, simulation = closed
+    motion = model.contact_valve.motion
+    model.restart(ClosedState(AT, simulation.frames[-1]))
+    same = HeldState(CLOSING.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1])
+    held = model.held(AT, same)
+    np.testing.assert_allclose(held, model.observed(simulation.frames[-1]), rtol=0, atol=1e-8)
+
+
+def test_a_held_valve_is_one_that_was_closed_under_these_loads(closed):
+    # Another pressure and other tips, reached from the closed state and from the open one.
+    model, _ = closed
+    motion = model.contact_valve.motion
+    tips = motion.papillary_tips[-1] + [0.0, 0.0, 0.3]
+    held = model.held(AT, HeldState(95.0, motion.annulus[-1], tips))
+    moved = replace(motion, papillary_tips=np.stack([motion.papillary_tips[0], tips]))
+    other = replace(
+        model,
+        contact_valve=replace(model.contact_valve, motion=moved),
+        settings=settings_of(replace(CLOSING, pressure_mmHg=95.0)),
+        continuation=False,
+    )
+    closed_so = other.close(AT, sensitivities=False).simulation
+    np.testing.assert_allclose(held, other.observed(closed_so.frames[-1]), rtol=0, atol=1e-7)
+
+
+def test_held_loads_must_be_those_of_the_valve(closed):
+    model, simulation = closed
+    motion = model.contact_valve.motion
+    model.restart(ClosedState(AT, simulation.frames[-1]))
+    with pytest.raises(InputError, match="held annulus"):
+        model.held(AT, HeldState(80.0, motion.annulus[-1][:5], motion.papillary_tips[-1]))
 
 
 def test_a_guide_has_the_model_s_parameters():
@@ -469,10 +498,10 @@ def test_what_hangs_on_the_valve_is_the_same_in_every_mesh():
 def test_a_chord_is_spread_over_its_patch():
     valve, contact_valve = TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)
     mesh = structured_mesh(TEMPLATE, "hex18", 24, 3)
-    points = mvest.model.embed(mesh, contact_valve.surface.vertices)
+    points = embed(mesh, contact_valve.surface.vertices)
     insertion = valve.chordae.insertion
     for radius in (1.0, 2.0):
-        patches = mvest.model._patches(points, contact_valve, radius, insertion)
+        patches = valve_system._patches(points, contact_valve, radius, insertion)
         np.testing.assert_allclose(patches.weights.sum(axis=1), 1, atol=1e-12)
         # The centre of a patch lies within it; at the free edge it is cut on one side.
         distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
@@ -480,14 +509,14 @@ def test_a_chord_is_spread_over_its_patch():
     # The patch is a piece of the leaflet, however densely that is sampled: with area weights its
     # centre converges (unweighted, samples of the free edge count twice and move it by 0.14 mm).
     dense = TEMPLATE.valve(240, 61)
-    exact = mvest.model.embed(mesh, dense.surface.vertices)
+    exact = embed(mesh, dense.surface.vertices)
     centres = [
-        mvest.model._patches(p, v, 2.0, insertion)(mesh.nodes)
+        valve_system._patches(p, v, 2.0, insertion)(mesh.nodes)
         for p, v in ((points, contact_valve), (exact, dense))
     ]
     assert np.linalg.norm(centres[0] - centres[1], axis=1).max() < 0.03
     # A patch smaller than the samples' spacing takes the nearest sample.
-    patches = mvest.model._patches(points, contact_valve, 1e-6, insertion)
+    patches = valve_system._patches(points, contact_valve, 1e-6, insertion)
     gap = np.linalg.norm(contact_valve.surface.vertices - insertion[:, None], axis=2).min(axis=1)
     distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
     assert np.all(distance <= 1.05 * gap + 1e-6)

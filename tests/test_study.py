@@ -7,7 +7,8 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
-from mvest.model import ClosedState, TissueSettings
+from mvest.mechanics.settings import TissueSettings
+from mvest.model import ClosedState
 from mvest.observation_errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.study import (
     Case,

@@ -6,6 +6,7 @@ textbook's: parameters m, covariance P, process noise Q, observation noise R, Ja
 covariance S, gain K.
 """
 
+from mvest.estimation.considered import SchmidtFilter
 from mvest.estimation.diagnostics import (
     Consistency,
     ZTest,
@@ -42,6 +43,7 @@ __all__ = [
     "PaperFilter",
     "Prediction",
     "Reason",
+    "SchmidtFilter",
     "Transform",
     "Update",
     "ZTest",

@@ -126,6 +126,42 @@ def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
     )
 
 
+def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNoise:
+    """Noise with what q unknown quantities add to it, R + C Cᵀ.
+
+    With W of ``base`` and the thin singular value decomposition W C = U diag(s) Vᵀ::
+
+        W (R + C Cᵀ) Wᵀ = I + U diag(s²) Uᵀ
+        log det (R + C Cᵀ) = log det R + Σ log(1 + s²)
+
+    so that (I − U diag(1 − 1 / √(1 + s²)) Uᵀ) W whitens the sum.
+
+    Parameters
+    ----------
+    base : ObservationNoise
+        R of n observations.
+    columns : (n, q) in units of the observation
+        C, one column for each independent quantity of unit variance.
+
+    Raises
+    ------
+    InputError
+        If C is not of n observations, or not finite.
+    """
+    C = np.asarray(columns, dtype=np.float64)
+    if C.ndim != 2 or len(C) != base.size:
+        raise InputError(f"added noise has shape {C.shape}, expected ({base.size}, q)")
+    require_finite(C, "added noise")
+    U, s, _ = np.linalg.svd(base.whiten(C), full_matrices=False)
+    shrink = 1.0 - 1.0 / np.sqrt(1.0 + s**2)
+
+    def whiten(values: FloatArray) -> FloatArray:
+        white = base.whiten(values)
+        return np.asarray(white - (U * shrink) @ (U.T @ white))
+
+    return ObservationNoise(base.size, base.log_determinant + float(np.sum(np.log1p(s**2))), whiten)
+
+
 def csc(matrix: SparseMatrix) -> CscMatrix:
     """A sparse matrix of any format and number type as columns in double precision."""
     # SciPy's stubs know no common constructor for all formats.

@@ -7,7 +7,7 @@ from mvest.mechanics.assembly import scatter_matrices
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Step
-from mvest.model import boundary_loading
+from mvest.mechanics.valve_system import boundary_loading
 from tests.benchmark.valves import CELLS, VALUES, Closed, close, closed, parameters
 
 ROUNDS = {"2k": 5, "3k": 5, "7k": 3, "25k": 2}

@@ -11,9 +11,11 @@ import numpy as np
 from experiments.build import guide_of
 from mvest.mechanics.contact import ContactPairs
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import Simulation
 from mvest.mechanics.system import Loads, Parameter, System
-from mvest.model import ClosureModel, MechanicsSettings, TissueSettings, boundary_loading
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.model import ClosureModel
 from mvest.typing import FloatArray
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.build import build_filter, build_twin, truth_mesh
 from experiments.config import hash_of, register
 from experiments.mirror import build
-from mvest.model import MechanicsSettings
+from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation_errors import WhiteNoise
 
 CONF = Path(__file__).resolve().parents[2] / "conf"

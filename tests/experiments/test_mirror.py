@@ -8,7 +8,7 @@ from omegaconf.errors import ConfigKeyError, ValidationError
 from experiments.config import MechanicsConfig, TemplateConfig
 from experiments.mirror import build, schema
 from mvest.errors import ConfigurationError, InputError
-from mvest.model import MechanicsSettings, TissueSettings
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.valve.template import TemplateParameters
 
 

@@ -1,0 +1,142 @@
+"""What the mechanics are told besides valve, mesh and unknowns: tissue, closure, numerics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.mechanics.contact import ContactSettings
+from mvest.mechanics.law import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.steps import Damping, NewtonSettings, Step
+
+__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings"]
+
+
+@dataclass(frozen=True, slots=True)
+class TissueSettings:
+    """Material of one region apart from E_f, which is estimated.
+
+    Attributes
+    ----------
+    ratio : float
+        E_f over E_perp.
+    nu : float
+        Poisson ratio of the paper.
+    reading : str
+        ``A`` or ``C`` (see :class:`mvest.mechanics.law.PoissonReading`).
+    """
+
+    ratio: float
+    nu: float = 0.488
+    reading: str = "A"
+
+    def __post_init__(self) -> None:
+        known = [reading.value for reading in PoissonReading]
+        if self.reading not in known:
+            raise InputError(
+                f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
+            )
+
+    def material(self, E_f: float) -> TransverselyIsotropic:
+        """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
+        return TransverselyIsotropic.from_ratio(
+            E_f, self.ratio, self.nu, PoissonReading(self.reading)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureProtocol:
+    """How the valve is closed, and when it is looked at.
+
+    Attributes
+    ----------
+    pressure_mmHg : float
+        Peak transmitral pressure.
+    ramp : float
+        s over which pressure and boundary motion rise (smooth step).
+    dt : float
+        s, time step during the ramp. The closed state does not depend on it where it is the only
+        one (the gate divides it by up to 16), so that a closure that is wanted for this state alone
+        takes the ramp in one step.
+    growth : float
+        Factor by which steps grow after the ramp, towards equilibrium.
+    end : float
+        s at which the dynamic phase ends.
+    equilibrium : bool
+        Whether a static step to exact equilibrium follows.
+    """
+
+    pressure_mmHg: float = 120.0
+    ramp: float = 0.3
+    dt: float = 0.3
+    growth: float = 1.5
+    end: float = 0.5
+    equilibrium: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.dt > 0:
+            raise InputError(f"time step dt = {self.dt} s, expected > 0")
+        if not np.isfinite(self.pressure_mmHg):
+            raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
+        if not (self.ramp > 0 and self.end >= self.ramp and self.growth >= 1):
+            raise InputError(f"closure protocol {self}: expected 0 < ramp <= end and growth >= 1")
+
+    def steps(self) -> tuple[Step, ...]:
+        """The time steps."""
+        n = max(1, round(self.ramp / self.dt))
+        times = [self.ramp * (k + 1) / n for k in range(n)]
+        dt = self.ramp / n
+        while times[-1] < self.end * (1 - 1e-9):
+            dt *= self.growth
+            times.append(min(times[-1] + dt, self.end))
+        steps = [Step(t) for t in times]
+        if self.equilibrium:
+            steps.append(Step(times[-1] + 1.0, static=True))
+        return tuple(steps)
+
+    def phase(self, t: float) -> float:
+        """Share of the closure at time ``t``: quintic smooth step over the ramp."""
+        u = min(max(t / self.ramp, 0.0), 1.0)
+        return u**3 * (10 - 15 * u + 6 * u * u)
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicsSettings:
+    """Everything about the mechanics that is not the valve, the mesh or an unknown.
+
+    Attributes
+    ----------
+    tissue : dict
+        Region name -> :class:`TissueSettings`.
+    protocol, damping, newton, contact
+        See their classes.
+    density : float
+        t/mm^3.
+    support : str
+        ``hinge`` (thickness-averaged annulus) or ``clamp`` (both faces).
+    support_stiffness : float
+        N/mm per mm of annulus.
+    patch_radius : float
+        mm over which a chord is spread at its insertion.
+    solver : str
+    """
+
+    tissue: dict[str, TissueSettings]
+    protocol: ClosureProtocol = field(default_factory=ClosureProtocol)
+    damping: Damping = field(default_factory=Damping)
+    newton: NewtonSettings = field(default_factory=NewtonSettings)
+    contact: ContactSettings = field(default_factory=ContactSettings)
+    density: float = 1.04e-9
+    support: str = "hinge"
+    support_stiffness: float = 50.0
+    patch_radius: float = 2.0
+    solver: str = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("density", "support_stiffness", "patch_radius"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"mechanics {name} = {getattr(self, name)}, expected > 0")
+        if self.support not in ("hinge", "clamp"):
+            raise InputError(f"annulus support {self.support!r}, expected hinge or clamp")
