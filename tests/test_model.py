@@ -225,17 +225,18 @@ def test_a_valve_held_under_the_loads_of_the_closed_frame_stays_closed(closed):
     np.testing.assert_allclose(held, model.observed(simulation.frames[-1]), rtol=0, atol=1e-8)
 
 
-def test_a_held_valve_is_one_that_was_closed_under_these_loads(closed):
-    # Another pressure and other tips, reached from the closed state and from the open one.
+@pytest.mark.parametrize(("pressure", "lift"), [(95.0, 0.0), (100.0, 0.3)])
+def test_a_held_valve_is_one_that_was_closed_under_these_loads(closed, pressure, lift):
+    # Reached from the closed state and from the open one.
     model, _ = closed
     motion = model.contact_valve.motion
-    tips = motion.papillary_tips[-1] + [0.0, 0.0, 0.3]
-    held = model.held(AT, HeldState(95.0, motion.annulus[-1], tips))
+    tips = motion.papillary_tips[-1] + [0.0, 0.0, lift]
+    held = model.held(AT, HeldState(pressure, motion.annulus[-1], tips))
     moved = replace(motion, papillary_tips=np.stack([motion.papillary_tips[0], tips]))
     other = replace(
         model,
         contact_valve=replace(model.contact_valve, motion=moved),
-        settings=settings_of(replace(CLOSING, pressure_mmHg=95.0)),
+        settings=settings_of(replace(CLOSING, pressure_mmHg=pressure)),
         continuation=False,
     )
     closed_so = other.close(AT, sensitivities=False).simulation
