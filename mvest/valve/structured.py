@@ -6,14 +6,41 @@ to one and the same body.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh import SolidMesh
-from mvest.valve.template import ANTERIOR, POSTERIOR, REGIONS, Template
 
-__all__ = ["structured_mesh"]
+__all__ = ["MaterialSurface", "structured_mesh"]
+
+
+class MaterialSurface(Protocol):
+    """A valve with two leaflets in material coordinates, as the template and `mvest.valve.band`.
+
+    Attributes
+    ----------
+    region_names : tuple of str
+        The leaflet of phi in (0, 180) degrees, and that of (180, 360).
+    """
+
+    @property
+    def region_names(self) -> tuple[str, ...]:
+        """Names of the two leaflets."""
+        ...
+
+    def position(
+        self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Reference positions ``(..., 3)`` mm of material points."""
+        ...
+
+    def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
+        """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
+        ...
+
 
 # A prism 0 1 2 (bottom) 3 4 5 (top) as three tetrahedra. The diagonal of each quadrilateral side
 # runs from the bottom node with the smaller rank; ranks increase 0 < 1 < 2, so neighbours agree.
@@ -21,13 +48,18 @@ _PRISM = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
 
 
 def structured_mesh(
-    template: Template, element: str = "hex18", columns: int = 36, rows: int = 4, layers: int = 1
+    shape: MaterialSurface,
+    element: str = "hex18",
+    columns: int = 36,
+    rows: int = 4,
+    layers: int = 1,
 ) -> SolidMesh:
     """Mesh of ``columns x rows x layers`` cells of the template.
 
     Parameters
     ----------
-    template : Template
+    shape : MaterialSurface
+        The template, or any valve in material coordinates.
     element : str
         ``hex18``, ``hex27`` (one brick per cell) or ``tet4``, ``tet10`` (six tetrahedra per cell).
     columns : int
@@ -46,9 +78,9 @@ def structured_mesh(
             "columns, rows >= 1 and layers >= 1"
         )
     if element in ("hex18", "hex27"):
-        return _bricks(template, element, columns, rows, layers)
+        return _bricks(shape, element, columns, rows, layers)
     if element in ("tet4", "tet10"):
-        return _tetrahedra(template, element, columns, rows, layers)
+        return _tetrahedra(shape, element, columns, rows, layers)
     raise InputError(f"no structured mesh of {element!r}; known: hex18, hex27, tet4, tet10")
 
 
@@ -58,23 +90,25 @@ def _grid(*sizes: int) -> tuple[IntArray, ...]:
 
 
 def _region(columns: int, cell: IntArray) -> IntArray:
-    return np.where(2 * cell < columns, ANTERIOR, POSTERIOR)
+    return np.where(2 * cell < columns, 0, 1)
 
 
 def _element_fibre(
-    template: Template, phi: FloatArray, s: FloatArray, region: IntArray
+    shape: MaterialSurface, phi: FloatArray, s: FloatArray, region: IntArray
 ) -> FloatArray:
     """Fibres ``(m, k, 3)`` at element nodes given per element and node."""
-    return template.fibre(phi, s, np.broadcast_to(region[:, None], phi.shape))
+    return shape.fibre(phi, s, np.broadcast_to(region[:, None], phi.shape))
 
 
-def _bricks(template: Template, element: str, columns: int, rows: int, layers: int) -> SolidMesh:
+def _bricks(
+    shape: MaterialSurface, element: str, columns: int, rows: int, layers: int
+) -> SolidMesh:
     n_phi, n_s = 2 * columns, 2 * rows + 1
     per_cell = 1 if element == "hex18" else 2
     n_z = per_cell * layers + 1
     k, j, i = _grid(n_z, n_s, n_phi)
     phi, s, zeta = 360.0 * i / n_phi, j / (n_s - 1), -1 + 2.0 * k / (n_z - 1)
-    nodes = template.position(phi, s, zeta)
+    nodes = shape.position(phi, s, zeta)
     # xi runs against phi so that (xi, eta, zeta) is right-handed with zeta to the ventricle.
     cz, cj, ci = _grid(layers, rows, columns)
     lk, lj, li = _grid(per_cell + 1, 3, 3)
@@ -83,13 +117,13 @@ def _bricks(template: Template, element: str, columns: int, rows: int, layers: i
     at_k = per_cell * cz[:, None] + lk
     elements = (at_k * n_s + at_j) * n_phi + at_i % n_phi
     region = _region(columns, ci)
-    fibre = _element_fibre(template, 360.0 * at_i / n_phi, at_j / (n_s - 1), region)
+    fibre = _element_fibre(shape, 360.0 * at_i / n_phi, at_j / (n_s - 1), region)
     top = elements[cz == layers - 1][:, -9:]
-    return SolidMesh(nodes, elements, element, region, REGIONS, fibre, top)
+    return SolidMesh(nodes, elements, element, region, shape.region_names, fibre, top)
 
 
 def _tetrahedra(
-    template: Template, element: str, columns: int, rows: int, layers: int
+    shape: MaterialSurface, element: str, columns: int, rows: int, layers: int
 ) -> SolidMesh:
     # Everything on the twice finer parameter grid, so that midside nodes lie on the exact surface.
     n_phi, n_s, n_z = 2 * columns, 2 * rows + 1, 2 * layers + 1
@@ -115,13 +149,13 @@ def _tetrahedra(
     elements = elements.reshape(number.shape)
     at_i, rest = used % n_phi, used // n_phi
     at_j, at_k = rest % n_s, rest // n_s
-    nodes = template.position(360.0 * at_i / n_phi, at_j / (n_s - 1), -1 + 2.0 * at_k / (n_z - 1))
+    nodes = shape.position(360.0 * at_i / n_phi, at_j / (n_s - 1), -1 + 2.0 * at_k / (n_z - 1))
     volume = np.linalg.det(nodes[elements[:, 1:4]] - nodes[elements[:, :1]])
     elements = _turned(elements, volume < 0)
     grid = np.where((volume < 0)[:, None, None], grid[:, _swap(grid.shape[1])], grid)
-    fibre = _element_fibre(template, 360.0 * grid[..., 0] / n_phi, grid[..., 1] / (n_s - 1), region)
+    fibre = _element_fibre(shape, 360.0 * grid[..., 0] / n_phi, grid[..., 1] / (n_s - 1), region)
     faces = _top_faces(elements, nodes, at_k == n_z - 1)
-    return SolidMesh(nodes, elements, element, region, REGIONS, fibre, faces)
+    return SolidMesh(nodes, elements, element, region, shape.region_names, fibre, faces)
 
 
 def _ranked(triangle: list[tuple[int, int]]) -> IntArray:

@@ -173,6 +173,7 @@ class Template:
 
     def __init__(self, parameters: TemplateParameters | None = None) -> None:
         self.parameters = parameters or TemplateParameters()
+        self.region_names: tuple[str, ...] = REGIONS
 
     # -- surface ----------------------------------------------------------------------------------
     def annulus(self, phi: FloatArray) -> FloatArray:
