@@ -44,6 +44,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
     "mvest.observation_errors": (*LEAVES, "mvest.valve", "mvest.estimation"),
     "mvest.observation": (*LEAVES, "mvest.estimation", "mvest.observation_errors"),
+    "mvest.surface_observation": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.estimation",
+        "mvest.observation",
+        "mvest.observation_errors",
+    ),
     "mvest.study": (
         *LEAVES,
         "mvest.provenance",
@@ -54,6 +61,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.model",
         "mvest.observation",
         "mvest.observation_errors",
+        "mvest.surface_observation",
     ),
     "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
 }
