@@ -13,7 +13,7 @@ import numpy as np
 
 from mvest.errors import MvestError, cannot_write
 from mvest.provenance import provenance
-from mvest.study import StudyResult
+from mvest.study import Observation, StudyResult
 from mvest.typing import FloatArray
 from mvest.valve.anatomy import LeafletSurface, Valve
 from mvest.valve.annulus import annulus_plane
@@ -177,7 +177,7 @@ def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> No
     InputError
         If the file cannot be written.
     """
-    assert result.observation is not None
+    assert isinstance(result.observation, Observation)
     assert result.fitted is not None
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.npz")
     try:

@@ -26,6 +26,7 @@ from mvest.estimation import (
     identifiability,
 )
 from mvest.estimation.estimate import OnIterate
+from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import require_finite
 from mvest.mechanics.settings import TissueSettings
 from mvest.model import ClosedState
@@ -38,7 +39,9 @@ __all__ = [
     "Case",
     "Modulus",
     "Observation",
+    "Observed",
     "ObservedFrames",
+    "PredictedFrames",
     "SharedStart",
     "StudyResult",
     "Truth",
@@ -63,6 +66,45 @@ class Truth:
     parameters: tuple[str, ...]
     values: FloatArray
     positions: FloatArray
+
+
+class PredictedFrames(Protocol):
+    """What a model predicts of an observation, and the frames that this was taken from."""
+
+    def whole(self, m: FloatArray) -> FloatArray | None:
+        """Observed frames ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
+        ...
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        ...
+
+
+class Observed(Protocol):
+    """What an estimation needs of an observation of another kind than ``Observation``."""
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the observed frames, the closed one last."""
+        ...
+
+    @property
+    def y(self) -> FloatArray:
+        """The observation ``(k,)``."""
+        ...
+
+    @property
+    def R(self) -> NoiseCovariance:
+        """Covariance of ``y``."""
+        ...
+
+    def of(self, model: ObservationModel, /) -> PredictedFrames:
+        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation."""
+        ...
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Distances (mm) of what was seen in the last frame to fitted ``(f, n, 3)``."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +224,7 @@ class StudyResult:
     parameters : tuple of str, (p,)
     tissue : mapping
         Region -> fixed ratios.
-    observation : Observation or None
+    observation : Observation, Observed or None
         None if it could not be simulated.
     filtered : Estimate or None
         What the filter returned; None if it was never run.
@@ -200,7 +242,7 @@ class StudyResult:
 
     parameters: tuple[str, ...]
     tissue: Mapping[str, TissueSettings]
-    observation: Observation | None
+    observation: Observation | Observed | None
     filtered: Estimate | None
     identifiability: Identifiability | None
     reason: str
@@ -245,10 +287,12 @@ class StudyResult:
     def distance(self) -> FloatArray | None:
         """Distance ``(n,)`` mm of each vertex, fitted to observed, in the last observed frame.
 
-        NaN where a vertex is not seen.
+        NaN where a vertex is not seen. Of seen points ``(q,)`` where no vertex is known again.
         """
         if self.fitted is None or self.observation is None:
             return None
+        if not isinstance(self.observation, Observation):
+            return self.observation.distance(self.fitted)
         return np.linalg.norm(self.fitted[-1] - self.observation.positions[-1], axis=1)
 
     @property
@@ -342,14 +386,18 @@ def simulate_observation(
 
 
 def estimate(
-    case: Case, observation: Observation, *, on_iterate: OnIterate | None = None
+    case: Case, observation: Observation | Observed, *, on_iterate: OnIterate | None = None
 ) -> StudyResult:
     """Estimate the parameters of a case from an observation.
 
     Numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
-    predicted = ObservedFrames(case.model, observation.frames, observation.seen)
+    predicted: PredictedFrames = (
+        ObservedFrames(case.model, observation.frames, observation.seen)
+        if isinstance(observation, Observation)
+        else observation.of(case.model)
+    )
     R = observation.R
     filtered = case.filter(
         predicted,
