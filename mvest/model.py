@@ -255,18 +255,25 @@ class ClosureModel:
         assert system.hinge is not None
         loading = held_loading(system, self.contact_valve, state)
         end = self.settings.protocol.end
-        simulation = simulate(
-            system,
-            loading,
-            # Damping by stiffness helps the leaflets slide over each other to where they are held.
-            [*(Step(end + t) for t in accumulate(REST)), Step(end + sum(REST) + 1.0, static=True)],
-            damping=self.settings.damping,
-            newton=self.settings.newton,
-            final_only=True,
-            solver=self._solver,
-            initial_positions=closure.simulation.frames[-1],
-            initial_time=end,
-        )
+
+        def run(steps: Sequence[Step]) -> Simulation:
+            return simulate(
+                system,
+                loading,
+                steps,
+                damping=self.settings.damping,
+                newton=self.settings.newton,
+                final_only=True,
+                solver=self._solver,
+                initial_positions=closure.simulation.frames[-1],
+                initial_time=end,
+            )
+
+        simulation = run([Step(end + 1.0, static=True)])
+        if not simulation.converged:
+            # Damping by stiffness helps leaflets to slide over each other to where they are held.
+            rests = [Step(end + t) for t in accumulate(REST)]
+            simulation = run([*rests, Step(end + sum(REST) + 1.0, static=True)])
         return self.observed(simulation.frames[-1]) if simulation.converged else None
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:

@@ -84,6 +84,17 @@ class Observation:
         """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
         return self.positions[self.seen].ravel()
 
+    def of(self, model: ObservationModel, /) -> ObservedFrames:
+        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation."""
+        return ObservedFrames(model, self.frames, self.seen)
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Distance ``(n,)`` mm of each vertex of the last frame from fitted ``(f, n, 3)``.
+
+        NaN where a vertex is not seen.
+        """
+        return np.asarray(np.linalg.norm(fitted[-1] - self.positions[-1], axis=1))
+
     @property
     def R(self) -> NoiseCovariance:
         """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""

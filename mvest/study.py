@@ -81,7 +81,7 @@ class PredictedFrames(Protocol):
 
 
 class Observed(Protocol):
-    """What an estimation needs of an observation of another kind than ``Observation``."""
+    """What an estimation needs of an observation, whatever its kind."""
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -150,12 +150,12 @@ class SharedStart:
 
     def __init__(self, model: Restartable, start: FloatArray) -> None:
         self._model = model
-        self._start = np.array(start, dtype=np.float64)
+        self.start = np.array(start, dtype=np.float64)
         self._first: tuple[Prediction, ClosedState | None] | None = None
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict, as an ``ObservationModel`` does."""
-        if not np.array_equal(m, self._start):
+        if not np.array_equal(m, self.start):
             return self._model(m)
         if self._first is None:
             self._model.restart(None)
@@ -224,7 +224,7 @@ class StudyResult:
     parameters : tuple of str, (p,)
     tissue : mapping
         Region -> fixed ratios.
-    observation : Observation, Observed or None
+    observation : Observed or None
         None if it could not be simulated.
     filtered : Estimate or None
         What the filter returned; None if it was never run.
@@ -242,7 +242,7 @@ class StudyResult:
 
     parameters: tuple[str, ...]
     tissue: Mapping[str, TissueSettings]
-    observation: Observation | Observed | None
+    observation: Observed | None
     filtered: Estimate | None
     identifiability: Identifiability | None
     reason: str
@@ -291,9 +291,7 @@ class StudyResult:
         """
         if self.fitted is None or self.observation is None:
             return None
-        if not isinstance(self.observation, Observation):
-            return self.observation.distance(self.fitted)
-        return np.linalg.norm(self.fitted[-1] - self.observation.positions[-1], axis=1)
+        return self.observation.distance(self.fitted)
 
     @property
     def distance_to_truth(self) -> FloatArray | None:
@@ -386,18 +384,14 @@ def simulate_observation(
 
 
 def estimate(
-    case: Case, observation: Observation | Observed, *, on_iterate: OnIterate | None = None
+    case: Case, observation: Observed, *, on_iterate: OnIterate | None = None
 ) -> StudyResult:
     """Estimate the parameters of a case from an observation.
 
     Numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
-    predicted: PredictedFrames = (
-        ObservedFrames(case.model, observation.frames, observation.seen)
-        if isinstance(observation, Observation)
-        else observation.of(case.model)
-    )
+    predicted = observation.of(case.model)
     R = observation.R
     filtered = case.filter(
         predicted,

@@ -63,6 +63,19 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.surface_observation",
     ),
+    "mvest.personalise": (
+        *LEAVES,
+        "mvest.cases",
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.estimation",
+        "mvest.model",
+        "mvest.observation",
+        "mvest.observation_errors",
+        "mvest.registration",
+        "mvest.study",
+        "mvest.surface_observation",
+    ),
     "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")

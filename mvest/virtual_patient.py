@@ -1,0 +1,294 @@
+"""Virtual patients: cases that a simulation wrote, with everything that an estimator is not told.
+
+A virtual patient is closed on another mesh than any estimator's, under a pressure, with chordae and
+seen with errors that its case does not state. What was hidden is returned beside the case and
+belongs in another place than it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.errors import GeometryError
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.valve_system import HeldState
+from mvest.model import ClosureModel
+from mvest.observation_errors import CorrelatedNoise, SpatialCorrelation
+from mvest.registration import REGISTRATION, displace
+from mvest.typing import FloatArray
+from mvest.valve.anatomy import Valve
+from mvest.valve.structured import structured_mesh
+from mvest.valve.template import Template
+
+__all__ = [
+    "Deviations",
+    "Hidden",
+    "Simulation",
+    "VirtualPatient",
+    "draw_hidden",
+    "simulate_patient",
+]
+
+REFERENCE, CLOSED, LATE = "open", "closed", "late"
+"""Names of the frames of a virtual patient."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """How far what is hidden may lie from what a case states: standard deviations.
+
+    Attributes
+    ----------
+    pressure, chord_rest_length, chord_stiffness : float
+        Relative.
+    shift_mm, turn_degrees : float
+        Of each component.
+    """
+
+    pressure: float = 0.10
+    chord_rest_length: float = 0.02
+    chord_stiffness: float = 0.20
+    shift_mm: float = 1.0
+    turn_degrees: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hidden:
+    """What the case of a virtual patient does not say.
+
+    Attributes
+    ----------
+    values : mapping
+        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
+        displacement of the leaflets as they were seen.
+    positions : mapping
+        Frame -> ``(n, 3)`` mm, where the vertices of the case truly were, before they were
+        displaced and seen with errors.
+    """
+
+    values: Mapping[str, float]
+    positions: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualPatient:
+    """A simulated case, and what it hides."""
+
+    case: ValveCase
+    hidden: Hidden
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """How virtual patients are made.
+
+    Attributes
+    ----------
+    element : str
+    columns, rows : int
+        Cells of the mesh that is closed.
+    dt_factor : float
+        On the time step of the mechanics.
+    contact_columns, contact_rows : int
+    seen_columns, seen_rows : int
+        Vertices of the surface that is seen.
+    std_mm, correlation_length_mm : float
+        Error of each coordinate of each vertex in each frame but the first, and over which distance
+        it is alike. Frames are independent.
+    late_pressure_mmHg : float
+        In the frame that is held out.
+    late_relaxation : float
+        Share of its way back to the open shape that the annulus has gone in it.
+    late_tips : (float, float, float)
+        mm, displacement of the papillary tips in it.
+    """
+
+    element: str = "hex18"
+    columns: int = 72
+    rows: int = 8
+    dt_factor: float = 0.5
+    contact_columns: int = 168
+    contact_rows: int = 38
+    seen_columns: int = 80
+    seen_rows: int = 21
+    std_mm: float = 0.6
+    correlation_length_mm: float = 10.0
+    late_pressure_mmHg: float = 80.0
+    late_relaxation: float = 0.3
+    late_tips: tuple[float, float, float] = (0.0, 0.0, 0.7)
+
+
+def draw_hidden(
+    moduli: Mapping[str, float], deviations: Deviations, rng: np.random.Generator
+) -> dict[str, float]:
+    """True values of all parameters: the moduli as given, everything else drawn.
+
+    Factors are log-normal, so that they are positive; displacements are normal.
+    """
+    factors = {
+        "pressure_scale": deviations.pressure,
+        "chord_stiffness": deviations.chord_stiffness,
+        "chord_rest_length": deviations.chord_rest_length,
+    }
+    drawn = {name: float(np.exp(std * rng.standard_normal())) for name, std in factors.items()}
+    for name in REGISTRATION:
+        std = deviations.shift_mm if name.startswith("shift") else deviations.turn_degrees
+        drawn[name] = float(std * rng.standard_normal())
+    return {**{name: float(value) for name, value in moduli.items()}, **drawn}
+
+
+def simulate_patient(
+    name: str,
+    description: str,
+    template: Template,
+    values: Mapping[str, float],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+    rng: np.random.Generator,
+) -> VirtualPatient:
+    """Close a template and see it.
+
+    Parameters
+    ----------
+    name, description : str
+        Of the case.
+    template : Template
+    values : mapping
+        As from :func:`draw_hidden`.
+    simulation : Simulation
+    mechanics : MechanicsSettings
+        Its pressure is what the case states.
+    rng : numpy.random.Generator
+        For the errors.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or has no equilibrium in the frame that is held out.
+    """
+    seen = template.valve(simulation.seen_columns, simulation.seen_rows)
+    model = _model(template, seen, values, simulation, mechanics)
+    at = np.array([values[parameter] for parameter in model.names])
+    prediction = model(at)
+    if not prediction.converged:
+        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+    late = _late(simulation, model.contact_valve)
+    held = model.held(
+        at, replace(late, pressure_mmHg=late.pressure_mmHg * values["pressure_scale"])
+    )
+    if held is None:
+        raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {LATE}")
+    closed = prediction.y.reshape(2, -1, 3)[1]
+    true = {REFERENCE: seen.surface.vertices, CLOSED: closed, LATE: held}
+    case = _case(name, description, seen, true, values, simulation, mechanics, rng)
+    return VirtualPatient(case, Hidden(dict(values), true))
+
+
+def _model(
+    template: Template,
+    seen: Valve,
+    values: Mapping[str, float],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+) -> ClosureModel:
+    names = tuple(name for name in values if name not in REGISTRATION)
+    protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
+    contact = template.valve(simulation.contact_columns, simulation.contact_rows)
+    guide = None
+    cells: Sequence[tuple[str, int, int]] = (
+        ("hex18", 24, 3),
+        ("hex18", 36, 4),
+        (simulation.element, simulation.columns, simulation.rows),
+    )
+    for element, columns, rows in cells:
+        guide = ClosureModel(
+            seen,
+            contact,
+            structured_mesh(template, element, columns, rows),
+            replace(mechanics, protocol=protocol),
+            names,
+            continuation=True,
+            guide=guide,
+        )
+    assert guide is not None
+    return guide
+
+
+def _late(simulation: Simulation, valve: Valve) -> HeldState:
+    """The frame that is held out, on the annulus of a valve."""
+    return HeldState(
+        simulation.late_pressure_mmHg,
+        _late_annulus(simulation, valve),
+        valve.motion.papillary_tips[-1] + np.array(simulation.late_tips),
+    )
+
+
+def _late_annulus(simulation: Simulation, valve: Valve) -> FloatArray:
+    start, end = valve.motion.annulus[0], valve.motion.annulus[-1]
+    return np.asarray(end + simulation.late_relaxation * (start - end))
+
+
+def _case(
+    name: str,
+    description: str,
+    seen: Valve,
+    true: Mapping[str, FloatArray],
+    values: Mapping[str, float],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+    rng: np.random.Generator,
+) -> ValveCase:
+    surface = seen.surface
+    centre = seen.motion.annulus[-1].mean(axis=0)
+    registration = np.array([values[parameter] for parameter in REGISTRATION])
+    correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
+    error = CorrelatedNoise(simulation.std_mm, correlation)
+    moved = np.stack([displace(true[frame], registration, centre) for frame in (CLOSED, LATE)])
+    closed, late = error(moved, moved, rng)
+    boundary = {
+        REFERENCE: (seen.motion.annulus[0], seen.papillary_tips),
+        CLOSED: (seen.motion.annulus[-1], seen.motion.papillary_tips[-1]),
+        LATE: (
+            _late_annulus(simulation, seen),
+            seen.motion.papillary_tips[-1] + np.array(simulation.late_tips),
+        ),
+    }
+
+    def frame(which: str, time: float, role: Role, pressure: float, vertices: FloatArray) -> Frame:
+        annulus, tips = boundary[which]
+        return Frame(
+            which,
+            time,
+            role,
+            pressure,
+            vertices,
+            surface.triangles,
+            surface.region,
+            annulus,
+            vertices[seen.free_edge],
+            tips,
+            True,
+        )
+
+    peak = mechanics.protocol.pressure_mmHg
+    return ValveCase(
+        name=name,
+        description=description,
+        source="simulated with mvest",
+        licence="MIT",
+        simulated=True,
+        surface=surface,
+        annulus=seen.annulus,
+        free_edge=seen.free_edge,
+        frames=(
+            frame(REFERENCE, 0.0, Role.REFERENCE, 0.0, surface.vertices),
+            frame(CLOSED, 0.3, Role.CLOSED, peak, closed),
+            frame(LATE, 0.4, Role.HELD_OUT, simulation.late_pressure_mmHg, late),
+        ),
+        chordae=seen.chordae,
+        uncertainty=Uncertainty(simulation.std_mm, simulation.correlation_length_mm),
+    )
