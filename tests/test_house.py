@@ -89,6 +89,7 @@ IMPORT_NAME = {
     "matplotlib": ("matplotlib", "mpl_toolkits"),
     "pillow": ("PIL",),
     "pynrrd": ("nrrd",),
+    "pyyaml": ("yaml",),
     "simpleitk": ("SimpleITK",),
 }
 

@@ -1,6 +1,6 @@
-"""Reading and writing surfaces and solid meshes: VTU, VTP, STL, OBJ, and time series for ParaView.
+"""Reading and writing surfaces and solid meshes: VTU, VTP, STL, OBJ, PLY, time series for ParaView.
 
-VTU, STL and OBJ go through meshio, VTP through `mvest.valve.vtp`. Coordinates are mm. A file
+VTU, STL, OBJ and PLY go through meshio, VTP through `mvest.valve.vtp`. Coordinates are mm. A file
 appears under its name only once it is complete.
 """
 
@@ -38,8 +38,15 @@ __all__ = [
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 
-SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj")
-_READERS = {".vtu": meshio.vtu.read, ".stl": meshio.stl.read, ".obj": meshio.obj.read}
+SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
+_READERS = {
+    ".vtu": meshio.vtu.read,
+    ".stl": meshio.stl.read,
+    ".obj": meshio.obj.read,
+    ".ply": meshio.ply.read,
+}
+_WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
+"""Formats that are written without data."""
 REGION_PREFIX = "region."
 
 
@@ -99,7 +106,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def read_mesh(path: Path | str) -> meshio.Mesh:
-    """Read a VTU, STL or OBJ file with meshio; a fault of the file is an `InputError`."""
+    """Read a VTU, STL, OBJ or PLY file with meshio; a fault of the file is an `InputError`."""
     source = _input_path(path, tuple(_READERS))
     try:
         # meshio takes a text STL for a binary one first, and may overflow on its supposed size.
@@ -125,7 +132,8 @@ def read_surface(path: Path | str) -> SurfaceFile:
     Raises
     ------
     InputError
-        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.stl``, ``.obj``.
+        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.stl``, ``.obj``,
+        ``.ply``.
     GeometryError
         No triangles, other cells, or points that are not finite.
     """
@@ -186,8 +194,8 @@ def write_surface(
     Raises
     ------
     InputError
-        Unknown extension, wrong shapes, data for a format that holds none (STL, OBJ), or a file
-        that cannot be written.
+        Unknown extension, wrong shapes, data for a format that holds none here (STL, OBJ, PLY), or
+        a file that cannot be written.
     """
     target = Path(path)
     _check_suffix(target, SURFACE_SUFFIXES)
@@ -197,12 +205,12 @@ def write_surface(
     at_points = _checked_data(point_data, len(points), "point")
     at_cells = _checked_data(cell_data, len(faces), "cell")
     suffix = target.suffix.lower()
-    if suffix in (".stl", ".obj"):
+    if suffix in _WRITERS:
         if at_points or at_cells:
             raise InputError(f"{target}: {suffix[1:].upper()} holds no data; write .vtu or .vtp")
-        module = meshio.stl if suffix == ".stl" else meshio.obj
-        mesh = meshio.Mesh(points, [("triangle", faces)])
-        write_whole(target, lambda file: module.write(str(file), mesh))
+        # PLY knows no 64-bit integers.
+        mesh = meshio.Mesh(points, [("triangle", faces.astype(np.int32))])
+        write_whole(target, lambda file: _WRITERS[suffix](str(file), mesh))
     elif suffix == ".vtp":
         content = PolyData(points, faces, at_points, at_cells)
         write_whole(target, lambda file: write_vtp(file, content))

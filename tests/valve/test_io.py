@@ -18,7 +18,7 @@ from mvest.valve.solid_io import VTK_ORDER, read_solid, vtk_cells, write_solid
 from mvest.valve.surfaces import check_surface, enclosed_volume
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".vtp", ".stl", ".obj"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtp", ".stl", ".obj", ".ply"])
 def test_a_surface_comes_back_as_it_went(shapes, tmp_path, suffix):
     vertices, triangles = shapes.sphere(2.0, 3)
     vertices += [10.0, -20.0, 1 / 3]
@@ -193,6 +193,11 @@ def test_series_has_an_index_and_one_file_per_state(tmp_path):
     assert [(b.type, len(b.data)) for b in last.cells] == [("hexahedron", 8), ("quad9", 1)]
 
 
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\n"
+    "property double z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 1 0\n"
+)
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
@@ -200,7 +205,9 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     ("name", "content", "error", "message"),
     [
         ("missing.stl", None, InputError, "no such file"),
-        ("mesh.ply", "", InputError, r"extension '\.ply', expected \.vtu, \.vtp, \.stl, \.obj"),
+        ("mesh.off", "", InputError, r"extension '\.off', expected .*\.stl, \.obj, \.ply"),
+        ("mesh.ply", "nonsense", InputError, "damaged or no PLY"),
+        ("mesh.ply", PLY + "3 0 1 9\n", GeometryError, "do not exist"),
         ("mesh", "", InputError, "extension ''"),
         ("mesh.vtu", "nonsense", InputError, "damaged or no VTU"),
         ("mesh.vtp", "nonsense", InputError, "damaged or no VTK XML"),
@@ -230,7 +237,7 @@ def box_with(shapes, **change):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("a.ply", {}, "extension"),
+        ("a.off", {}, "extension"),
         ("no/where/a.vtu", {}, "cannot be written"),
         ("a.vtu", {"vertices": np.zeros((8, 2))}, "shape"),
         ("a.vtu", {"vertices": np.full((8, 3), np.nan)}, "not finite"),
@@ -240,6 +247,7 @@ def box_with(shapes, **change):
         ("a.vtu", {"cell_data": {"x": np.array(["a"] * 12)}}, "expected numbers"),
         ("a.stl", {"cell_data": {"x": np.zeros(12)}}, "STL holds no data"),
         ("a.obj", {"point_data": {"x": np.zeros(8)}}, "OBJ holds no data"),
+        ("a.ply", {"point_data": {"x": np.zeros(8)}}, "PLY holds no data"),
     ],
 )
 def test_bad_output_is_one_clear_error_and_leaves_nothing(shapes, tmp_path, name, change, message):

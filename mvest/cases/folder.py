@@ -1,0 +1,125 @@
+"""Reading a case from its folder: ``case.yaml`` and the files that it names.
+
+What a field means stands in ``README.md`` beside this module. Every error begins with the file and
+the field it comes from.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mvest.cases.case import Role, Uncertainty, ValveCase
+from mvest.cases.checks import at, check_closing_pressure, check_frames
+from mvest.cases.csv_files import read_numbers
+from mvest.cases.frames import SECONDS_PER, check_reference, place_frame, read_frame
+from mvest.cases.paths import CASE_FILE, CaseFolder
+from mvest.cases.pressure_curve import PressureCurve, generic_curve
+from mvest.cases.schema import CaseFile, read_case_file
+from mvest.cases.tissue import read_chordae, read_leaflets
+from mvest.errors import InputError
+from mvest.units import kpa_to_mpa, mpa_to_mmhg
+
+__all__ = ["read_case"]
+
+GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
+"""Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""
+
+
+def read_case(path: Path | str) -> ValveCase:
+    """Read a case folder.
+
+    Parameters
+    ----------
+    path
+        The folder with ``case.yaml``.
+
+    Raises
+    ------
+    InputError, GeometryError
+        Anything missing, unknown, inadmissible or contradictory: one error with file, field,
+        numbers, and what would be right.
+    """
+    folder = CaseFolder(Path(path))
+    if not folder.root.is_dir():
+        raise InputError(f"{folder.root}: no such folder; expected a folder with {CASE_FILE}")
+    if not folder.case.is_file():
+        raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
+    document = read_case_file(folder.case)
+    check_frames(folder.case, document)
+    derived = list(document.derived)
+    seen = [read_frame(folder, document, number) for number in range(len(document.frames))]
+    first = next(s for s in seen if s.entry.role == Role.REFERENCE.value)
+    reference = check_reference(folder.case, first, derived)
+    pressures = _pressures(folder, document, derived)
+    placed = [
+        place_frame(folder.case, document, reference, s, p, derived)
+        for s, p in zip(seen, pressures, strict=True)
+    ]
+    frames = tuple(frame for frame, _ in placed)
+    surface = read_leaflets(folder.case, document, reference, derived)
+    chordae = read_chordae(folder, document, reference, placed, derived)
+    if document.observation is None:
+        uncertainty = GENERIC_UNCERTAINTY
+        derived.append(
+            f"observation: standard deviation {uncertainty.std_mm:g} mm and correlation length "
+            f"{uncertainty.correlation_length_mm:g} mm assumed"
+        )
+    else:
+        given = document.observation
+        uncertainty = Uncertainty(given.std_mm, given.correlation_length_mm)
+    return ValveCase(
+        name=document.name,
+        description=document.description,
+        source=document.source,
+        licence=document.licence,
+        simulated=document.simulated,
+        surface=surface,
+        annulus=reference.rims.annulus,
+        free_edge=reference.rims.free_edge,
+        frames=frames,
+        chordae=chordae,
+        uncertainty=uncertainty,
+        derived=tuple(derived),
+        sha256=folder.sha256(),
+    )
+
+
+def _pressures(folder: CaseFolder, document: CaseFile, derived: list[str]) -> list[float]:
+    """Transmitral pressure (mmHg) of every frame."""
+    unit = document.units.pressure
+    to_mmhg = 1.0 if unit == "mmHg" else mpa_to_mmhg(kpa_to_mpa(1.0))
+    to_seconds = SECONDS_PER[document.units.time]
+    curve = generic_curve()
+    if document.pressure_curve is not None:
+        file = folder.file(document.pressure_curve, "pressure_curve")
+        with at(folder.case, "pressure_curve"):
+            table = read_numbers(file, ("time", "pressure"))
+            curve = PressureCurve(to_seconds * table[:, 0], to_mmhg * table[:, 1])
+    result = []
+    for number, frame in enumerate(document.frames):
+        where = f"frames.{number}.pressure"
+        if frame.pressure is not None:
+            pressure = to_mmhg * frame.pressure
+        else:
+            with at(folder.case, where):
+                pressure = _from_curve(curve, to_seconds * frame.time)
+            if document.pressure_curve is None:
+                derived.append(
+                    f"pressure of frame {frame.name!r}: {pressure:.1f} mmHg of a generic "
+                    "transmitral curve, whose clock is taken to be that of the frames"
+                )
+        if frame.role != Role.REFERENCE.value:
+            with at(folder.case, where):
+                check_closing_pressure(pressure, unit)
+        result.append(pressure)
+    return result
+
+
+def _from_curve(curve: PressureCurve, time: float) -> float:
+    try:
+        return curve(time)
+    except InputError as fault:
+        raise InputError(
+            f"not given, and {fault}; give the pressure of this frame or a pressure_curve that "
+            "covers it"
+        ) from fault

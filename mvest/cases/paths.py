@@ -1,0 +1,49 @@
+"""The files of a case folder: found by name, never outside the folder, and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mvest.cases.schema import wrong
+
+__all__ = ["CASE_FILE", "CaseFolder"]
+
+CASE_FILE = "case.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class CaseFolder:
+    """A case folder: finds the files in it and remembers which were used."""
+
+    root: Path
+    used: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def case(self) -> Path:
+        """The file with the fields, which every error names first."""
+        return self.root / CASE_FILE
+
+    def file(self, name: str, where: str) -> Path:
+        """The path of a file that a field names; it must lie in the folder."""
+        given = Path(name)
+        path = self.root / given
+        outside = given.is_absolute() or ".." in given.parts or "\\" in name or "\0" in name
+        if outside or not path.resolve().is_relative_to(self.root.resolve()):
+            raise wrong(
+                self.case, where, f"{name!r} leads out of the folder; expected a file inside it"
+            )
+        if not path.is_file():
+            raise wrong(self.case, where, f"{name!r}: no such file in {self.root}")
+        self.used[given.as_posix()] = path
+        return path
+
+    def sha256(self) -> str:
+        """Over names and contents of all used files, in the order of the names."""
+        digest = hashlib.sha256()
+        for name, path in sorted({CASE_FILE: self.case, **self.used}.items()):
+            content = path.read_bytes()
+            digest.update(f"{len(name.encode())} {name} {len(content)} ".encode())
+            digest.update(content)
+        return digest.hexdigest()

@@ -1,0 +1,261 @@
+"""The two edges of a leaflet band, its commissures, and matching one annulus to another.
+
+All loops run in the direction of their triangles. With normals towards the ventricle in both
+frames, two such loops run alike, so that commissures are told apart by which region begins there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.surface_coordinates import boundary_loops
+
+__all__ = ["Rims", "commissures", "find_rims", "loop_vector_area", "match_annulus", "two_loops"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rims:
+    """The boundary of a band.
+
+    Attributes
+    ----------
+    annulus, free_edge : ndarray
+        Vertices in the order of the loop.
+    """
+
+    annulus: IntArray
+    free_edge: IntArray
+
+
+def loop_vector_area(points: FloatArray) -> FloatArray:
+    """Vector area ``(3,)`` mm² of a closed curve ``(k, 3)``, independent of the surface in it."""
+    centred = points - points.mean(axis=0)
+    area: FloatArray = 0.5 * np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
+    return area
+
+
+def find_rims(
+    vertices: FloatArray,
+    triangles: IntArray,
+    tips: FloatArray,
+    annulus: IntArray | None = None,
+    free_edge: IntArray | None = None,
+) -> Rims:
+    """Name the two boundary loops of a band.
+
+    The free edge is the loop nearer to the papillary tips (mean distance of its vertices from
+    their nearest tips). A loop that is given keeps its order.
+
+    Raises
+    ------
+    GeometryError
+        Not exactly two boundary loops, or a given list is not one of them; the loop near the tips
+        is the wider one, as if the tips lay on the atrial side.
+    """
+    loops = two_loops(vertices, triangles)
+    given = {"annulus": annulus, "free_edge": free_edge}
+    place = {
+        name: _which(name, wanted, loops) for name, wanted in given.items() if wanted is not None
+    }
+    if len(place) == 2 and place["annulus"] == place["free_edge"]:
+        raise GeometryError("annulus and free_edge are the same boundary loop; expected both loops")
+    if not place:
+        distance = [
+            np.linalg.norm(vertices[loop][:, None] - tips, axis=2).min(axis=1).mean()
+            for loop in loops
+        ]
+        place["free_edge"] = int(np.argmin(distance))
+        area = [np.linalg.norm(loop_vector_area(vertices[loop])) for loop in loops]
+        if area[place["free_edge"]] > area[1 - place["free_edge"]]:
+            near = place["free_edge"]
+            raise GeometryError(
+                f"the papillary tips are nearest to the wider edge of the surface (which encloses "
+                f"{area[near]:.0f} mm^2, the other {area[1 - near]:.0f} mm^2), so they seem to lie "
+                f"above the annulus, on the atrial side; correct papillary_tips, or name the "
+                f"annulus if this is right"
+            )
+    if "annulus" not in place:
+        place["annulus"] = 1 - place["free_edge"]
+    return Rims(
+        loops[place["annulus"]] if annulus is None else annulus,
+        loops[1 - place["annulus"]] if free_edge is None else free_edge,
+    )
+
+
+def two_loops(vertices: FloatArray, triangles: IntArray) -> list[IntArray]:
+    """The boundary loops of a surface, or what is wrong if they are not two.
+
+    Raises
+    ------
+    GeometryError
+        With the size and place of the loops: those that are no annulus and no free edge are holes.
+    """
+    loops = boundary_loops(triangles)
+    if len(loops) != 2:
+        raise GeometryError(_wrong_number(vertices, loops))
+    return loops
+
+
+def _wrong_number(vertices: FloatArray, loops: list[IntArray]) -> str:
+    perimeter = [
+        float(np.linalg.norm(vertices[loop] - vertices[np.roll(loop, -1)], axis=1).sum())
+        for loop in loops
+    ]
+    order = np.argsort(perimeter)[::-1]
+    listed = "; ".join(
+        f"{len(loops[i])} vertices, {perimeter[i]:.1f} mm round, near "
+        f"{np.round(vertices[loops[i]].mean(axis=0), 1).tolist()} (vertex {int(loops[i][0])})"
+        for i in order[:5]
+    )
+    if len(loops) > 2:
+        advice = (
+            f"close the {len(loops) - 2} holes (the shortest loops), or merge the vertices along "
+            "the seams of its parts"
+        )
+    else:
+        advice = "open it along the annulus and along the free edge"
+    return (
+        f"{len(loops)} boundary loops ({listed or 'none'}), expected two, the annulus and the free "
+        f"edge: {advice}"
+    )
+
+
+def _which(name: str, wanted: IntArray, loops: list[IntArray]) -> int:
+    """Number of the boundary loop that a list of vertices runs along, in either direction."""
+    for number, loop in enumerate(loops):
+        if set(loop.tolist()) == set(wanted.tolist()):
+            turned = np.roll(loop, -int(np.flatnonzero(loop == wanted[0])[0]))
+            if len(wanted) == len(loop) and (
+                np.array_equal(wanted, turned) or np.array_equal(wanted, np.roll(turned[::-1], 1))
+            ):
+                return number
+            raise GeometryError(
+                f"{name}: its vertices are those of a boundary loop, but not in the order of the "
+                "loop; sort them so that neighbours share an edge"
+            )
+    best = max(loops, key=lambda loop: np.isin(loop, wanted).sum())
+    missing = np.setdiff1d(best, wanted)
+    extra = np.setdiff1d(wanted, best)
+    raise GeometryError(
+        f"{name} is not closed: its {len(wanted)} vertices are not one of the boundary loops "
+        f"({', '.join(str(len(loop)) for loop in loops)} vertices); of the nearest it misses "
+        f"{missing[:5].tolist()} ({len(missing)} in all) and has {extra[:5].tolist()} "
+        f"({len(extra)} in all) besides"
+    )
+
+
+def directed(loop: IntArray, triangles: IntArray) -> IntArray:
+    """A boundary loop in the direction of its triangles, with the same first vertex."""
+    following = {
+        (int(a), int(b)) for i in range(3) for a, b in np.roll(triangles, -i, axis=1)[:, :2]
+    }
+    if (int(loop[0]), int(loop[1])) in following:
+        return loop
+    return np.roll(loop[::-1], 1)
+
+
+def edge_regions(loop: IntArray, triangles: IntArray, region: IntArray) -> IntArray:
+    """Region ``(k,)`` of the triangle at each edge from ``loop[i]`` to ``loop[i + 1]``."""
+    owner: dict[tuple[int, int], int] = {}
+    for i in range(3):
+        pairs = np.roll(triangles, -i, axis=1)[:, :2].tolist()
+        owner.update({(a, b): r for (a, b), r in zip(pairs, region.tolist(), strict=True)})
+    ends = zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)
+    return np.array([owner[pair] for pair in ends], dtype=np.int64)
+
+
+def commissures(
+    loop: IntArray, triangles: IntArray, region: IntArray
+) -> dict[int, tuple[int, int]]:
+    """Where each region begins and ends along a loop that runs in the direction of its triangles.
+
+    Returns
+    -------
+    dict
+        Region to the positions (begin, end) in ``loop``; the end is where the next region begins.
+
+    Raises
+    ------
+    GeometryError
+        A region does not touch the loop in one piece, or there is only one region.
+    """
+    labels = edge_regions(loop, triangles, region)
+    begins = np.flatnonzero(labels != np.roll(labels, 1))
+    present = labels[begins]
+    if len(begins) < 2:
+        raise GeometryError("the annulus belongs to one region only, so that it has no commissures")
+    if len(set(present.tolist())) != len(present):
+        raise GeometryError(
+            f"along the annulus the regions are {present.tolist()} one after the other; expected "
+            "each once, in one piece"
+        )
+    ends = np.roll(begins, -1)
+    return {int(r): (int(a), int(b)) for r, a, b in zip(present, begins, ends, strict=True)}
+
+
+def _arc(loop: FloatArray, begin: int, end: int) -> tuple[IntArray, FloatArray]:
+    """Positions in a closed curve from ``begin`` to ``end``, and their share of the arc length."""
+    count = (end - begin) % len(loop)
+    at = (begin + np.arange(count + 1)) % len(loop)
+    step = np.linalg.norm(np.diff(loop[at], axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(step)])
+    return at, length / length[-1]
+
+
+def match_annulus(
+    reference: tuple[FloatArray, IntArray, IntArray],
+    reference_annulus: IntArray,
+    seen: tuple[FloatArray, IntArray, IntArray],
+    seen_annulus: IntArray,
+) -> FloatArray:
+    """Where the annulus vertices of the reference are on the annulus of another frame.
+
+    Between two commissures a vertex keeps its share of the arc length.
+
+    Parameters
+    ----------
+    reference, seen
+        Vertices ``(n, 3)`` mm, triangles and regions of the two frames.
+    reference_annulus, seen_annulus
+        The annulus loops.
+
+    Returns
+    -------
+    ndarray
+        ``(k, 3)`` mm, in the order of ``reference_annulus``.
+
+    Raises
+    ------
+    InputError
+        The regions follow each other differently along the two loops.
+    GeometryError
+        No commissures.
+    """
+    vertices, triangles, region = reference
+    loop = directed(reference_annulus, triangles)
+    other = directed(seen_annulus, seen[1])
+    pieces = commissures(loop, triangles, region)
+    other_pieces = commissures(other, seen[1], seen[2])
+    if _cycle(list(pieces)) != _cycle(list(other_pieces)):
+        raise InputError(
+            f"along the annulus the regions follow each other as {list(other_pieces)}, in the "
+            f"reference frame as {list(pieces)}"
+        )
+    curve, other_curve = vertices[loop], seen[0][other]
+    placed = np.zeros((len(vertices), 3))
+    for label, (begin, end) in pieces.items():
+        at, share = _arc(curve, begin, end)
+        other_at, other_share = _arc(other_curve, *other_pieces[label])
+        for axis in range(3):
+            placed[loop[at], axis] = np.interp(share, other_share, other_curve[other_at, axis])
+    return placed[reference_annulus]
+
+
+def _cycle(labels: list[int]) -> list[int]:
+    """A cyclic sequence begun at its smallest entry."""
+    start = labels.index(min(labels))
+    return labels[start:] + labels[:start]

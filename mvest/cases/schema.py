@@ -1,0 +1,272 @@
+"""What may stand in the file ``case.yaml``: its fields, version 1.
+
+The models say what the fields are and which kinds of values they take. Whether the values make
+sense together, and with the files they name, is for `mvest.cases.checks`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
+
+from mvest.cases.yaml_file import read_yaml
+from mvest.errors import InputError
+
+__all__ = [
+    "VERSION",
+    "CaseFile",
+    "ChordaeEntry",
+    "FrameEntry",
+    "ObservationEntry",
+    "PointData",
+    "Units",
+    "case_schema",
+    "read_case_file",
+    "wrong",
+]
+
+VERSION = 1
+"""The version of the format that is read and written."""
+
+
+def _kind(value: Any) -> str:
+    """Which alternative of a field a value belongs to; the angle brackets keep it out of names."""
+    if isinstance(value, dict):
+        return "<point data>" if "point_data" in value else "<mapping>"
+    if isinstance(value, BaseModel):
+        return "<point data>" if isinstance(value, PointData) else "<mapping>"
+    if isinstance(value, list):
+        return "<list>"
+    return "<text>" if isinstance(value, str) else "<number>"
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Text = Annotated[str, Field(strict=True)]
+Name = Annotated[str, Field(strict=True, min_length=1)]
+Index = Annotated[int, Field(strict=True, ge=0)]
+Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Regions = Annotated[
+    Annotated[list[Name], Field(min_length=1), Tag("<list>")]
+    | Annotated[
+        dict[Annotated[int, Field(strict=True)], Name], Field(min_length=1), Tag("<mapping>")
+    ],
+    Discriminator(_kind),
+]
+SurfaceFiles = Annotated[
+    Annotated[Name, Tag("<text>")]
+    | Annotated[dict[Name, Name], Field(min_length=1), Tag("<mapping>")],
+    Discriminator(_kind),
+]
+Curve = Annotated[
+    Annotated[Name, Tag("<text>")] | Annotated[list[Index], Field(min_length=3), Tag("<list>")],
+    Discriminator(_kind),
+]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Units(_Model):
+    """Units of everything in the folder that does not carry one in its name."""
+
+    length: Literal["mm", "cm", "m"] = Field(description="mm, cm or m, of all coordinates")
+    pressure: Literal["mmHg", "kPa"] = Field("mmHg", description="mmHg or kPa")
+    time: Literal["s", "ms"] = Field("s", description="s or ms")
+
+
+class PointData(_Model):
+    """A field at the vertices of the reference surface."""
+
+    point_data: Name = Field(description="the name of point data of the reference surface")
+
+
+class FrameEntry(_Model):
+    """One instant at which the valve was seen."""
+
+    name: Name = Field(description="text, different for every frame")
+    time: Number = Field(description="a number in units.time, larger than that of the frame before")
+    role: Literal["reference", "closed", "held_out"] = Field(
+        description="reference (open; the model starts from it), closed (fitted) or held_out"
+    )
+    surface: SurfaceFiles = Field(
+        description="a file (.vtp, .vtu, .stl, .obj, .ply), or one file for every region"
+    )
+    annulus: Curve | None = Field(
+        None, description="a list of vertex numbers in the order of the loop, or a .csv file"
+    )
+    free_edge: Curve | None = Field(
+        None, description="a list of vertex numbers in the order of the loop, or a .csv file"
+    )
+    papillary_tips: Annotated[list[Point], Field(min_length=1)] = Field(
+        description="a list of [x, y, z] in units.length, in the same order in all frames"
+    )
+    pressure: Number | None = Field(
+        None, description="transmitral pressure in units.pressure, positive where it closes"
+    )
+    corresponds: bool | None = Field(
+        None,
+        strict=True,
+        description="true or false: vertex i is the same material point as in the reference",
+    )
+
+
+class ChordaeEntry(_Model):
+    """The table of chordae, with what is common to all of them."""
+
+    file: Name = Field(description="a .csv file with tip,x,y,z,family,rest_length_mm,stiffness_n")
+    toe_strain: Number = Field(
+        0.015, gt=0, lt=0.5, description="strain over which the stiffness rises, in (0, 0.5)"
+    )
+    families: list[Name] | None = Field(None, description="names of all families, in order")
+
+
+class ObservationEntry(_Model):
+    """How well the vertices of a frame are seen."""
+
+    std_mm: Number = Field(gt=0, description="standard deviation of a coordinate in mm, > 0")
+    correlation_length_mm: Number = Field(
+        ge=0, description="mm along the leaflets over which errors are alike, >= 0"
+    )
+
+
+class CaseFile(_Model):
+    """The content of ``case.yaml``."""
+
+    version: Literal[1] = Field(description="1, the version of this format")
+    name: Name = Field(description="text")
+    description: Text = Field("", description="text")
+    source: Text = Field("", description="text: where the data come from")
+    licence: Text = Field("", description="text: under which terms they may be used")
+    simulated: bool = Field(
+        False, strict=True, description="true or false: do the frames come from a simulation"
+    )
+    units: Units = Field(description="a mapping with length, and if need be pressure and time")
+    regions: Regions = Field(
+        description="a list of names (labels 0, 1, ...) or a mapping from label to name"
+    )
+    thickness: (
+        Annotated[
+            Annotated[Number, Tag("<number>")]
+            | Annotated[PointData, Tag("<point data>")]
+            | Annotated[dict[Name, Number], Tag("<mapping>")],
+            Discriminator(_kind),
+        ]
+        | None
+    ) = Field(None, description="mm: a number, a number for every region, or {point_data: NAME}")
+    fibre: Name | None = Field(
+        None, description="the name of point data (3 components) of the reference surface"
+    )
+    frames: Annotated[list[FrameEntry], Field(min_length=2)] = Field(
+        description="a list of at least two frames in the order of time"
+    )
+    pressure_curve: Name | None = Field(
+        None, description="a .csv file with the columns time,pressure"
+    )
+    chordae: (
+        Annotated[
+            Annotated[Name, Tag("<text>")] | Annotated[ChordaeEntry, Tag("<mapping>")],
+            Discriminator(_kind),
+        ]
+        | None
+    ) = Field(None, description="a .csv file, or a mapping with file, toe_strain and families")
+    observation: ObservationEntry | None = Field(
+        None, description="a mapping with std_mm and correlation_length_mm"
+    )
+    corresponds: bool | Literal["auto"] = Field(
+        "auto", description="true, false or auto: do vertices correspond between all frames"
+    )
+    derived: list[Text] = Field(
+        default_factory=list,
+        description="sentences on what had been derived when the case was written by a program",
+    )
+
+    def region_names(self) -> dict[int, str]:
+        """Name of every label, in order."""
+        return dict(enumerate(self.regions)) if isinstance(self.regions, list) else self.regions
+
+
+def case_schema() -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of ``case.yaml``."""
+    return CaseFile.model_json_schema()
+
+
+def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
+    """The error for one field of a case: file, field, and what is wrong with it."""
+    return kind(f"{file}: {field}: {what}")
+
+
+def read_case_file(file: Path) -> CaseFile:
+    """Read ``case.yaml``.
+
+    Raises
+    ------
+    InputError
+        The file is no plain YAML mapping, or a field is missing, unknown or of the wrong kind: one
+        line with the field, what was found and what would be right.
+    """
+    data = read_yaml(file)
+    version = data.get("version")
+    if version != VERSION or isinstance(version, bool):
+        found = f"{version!r} is not known" if "version" in data else "is missing"
+        raise wrong(file, "version", f"{found}; expected {VERSION}")
+    try:
+        return CaseFile.model_validate(data)
+    except ValidationError as fault:
+        errors = fault.errors(include_url=False)
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        field, what = _explained(errors[0]["loc"], errors[0]["type"], errors[0]["input"])
+        raise wrong(file, field, what + more) from fault
+
+
+def _explained(loc: Sequence[int | str], kind: str, value: Any) -> tuple[str, str]:
+    """Dotted field and a sentence for one of pydantic's errors."""
+    path = [part for part in loc if not (isinstance(part, str) and part.startswith("<"))]
+    field = ".".join(str(part) for part in path)
+    if kind == "extra_forbidden":
+        model, _ = _place(path[:-1])
+        known = list(model.model_fields)
+        near = difflib.get_close_matches(str(path[-1]), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+        return field, f"unknown key; {hint}"
+    _, expected = _place(path)
+    if kind == "missing":
+        return field, f"is missing; expected {expected}"
+    shown = repr(value)
+    found = shown if len(shown) <= 60 else shown[:57] + "..."
+    note = ""
+    if isinstance(value, str) and _is_number(value):
+        note = " (this is text: YAML wants numbers like 1.0e-3, without quotes)"
+    return field, f"found {found}{note}; expected {expected}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _place(path: Sequence[int | str]) -> tuple[type[BaseModel], str]:
+    """The model that a path leads to (or through last), and the description of its last field."""
+    model: type[BaseModel] = CaseFile
+    description = "a mapping of fields"
+    for part in path:
+        if isinstance(part, str) and part in model.model_fields:
+            info = model.model_fields[part]
+            description = info.description or description
+            model = _model_in(info.annotation) or model
+    return model, description
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model that a field holds, by itself, in a list, or as one of several alternatives."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = (_model_in(part) for part in get_args(annotation))
+    return next((model for model in found if model is not None), None)

@@ -1,0 +1,191 @@
+"""One frame's surface with its regions, from one labelled file or from one file per region.
+
+Formats without labels (STL, PLY without a ``region`` property, OBJ without groups) carry the
+regions through the files' names: ``{anterior: a.stl, posterior: p.stl}``. Coincident vertices of
+such files, and of STL files as a whole, are merged and numbered in the order in which the triangles
+name them, so that two files with the same triangles in the same order correspond.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.io import SurfaceFile, read_surface
+
+__all__ = ["MERGE_TOLERANCE", "RegionSurface", "read_regions"]
+
+MERGE_TOLERANCE = 1e-5
+"""Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionSurface:
+    """A surface as read, its triangles labelled.
+
+    Attributes
+    ----------
+    vertices
+        ``(n, 3)`` in the unit of the file.
+    triangles
+        ``(m, 3)``.
+    region
+        ``(m,)`` index into the regions of the case, or None where the file has no labels.
+    point_data
+        Named arrays with n rows.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray | None
+    point_data: Mapping[str, NDArray[np.generic]]
+
+
+def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -> RegionSurface:
+    """Read a surface and which region each of its triangles belongs to.
+
+    Labels are looked for, in this order, in the file names (one file for each region), in the cell
+    data ``region``, in the point data ``region`` (a triangle belongs to the region of at least two
+    of its corners), and in the names of OBJ groups or objects. With one region there is nothing to
+    label.
+
+    Parameters
+    ----------
+    files
+        One file, or one for each name of a region.
+    regions
+        Name of every label, in order.
+
+    Raises
+    ------
+    InputError, GeometryError
+        A missing, damaged or empty file, unknown or missing labels, a region without triangles.
+    """
+    if isinstance(files, Path):
+        found = read_surface(files)
+        region = _labels(files, found, regions)
+        surface = RegionSurface(found.vertices, found.triangles, region, found.point_data)
+        if files.suffix.lower() == ".stl":
+            surface = _merged(surface)
+    else:
+        surface = _merged(_joined(files, list(regions.values())))
+    if surface.region is not None:
+        empty = [n for i, n in enumerate(regions.values()) if not (surface.region == i).any()]
+        if empty:
+            raise GeometryError(f"no triangle belongs to the region {', '.join(empty)}")
+    return surface
+
+
+def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:
+    unknown = [name for name in files if name not in names]
+    if unknown:
+        raise InputError(f"a file for the region {unknown[0]!r}; known are {', '.join(names)}")
+    missing = [name for name in names if name not in files]
+    if missing:
+        raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
+    parts = [read_surface(files[name]) for name in names]
+    shared = set.intersection(*(set(part.point_data) for part in parts))
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return RegionSurface(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + s for part, s in zip(parts, start, strict=False)]),
+        np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts]),
+        {name: np.concatenate([part.point_data[name] for part in parts]) for name in shared},
+    )
+
+
+def _merged(surface: RegionSurface) -> RegionSurface:
+    """The surface with coincident vertices made one, numbered as the triangles name them."""
+    n = len(surface.vertices)
+    diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    pairs = cKDTree(surface.vertices).query_pairs(MERGE_TOLERANCE * diagonal, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(n, n))
+    _, group = connected_components(graph, directed=False)
+    corners = group[surface.triangles.ravel()]
+    _, first, inverse = np.unique(corners, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    keep = surface.triangles.ravel()[np.sort(first)]
+    return RegionSurface(
+        surface.vertices[keep],
+        rank[inverse].reshape(-1, 3),
+        surface.region,
+        {name: values[keep] for name, values in surface.point_data.items()},
+    )
+
+
+def _labels(file: Path, found: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
+    if "region" in found.cell_data:
+        return _numbered(found.cell_data["region"], regions, "triangles", "cell data region")
+    if "region" in found.point_data:
+        at_corner = _numbered(found.point_data["region"], regions, "vertices", "point data region")[
+            found.triangles
+        ]
+        ordered = np.sort(at_corner, axis=1)
+        torn = np.flatnonzero((np.diff(ordered, axis=1) > 0).all(axis=1))
+        if len(torn):
+            raise InputError(
+                f"triangles {torn[:5].tolist()} have corners in three regions; give the region as "
+                "cell data"
+            )
+        # The middle one of three sorted labels is the one that occurs at least twice.
+        return ordered[:, 1]
+    if file.suffix.lower() == ".obj":
+        groups = _groups(file)
+        if len(set(groups)) > 1 or (groups and groups[0] in regions.values()):
+            return _named(groups, list(regions.values()))
+    return np.zeros(len(found.triangles), dtype=np.int64) if len(regions) == 1 else None
+
+
+def _numbered(
+    labels: NDArray[np.generic], regions: Mapping[int, str], what: str, where: str
+) -> IntArray:
+    """Labels as indices into the regions."""
+    values = np.asarray(labels, dtype=np.float64).reshape(len(labels), -1)
+    if values.shape[1] != 1:
+        raise InputError(f"{where} has {values.shape[1]} components, expected one label")
+    result = np.full(len(values), -1, dtype=np.int64)
+    for index, label in enumerate(regions):
+        result[values[:, 0] == label] = index
+    bad = np.flatnonzero(result < 0)
+    if len(bad):
+        known = ", ".join(f"{label} ({name})" for label, name in regions.items())
+        odd = sorted({f"{v:g}" for v in values[bad, 0]})
+        raise InputError(
+            f"{where}: unknown label {', '.join(odd[:5])} at {what} {bad[:5].tolist()}"
+            f"{f' and {len(bad) - 5} more' if len(bad) > 5 else ''}; known are {known}"
+        )
+    return result
+
+
+def _groups(file: Path) -> list[str]:
+    """Name of the group of every face of an OBJ file, or of its object where it has no groups."""
+    group, obj, by_group, by_object = "", "", [], []
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word == "g":
+            group = rest.strip()
+        elif word == "o":
+            obj = rest.strip()
+        elif word == "f":
+            by_group.append(group)
+            by_object.append(obj)
+    return by_group if any(by_group) else by_object
+
+
+def _named(groups: list[str], names: list[str]) -> IntArray:
+    unknown = sorted(set(groups) - set(names))
+    if unknown:
+        raise InputError(
+            f"groups {', '.join(repr(name) for name in unknown[:5])} are no regions; known are "
+            f"{', '.join(names)}"
+        )
+    return np.array([names.index(name) for name in groups], dtype=np.int64)

@@ -1,0 +1,189 @@
+"""Thickness, fibres and chordae of a case, as given or as derived."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mvest.cases.case import Frame, Role
+from mvest.cases.checks import at, check_chordae, check_thickness
+from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.cases.csv_files import indices, numbers, read_columns
+from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
+from mvest.cases.paths import CaseFolder
+from mvest.cases.rims import Rims
+from mvest.cases.schema import CaseFile, ChordaeEntry, PointData
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy import Chordae, LeafletSurface
+from mvest.valve.surface_coordinates import surface_coordinates
+
+__all__ = ["CHORD_COLUMNS", "GENERIC_THICKNESS", "read_chordae", "read_leaflets"]
+
+CHORD_COLUMNS = ("tip", "x", "y", "z", "family", "rest_length_mm", "stiffness_n")
+GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
+"""mm, the method paper's values (ISBI 2013)."""
+
+
+def read_leaflets(
+    file: Path, document: CaseFile, reference: ReferenceFrame, derived: list[str]
+) -> LeafletSurface:
+    """The midsurface of the reference frame; what was not given is added to ``derived``."""
+    seen, names = reference.seen, tuple(document.region_names().values())
+    n = len(seen.vertices)
+    bare = LeafletSurface(
+        seen.vertices,
+        seen.triangles,
+        reference.region,
+        names,
+        np.tile([1.0, 0.0, 0.0], (n, 1)),
+        np.ones(n),
+    )
+    with at(file, "thickness"):
+        thickness = _thickness(document, seen, names, bare.vertex_region, derived)
+        check_thickness(thickness)
+    with at(file, "fibre"):
+        fibre = _fibre(document, reference, derived)
+    return LeafletSurface(seen.vertices, seen.triangles, reference.region, names, fibre, thickness)
+
+
+def _thickness(
+    document: CaseFile,
+    seen: SeenFrame,
+    names: tuple[str, ...],
+    vertex_region: IntArray,
+    derived: list[str],
+) -> FloatArray:
+    given = document.thickness
+    if isinstance(given, PointData):
+        return MM_PER[document.units.length] * _point_data(seen, given.point_data, 1)[:, 0]
+    if isinstance(given, float):
+        return np.full(len(seen.vertices), given)
+    by_name: Mapping[str, float] = GENERIC_THICKNESS if given is None else given
+    missing = [name for name in names if name not in by_name]
+    if missing:
+        raise InputError(f"none for the region {', '.join(missing)}; give one in mm")
+    unknown = [name for name in by_name if name not in names]
+    if given is None:
+        listed = ", ".join(f"{by_name[name]:g} mm ({name})" for name in names)
+        derived.append(f"thickness: {listed} assumed")
+    elif unknown:
+        raise InputError(f"unknown region {unknown[0]!r}; known are {', '.join(names)}")
+    return np.array([by_name[name] for name in names])[vertex_region]
+
+
+def _fibre(document: CaseFile, reference: ReferenceFrame, derived: list[str]) -> FloatArray:
+    seen, rims = reference.seen, reference.rims
+    if document.fibre is not None:
+        return _point_data(seen, document.fibre, 3)
+    derived.append(
+        "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
+    )
+    return surface_coordinates(
+        seen.vertices, seen.triangles, rims.annulus, rims.free_edge
+    ).circumferential
+
+
+def _point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
+    """Finite point data ``(n, components)`` of the reference surface."""
+    if name not in seen.point_data:
+        listed = ", ".join(sorted(seen.point_data)) or "none"
+        raise InputError(
+            f"the reference surface has no point data {name!r}; found {listed} (only .vtp, .vtu "
+            "and .ply hold any)"
+        )
+    values = np.asarray(seen.point_data[name], dtype=np.float64).reshape(len(seen.vertices), -1)
+    if values.shape[1] != components:
+        raise InputError(
+            f"point data {name!r} has {values.shape[1]} components, expected {components}"
+        )
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise GeometryError(f"point data {name!r} is not finite at vertices {bad[:5].tolist()}")
+    return values
+
+
+def read_chordae(
+    folder: CaseFolder,
+    document: CaseFile,
+    reference: ReferenceFrame,
+    placed: list[tuple[Frame, Rims]],
+    derived: list[str],
+) -> Chordae:
+    """The chordae of the table, or those laid out; then this is added to ``derived``."""
+    tip_count = len(reference.seen.tips)
+    if document.chordae is None:
+        with at(folder.case, "chordae"):
+            return _laid_out(document, reference, placed, derived)
+    given = document.chordae
+    entry = given if isinstance(given, ChordaeEntry) else ChordaeEntry(file=given)  # type: ignore[call-arg]
+    file = folder.file(entry.file, "chordae")
+    with at(folder.case, "chordae"):
+        chordae = _chord_table(file, entry, MM_PER[document.units.length])
+        check_chordae(chordae, reference.seen.vertices, tip_count)
+    if isinstance(given, str):
+        derived.append(f"chordae: toe strain {entry.toe_strain:g} assumed")
+    return chordae
+
+
+def _chord_table(file: Path, entry: ChordaeEntry, scale: float) -> Chordae:
+    columns = read_columns(file, CHORD_COLUMNS)
+    names = entry.families or list(dict.fromkeys(columns["family"]))
+    for row, name in enumerate(columns["family"]):
+        if name not in names:
+            raise InputError(
+                f"{file}: family of row {row} is {name!r}; known are {', '.join(names)}"
+            )
+    measured = ("x", "y", "z", "rest_length_mm", "stiffness_n")
+    values = {name: numbers(file, name, columns[name]) for name in measured}
+    return Chordae(
+        tip=indices(file, "tip", columns["tip"]),
+        insertion=scale * np.column_stack([values[name] for name in ("x", "y", "z")]),
+        family=np.array([names.index(name) for name in columns["family"]], dtype=np.int64),
+        family_names=tuple(names),
+        rest_length=values["rest_length_mm"],
+        axial_stiffness=values["stiffness_n"],
+        toe_strain=entry.toe_strain,
+    )
+
+
+def _laid_out(
+    document: CaseFile,
+    reference: ReferenceFrame,
+    placed: list[tuple[Frame, Rims]],
+    derived: list[str],
+) -> Chordae:
+    names = list(document.region_names().values())
+    seen = reference.seen
+    if len(names) != 2 or "anterior" not in names or len(seen.tips) != 2:
+        raise InputError(
+            f"missing; it can be left out only for two regions, one of them named anterior, and "
+            f"two papillary tips (here: {', '.join(names)}; {len(seen.tips)} tips)"
+        )
+    anterior = names.index("anterior")
+    rims = reference.rims
+    band = LeafletBand.of(
+        seen.vertices, seen.triangles, reference.region, rims.annulus, rims.free_edge, anterior
+    )
+    closed, closed_rims = next(p for p in placed if p[0].role is Role.CLOSED)
+    goal: LeafletBand | FloatArray
+    if closed.corresponds:
+        how, goal = "its vertices", closed.vertices
+    else:
+        how = "the same material coordinates in it"
+        goal = LeafletBand.of(
+            closed.vertices,
+            closed.triangles,
+            closed.region,
+            closed_rims.annulus,
+            closed_rims.free_edge,
+            anterior,
+        )
+    chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips)
+    derived.append(
+        f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
+        f"rest lengths from the closed frame (through {how})"
+    )
+    return chordae

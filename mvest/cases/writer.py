@@ -1,0 +1,154 @@
+"""Writing a case as a folder that `mvest.cases.folder.read_case` reads back unchanged."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.csv_files import write_columns
+from mvest.cases.paths import CASE_FILE
+from mvest.cases.schema import VERSION
+from mvest.cases.tissue import CHORD_COLUMNS
+from mvest.errors import InputError, cannot_write
+from mvest.valve.io import write_surface
+
+__all__ = ["write_case"]
+
+
+def write_case(folder: Path | str, case: ValveCase) -> Path:
+    """Write a case: ``case.yaml``, one ``.vtp`` per frame, loops and chordae as ``.csv``.
+
+    Everything is given explicitly, in mm, s and mmHg, so that nothing is derived anew on reading.
+    The folder appears under its name only once it is complete.
+
+    Parameters
+    ----------
+    folder
+        A folder that does not exist yet (or is empty), in one that does.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    InputError
+        The folder is not empty or cannot be written, or the reference frame is not the surface of
+        the case.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
+    _check_reference(case)
+    try:
+        temporary = Path(tempfile.mkdtemp(dir=target.parent, prefix=".part-"))
+        try:
+            _write_files(temporary, case)
+            temporary.chmod(0o755)
+            temporary.replace(target)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as fault:
+        raise cannot_write(target, fault) from fault
+    return target
+
+
+def _check_reference(case: ValveCase) -> None:
+    frame, surface = case.frame(Role.REFERENCE), case.surface
+    for name in ("vertices", "triangles", "region"):
+        if not np.array_equal(getattr(frame, name), getattr(surface, name)):
+            raise InputError(
+                f"case {case.name}: {name} of the reference frame {frame.name!r} are not those of "
+                "the surface"
+            )
+    for name in ("annulus", "free_edge"):
+        if not np.array_equal(getattr(frame, name), surface.vertices[getattr(case, name)]):
+            raise InputError(
+                f"case {case.name}: {name} of the reference frame {frame.name!r} is not where the "
+                "surface has it"
+            )
+
+
+def _write_files(folder: Path, case: ValveCase) -> None:
+    chordae = case.chordae
+    document: dict[str, Any] = {
+        "version": VERSION,
+        "name": case.name,
+        "description": case.description,
+        "source": case.source,
+        "licence": case.licence,
+        "simulated": case.simulated,
+        "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
+        "regions": list(case.surface.region_names),
+        "thickness": {"point_data": "thickness"},
+        "fibre": "fibre",
+        "frames": [_write_frame(folder, case, k) for k in range(len(case.frames))],
+        "chordae": {
+            "file": "chordae.csv",
+            "toe_strain": float(chordae.toe_strain),
+            "families": list(chordae.family_names),
+        },
+        "observation": {
+            "std_mm": float(case.uncertainty.std_mm),
+            "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
+        },
+        "derived": list(case.derived),
+    }
+    families = [chordae.family_names[k] for k in chordae.family]
+    write_columns(
+        folder / "chordae.csv",
+        CHORD_COLUMNS,
+        zip(
+            chordae.tip.tolist(),
+            *chordae.insertion.T.tolist(),
+            families,
+            chordae.rest_length.tolist(),
+            chordae.axial_stiffness.tolist(),
+            strict=True,
+        ),
+    )
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+    (folder / CASE_FILE).write_text(text, encoding="utf-8")
+
+
+def _write_frame(folder: Path, case: ValveCase, number: int) -> dict[str, Any]:
+    frame = case.frames[number]
+    stem = f"frame_{number:02d}"
+    point_data = {}
+    if frame.role is Role.REFERENCE:
+        point_data = {"fibre": case.surface.fibre, "thickness": case.surface.thickness}
+    write_surface(
+        folder / f"{stem}.vtp",
+        frame.vertices,
+        frame.triangles,
+        point_data,
+        {"region": np.asarray(frame.region)},
+    )
+    for name in ("annulus", "free_edge"):
+        file = folder / f"{stem}_{name}.csv"
+        if frame.role is Role.REFERENCE:
+            write_columns(file, ("vertex",), ([v] for v in getattr(case, name).tolist()))
+        else:
+            write_columns(file, ("x", "y", "z"), getattr(frame, name).tolist())
+    return {
+        "name": frame.name,
+        "time": float(frame.time),
+        "role": frame.role.value,
+        "surface": f"{stem}.vtp",
+        "annulus": f"{stem}_annulus.csv",
+        "free_edge": f"{stem}_free_edge.csv",
+        "papillary_tips": np.asarray(frame.papillary_tips, dtype=np.float64).tolist(),
+        "pressure": float(frame.pressure_mmHg),
+        **_correspondence(frame),
+    }
+
+
+def _correspondence(frame: Frame) -> dict[str, Any]:
+    return {} if frame.role is Role.REFERENCE else {"corresponds": bool(frame.corresponds)}

@@ -1,0 +1,117 @@
+"""Case folders to read, made from the template and a made-up closed frame."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.valve.io import write_surface
+from mvest.valve.template import Template
+
+TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
+
+
+def closing(x, share=1.0):
+    """A smooth motion of every vertex: the annulus shrinks and the leaflets swing inwards."""
+    below = np.clip(-x[:, 2:] / 20.0, 0.0, 1.0)
+    squeeze = np.array([0.008, 0.064, 0.0]) + below * np.array([0.1, 0.3, 0.1])
+    return x * (1.0 - share * squeeze)
+
+
+def template_case(columns=40, rows=12):
+    """The template, open, closed and held out, with something of its own in every field."""
+    valve = Template().valve(columns, rows)
+    surface = valve.surface
+
+    def frame(name, time, role, pressure, share, corresponds=True):
+        x = surface.vertices if share == 0 else closing(surface.vertices, share)
+        tips = valve.papillary_tips + np.array([0.0, share / 3, share])
+        return Frame(
+            name,
+            time,
+            role,
+            pressure,
+            x,
+            surface.triangles,
+            surface.region,
+            x[valve.annulus],
+            x[valve.free_edge],
+            tips,
+            corresponds,
+        )
+
+    return ValveCase(
+        name="template",
+        description="zwei Segel: offen, zu",
+        source="mvest",
+        licence="CC0",
+        simulated=True,
+        surface=surface,
+        annulus=valve.annulus,
+        free_edge=valve.free_edge,
+        frames=(
+            frame("open", 0.1, Role.REFERENCE, -1 / 3, 0.0),
+            frame("held", 0.3, Role.HELD_OUT, 80.1, 0.7, corresponds=False),
+            frame("closed", 0.45, Role.CLOSED, 121.3, 1.0),
+        ),
+        chordae=valve.chordae,
+        uncertainty=Uncertainty(0.9, 7.5),
+        derived=("fibre: by a rule",),
+    )
+
+
+def plain_folder(folder: Path, columns=24, rows=8, suffix=".vtp"):
+    """Write the surfaces of an open and a closed frame and a table of chordae; returns case.yaml.
+
+    The fields are as a user would write them: thickness and fibres are left to be derived.
+    """
+    valve = Template().valve(columns, rows)
+    surface, chordae = valve.surface, valve.chordae
+    folder.mkdir(exist_ok=True)
+    for name, x in (("open", surface.vertices), ("closed", closing(surface.vertices))):
+        save_surface(folder / f"{name}{suffix}", x, surface.triangles, surface.region)
+    rows = ["tip,x,y,z,family,rest_length_mm,stiffness_n"]
+    for k in range(len(chordae)):
+        x, y, z = chordae.insertion[k].tolist()
+        family = chordae.family_names[chordae.family[k]]
+        length, stiffness = float(chordae.rest_length[k]), float(chordae.axial_stiffness[k])
+        rows.append(f"{chordae.tip[k]},{x!r},{y!r},{z!r},{family},{length!r},{stiffness!r}")
+    (folder / "chordae.csv").write_text("\n".join(rows) + "\n")
+    return {
+        "version": 1,
+        "name": "plain",
+        "units": {"length": "mm"},
+        "regions": ["anterior", "posterior"],
+        "frames": [
+            {
+                "name": "open",
+                "time": 0.0,
+                "role": "reference",
+                "surface": f"open{suffix}",
+                "papillary_tips": [list(tip) for tip in TIPS],
+                "pressure": 0,
+            },
+            {
+                "name": "closed",
+                "time": 0.35,
+                "role": "closed",
+                "surface": f"closed{suffix}",
+                "papillary_tips": [list(tip) for tip in TIPS],
+                "pressure": 120.0,
+            },
+        ],
+        "chordae": "chordae.csv",
+    }
+
+
+def save_surface(file, vertices, triangles, region):
+    data = {} if region is None else {"region": region}
+    write_surface(file, vertices, triangles, None, data)
+
+
+def save(folder: Path, document):
+    folder.mkdir(exist_ok=True)
+    text = document if isinstance(document, str) else yaml.safe_dump(document, sort_keys=False)
+    (folder / "case.yaml").write_text(text, encoding="utf-8")
+    return folder
