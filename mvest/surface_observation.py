@@ -21,8 +21,8 @@ What to know:
 * Beyond the border of a leaflet d is the distance to the border, and its sign changes across the
   border triangle's plane. Independent errors do not see the sign; correlated ones do.
 * A point however far counts, at any distance; outliers are to be removed before.
-* Noise of variance s² normal to a surface of mean curvature k shifts d by about k s² on average,
-  which for leaflets (k < 0.2/mm) and s = 0.5 mm is a tenth of s.
+* Noise of s in every coordinate shifts d by about k s² on average, where k is the mean curvature:
+  0.025 mm for s = 0.5 mm at a bend of radius 5 mm (k = 0.1/mm).
 * Points are to lie on what the model predicts, the midsurface of the leaflets.
 """
 
@@ -39,7 +39,7 @@ from mvest.estimation.noise import NoiseCovariance, observation_noise, stacked_n
 from mvest.observation import FRAMES
 from mvest.observation_errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy import lumped_areas
+from mvest.valve.anatomy import Valve, lumped_areas
 from mvest.valve.proximity import closest_points
 
 __all__ = [
@@ -56,7 +56,7 @@ UNKNOWN = -1
 """Region of a point that may be of any leaflet."""
 
 MAX_CORRELATED_POINTS = 2000
-"""Largest number of points of a frame whose correlation is factorised: 32 MB, and 0.1 s."""
+"""Largest number of points of a frame whose correlation is factorised: 32 MB and half a second."""
 
 TOUCHING = 1e-9
 """Distance in mm below which x - c has no direction of its own."""
@@ -154,6 +154,13 @@ class PredictedSurface:
                 if loop.ndim != 1 or len(loop) < 3 or len(np.unique(loop)) != len(loop):
                     raise InputError(f"{name}: expected a loop of three or more different vertices")
                 object.__setattr__(self, name, loop)
+
+    @classmethod
+    def of_valve(cls, valve: Valve) -> PredictedSurface:
+        """The surface of a valve whose vertices a model predicts, with both curves."""
+        surface = valve.surface
+        n = len(surface.vertices)
+        return cls(n, surface.triangles, surface.region, valve.free_edge, valve.annulus)
 
     def of(self, region: int) -> IntArray:
         """Triangles of one leaflet, of all if it is ``UNKNOWN``."""

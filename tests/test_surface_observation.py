@@ -25,7 +25,9 @@ from mvest.surface_observation import (
     mean_surface_distance,
     surface_distance,
 )
+from mvest.valve.anatomy import Valve
 from mvest.valve.proximity import closest_points
+from mvest.valve.template import Template
 
 FRAMES = ("open", "closed")
 Geometry = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -445,6 +447,51 @@ def test_points_tell_no_more_than_vertices_that_are_known_again() -> None:
         assert less.min() > -1e-9 * less.max()
         assert np.trace(part) < 0.99 * np.trace(whole)
         assert np.linalg.matrix_rank(part) == 3
+
+
+def test_noise_about_a_bend_shifts_distances_by_its_curvature() -> None:
+    # A cylinder of radius 5 mm has the mean curvature 0.1 / mm: 0.5^2 x 0.1 = 0.025 mm.
+    flat, triangles = grid(81, 3, 20.0)
+    angle = np.pi * flat[:, 0] / 20.0
+    cylinder = np.column_stack([-5 * np.cos(angle), flat[:, 1], 5 * np.sin(angle)])
+    surface = PredictedSurface(len(flat), triangles, np.zeros(len(triangles), dtype=int))
+    n = 10_000
+    t = rng(1).uniform(0.8, np.pi - 0.8, n)
+    points = np.column_stack([5 * np.cos(t), rng(2).uniform(3, 17, n), 5 * np.sin(t)])
+    points += 0.5 * rng(3).normal(size=points.shape)
+    observation = SurfaceObservation((seen(points),), surface, 0.5)
+    d = observation.of(model(translated(cylinder)))(np.zeros(3)).y
+    # The standard error of the mean is 0.5 / sqrt(10000) = 0.005.
+    assert d.mean() == pytest.approx(0.025, abs=3 * 0.005)
+    assert d.std() == pytest.approx(0.5, rel=0.02)
+
+
+def test_a_valve_is_its_own_surface() -> None:
+    valve = Template().valve(16, 5)
+    surface = PredictedSurface.of_valve(valve)
+    vertices = valve.surface.vertices
+    observed = ObservedSurface(
+        "closed",
+        vertices[valve.surface.triangles].mean(axis=1),
+        valve.surface.region,
+        vertices[valve.free_edge],
+        vertices[valve.annulus],
+    )
+    observation = SurfaceObservation((observed,), surface, 0.5, 0.5)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    np.testing.assert_allclose(prediction.y, 0.0, atol=1e-12)
+    # Towards the ventricle is positive: the distance of points moved there grows.
+    into = ObservedSurface("closed", observed.points + 0.1 * valve_normals(valve), observed.region)
+    y = SurfaceObservation((into,), surface, 0.5).of(model(translated(vertices)))(np.zeros(3)).y
+    assert np.median(y) == pytest.approx(0.1, abs=1e-12)
+    assert y.min() > 0.0
+
+
+def valve_normals(valve: Valve) -> np.ndarray:
+    """Unit normals of the triangles of a valve's surface."""
+    a, b, c = np.moveaxis(valve.surface.vertices[valve.surface.triangles], 1, 0)
+    normal = np.cross(b - a, c - a)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def test_a_point_on_a_plane_says_nothing_of_sliding() -> None:
