@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy import Chordae, LeafletSurface, Motion, Valve
 
 __all__ = ["ChordLayout", "Template", "TemplateParameters"]
@@ -46,6 +46,16 @@ class ChordLayout:
     open_slack : float
         Rest length over the open length, at least.
     toe_strain : float
+    elongated : tuple of (float, float, float)
+        (from, to, factor): chordae that insert at these ``phi`` of the whole valve, in degrees, are
+        longer by the factor; where ranges overlap, by all of theirs. Nothing is mirrored.
+    absent : tuple of (float, float)
+        (from, to): chordae that insert at these ``phi`` of the whole valve are missing.
+
+    Raises
+    ------
+    InputError
+        If there is no chord, a place is incomplete, a range is empty or a factor not positive.
     """
 
     marginal_phi: tuple[float, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
@@ -57,6 +67,8 @@ class ChordLayout:
     basal_slack: float = 1.03
     open_slack: float = 1.035
     toe_strain: float = 0.015
+    elongated: tuple[tuple[float, float, float], ...] = ()
+    absent: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.marginal_phi and not self.basal:
@@ -64,6 +76,15 @@ class ChordLayout:
         for k, place in enumerate(self.basal):
             if len(place) != 2:
                 raise InputError(f"basal chord {k} is {place}, expected (phi, s)")
+        for elongation in self.elongated:
+            if len(elongation) != 3 or not (elongation[0] < elongation[1] and elongation[2] > 0):
+                raise InputError(
+                    f"elongated chordae {elongation}, expected (from, to, factor) with from < to "
+                    "and factor > 0"
+                )
+        for gap in self.absent:
+            if len(gap) != 2 or not gap[0] < gap[1]:
+                raise InputError(f"absent chordae {gap}, expected (from, to) with from < to")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +117,10 @@ class TemplateParameters:
         y of the open free edge's middles relative to ``edge_y`` (anterior up, posterior down).
     tips : tuple
         (x, y, z) of the papillary tip at positive x; the other is its mirror image.
+    tips_displacement : tuple
+        (x, y, z) by which this tip has moved since the chordae got their lengths, outward for
+        positive x; the other moves as its mirror image. The chordae do not follow, so they tether
+        the leaflets; they are only never taut in the open valve.
     thickness_anterior, thickness_posterior : float
     taper : float
         Thickness at the free edge over that of the annular half.
@@ -126,6 +151,7 @@ class TemplateParameters:
     edge_anterior: float = 6.5
     edge_posterior: float = 10.5
     tips: tuple[float, float, float] = (16.0, -0.24, -25.0)
+    tips_displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)
     thickness_anterior: float = 1.32
     thickness_posterior: float = 1.26
     taper: float = 0.75
@@ -139,8 +165,9 @@ class TemplateParameters:
     chordae: ChordLayout = ChordLayout()
 
     def __post_init__(self) -> None:
-        if len(self.tips) != 3:
-            raise InputError(f"template tips = {self.tips}, expected (x, y, z)")
+        for name in ("tips", "tips_displacement"):
+            if len(getattr(self, name)) != 3:
+                raise InputError(f"template {name} = {getattr(self, name)}, expected (x, y, z)")
         if not 0 < self.fibre_turn <= 0.5:
             raise InputError(f"template fibre_turn = {self.fibre_turn}, expected in (0, 0.5]")
         for name in (
@@ -156,6 +183,17 @@ def _smoothstep(x: FloatArray) -> FloatArray:
     """C2 step from 0 to 1 on [0, 1] (quintic)."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x * x)
+
+
+def _mirrored(point: tuple[float, float, float]) -> FloatArray:
+    """A point of the half at positive x, and its mirror image ``(2, 3)``."""
+    x, y, z = point
+    return np.array([[x, y, z], [-x, y, z]])
+
+
+def _between(phi: FloatArray, start: float, end: float) -> BoolArray:
+    """Which angles ``(k,)`` in degrees lie in [start, end], whatever multiple of 360 they are."""
+    return np.asarray(np.mod(phi - start, 360.0) <= end - start)
 
 
 class Template:
@@ -318,12 +356,22 @@ class Template:
     # -- what hangs on it -------------------------------------------------------------------------
     @property
     def papillary_tips(self) -> FloatArray:
-        """``(2, 3)`` mm."""
-        x, y, z = self.parameters.tips
-        return np.array([[x, y, z], [-x, y, z]])
+        """Where the tips are ``(2, 3)`` mm, displacement included."""
+        return self._intended_tips + _mirrored(self.parameters.tips_displacement)
+
+    @property
+    def _intended_tips(self) -> FloatArray:
+        """``(2, 3)`` mm: the tips for which the chordae have their lengths."""
+        return _mirrored(self.parameters.tips)
 
     def chordae(self) -> Chordae:
-        """The chordae of both halves."""
+        """The chordae of both halves, without the absent ones.
+
+        Raises
+        ------
+        InputError
+            If all of them are absent.
+        """
         layout = self.parameters.chordae
         marginal = [(phi, layout.marginal_s, 0) for phi in layout.marginal_phi]
         basal = [(phi, s, 1) for phi, s in layout.basal]
@@ -331,14 +379,21 @@ class Template:
         phi = np.concatenate([phi, 180.0 - phi])
         s, family = np.tile(s, 2), np.tile(family, 2).astype(np.int64)
         tip = np.repeat([0, 1], len(family) // 2)
+        present = np.ones(len(phi), dtype=bool)
+        for start, end in layout.absent:
+            present &= ~_between(phi, start, end)
+        if not np.any(present):
+            raise InputError(f"chordae absent at {layout.absent}: none is left")
+        phi, s, family, tip = phi[present], s[present], family[present], tip[present]
         insertion = self.position(phi, s)
         tips = self.papillary_tips[tip]
         open_length = np.linalg.norm(insertion - tips, axis=1)
         target = self._closed_position(phi, s, insertion)
         slack = np.where(family == 0, layout.marginal_slack, layout.basal_slack)
-        rest = np.maximum(
-            slack * np.linalg.norm(target - tips, axis=1), layout.open_slack * open_length
-        )
+        closed_length = np.linalg.norm(target - self._intended_tips[tip], axis=1)
+        rest = np.maximum(slack * closed_length, layout.open_slack * open_length)
+        for start, end, factor in layout.elongated:
+            rest[_between(phi, start, end)] *= factor
         stiffness = np.where(family == 0, layout.marginal_stiffness, layout.basal_stiffness)
         return Chordae(
             tip, insertion, family, ("marginal", "basal"), rest, stiffness, layout.toe_strain

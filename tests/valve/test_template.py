@@ -208,6 +208,86 @@ def test_rest_lengths_lead_to_the_intended_closed_line():
     assert chordae.rest_length[0] == pytest.approx(expected, rel=1e-9)
 
 
+def test_chordae_of_a_range_are_elongated_and_those_of_no_other():
+    # Insertions on the posterior leaflet are at negative degrees of the layout (-60 is 300 of the
+    # whole valve) and, mirrored, at 180 + their angle (240): only the first is in 290 to 310.
+    layout = ChordLayout(marginal_phi=(-60.0, 50.0), basal=((-60.0, 0.5),))
+    plain = Template(replace(DEFAULT, chordae=layout)).chordae()
+    longer = replace(layout, elongated=((290.0, 310.0, 1.2), (295.0, 305.0, 1.1)))
+    chordae = Template(replace(DEFAULT, chordae=longer)).chordae()
+    # Ranges that overlap multiply: 1.2 x 1.1 = 1.32.
+    np.testing.assert_allclose(
+        chordae.rest_length / plain.rest_length, [1.32, 1, 1.32, 1, 1, 1], rtol=1e-12
+    )
+    np.testing.assert_array_equal(chordae.insertion, plain.insertion)
+    # The same range, named by other multiples of 360 degrees.
+    again = replace(layout, elongated=((-70.0, -50.0, 1.32),))
+    np.testing.assert_allclose(
+        Template(replace(DEFAULT, chordae=again)).chordae().rest_length, chordae.rest_length
+    )
+
+
+def test_absent_chordae_are_missing_and_the_others_are_as_before():
+    layout = replace(DEFAULT.chordae, absent=((235.0, 262.0),))
+    plain, chordae = TEMPLATE.chordae(), Template(replace(DEFAULT, chordae=layout)).chordae()
+    # Spacing 175 / 13 = 13.46 degrees from -87: the mirrored ones are at 180 + 87, 73.5, 60.1 and
+    # 46.6 degrees, of which 253.5 and 240.1 lie in the range, as does the basal chord at 240.
+    assert len(plain) - len(chordae) == 3
+    assert np.bincount(chordae.tip).tolist() == [17, 14]
+    kept = [k for k, at in enumerate(plain.insertion) if at.tolist() in chordae.insertion.tolist()]
+    for name in ("tip", "insertion", "family", "rest_length", "axial_stiffness"):
+        np.testing.assert_array_equal(getattr(plain, name)[kept], getattr(chordae, name))
+
+
+def test_a_valve_without_any_chord_is_refused():
+    layout = ChordLayout(marginal_phi=(10.0,), basal=(), absent=((0.0, 20.0), (160.0, 180.0)))
+    with pytest.raises(InputError, match="none is left"):
+        Template(replace(DEFAULT, chordae=layout)).chordae()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"elongated": ((225.0, 315.0),)},
+        {"elongated": ((315.0, 225.0, 1.1),)},
+        {"elongated": ((225.0, 315.0, 0.0),)},
+        {"absent": ((225.0,),)},
+        {"absent": ((315.0, 225.0),)},
+    ],
+)
+def test_ranges_of_chordae_that_mean_nothing_are_refused(wrong):
+    (name, ranges), *_ = wrong.items()
+    with pytest.raises(InputError, match=rf"{name} chordae \({ranges[0][0]}"):
+        ChordLayout(**wrong)
+
+
+def test_displaced_tips_tether_because_the_chordae_do_not_follow():
+    shift = (3.0, -1.0, -5.0)
+    plain = TEMPLATE.chordae()
+    template = Template(replace(DEFAULT, tips_displacement=shift))
+    chordae = template.chordae()
+    # Outward on both sides, and down.
+    moved_by = template.papillary_tips - TEMPLATE.papillary_tips
+    np.testing.assert_allclose(moved_by, [[3, -1, -5], [-3, -1, -5]], atol=1e-12)
+    for tips in template.valve(24, 5).motion.papillary_tips:
+        np.testing.assert_array_equal(tips, template.papillary_tips)
+    opened = np.linalg.norm(chordae.insertion - template.papillary_tips[chordae.tip], axis=1)
+    # Rest lengths are those for the tips before, unless these would be taut in the open valve ...
+    expected = np.maximum(plain.rest_length, DEFAULT.chordae.open_slack * opened)
+    np.testing.assert_allclose(chordae.rest_length, expected, rtol=1e-12)
+    # ... and so they are shorter than those made for where the tips are now.
+    moved = tuple(np.add(DEFAULT.tips, shift))
+    adapted = Template(replace(DEFAULT, tips=moved)).chordae()
+    assert np.all(chordae.rest_length <= adapted.rest_length + 1e-12)
+    assert (adapted.rest_length - chordae.rest_length).mean() > 1.0
+
+
+@pytest.mark.parametrize("name", ["tips", "tips_displacement"])
+def test_a_place_of_the_tips_needs_three_numbers(name):
+    with pytest.raises(InputError, match=rf"template {name} = \(1.0, 2.0\), expected \(x, y, z\)"):
+        TemplateParameters(**{name: (1.0, 2.0)})
+
+
 def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
     motion = TEMPLATE.valve().motion
     start, end = motion.annulus
