@@ -15,8 +15,10 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
 from mvest.mechanics.settings import MechanicsSettings
+from mvest.personalise import CaseMesh, PaperSettings
 from mvest.provenance import config_hash
 from mvest.valve.template import TemplateParameters
+from mvest.virtual_patient import Deviations, Simulation
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
@@ -34,6 +36,12 @@ NOT_THE_RESULT = (
     "isolate",
 )
 """Parts of a configuration that change no number of the result, left out of its hash."""
+
+
+CaseMeshConfig = schema(CaseMesh)
+PaperSettingsConfig = schema(PaperSettings)
+SimulationConfig = schema(Simulation)
+DeviationsConfig = schema(Deviations)
 
 
 @dataclass
@@ -114,6 +122,45 @@ class TruthConfig:
 
 
 @dataclass
+class UnknownConfig:
+    """One quantity that is not known of a case: its prior, and what becomes of it."""
+
+    mean: float = MISSING
+    std: float = MISSING
+    treatment: str = "estimated"  # or considered, or fixed
+
+
+@dataclass
+class PersonalConfig:
+    """How a case is personalised (see mvest.personalise.PersonaliseSettings)."""
+
+    unknowns: dict[str, UnknownConfig] = field(default_factory=dict)
+    mesh: CaseMeshConfig = field(default_factory=CaseMeshConfig)  # type: ignore[valid-type]
+    tolerance: float = 2e-3
+    max_iterations: int = 15
+    reach: float = 0.5  # largest change of a logarithm over which a closure is continued
+    paper: PaperSettingsConfig | None = None  # type: ignore[valid-type]
+    moduli_only: bool = False  # estimate also with all nuisances fixed
+    confirm: bool = False  # close the fitted valve anew from the open one
+    correspondence: bool = True  # use corresponding vertices as such, where there are any
+
+
+@dataclass
+class PatientConfig:
+    """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
+
+    name: str = MISSING
+    description: str = MISSING
+    moduli: dict[str, float] = field(default_factory=dict)  # MPa
+    moduli_spread: float = 0.0  # SD of the logarithm by which they are drawn about these
+    variation: float = 0.0  # size of the random variation of the anatomy; 0: as configured
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)  # type: ignore[valid-type]
+    deviations: DeviationsConfig = field(default_factory=DeviationsConfig)  # type: ignore[valid-type]
+    paper_moduli: list[float] = field(default_factory=list)  # MPa, of the paper's patient
+    paper_distance_mm: list[float] = field(default_factory=list)  # generic, personalised
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -174,6 +221,10 @@ class Config:
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
+    case: str | None = None  # folder of a case
+    check: bool = False  # only check the case and draw it
+    personal: PersonalConfig = field(default_factory=PersonalConfig)
+    patient: PatientConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

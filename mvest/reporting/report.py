@@ -6,8 +6,6 @@ runs is escaped by the template; Markdown is rendered with raw HTML switched off
 
 from __future__ import annotations
 
-import base64
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,10 +14,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markdown_it import MarkdownIt
 from markupsafe import Markup
-from PIL import Image
 
-from mvest.errors import InputError
 from mvest.reporting.files import write_text
+from mvest.reporting.pictures import embedded
 from mvest.reporting.sweep_conclusions import conclusions, question
 from mvest.reporting.sweep_rows import (
     Sweep,
@@ -36,11 +33,6 @@ __all__ = ["REPORT", "write_report"]
 
 REPORT = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
-
-WIDEST_PIXELS = 1500
-"""Of an embedded picture: two for each pixel of the page's column."""
-WEBP_QUALITY = 85
-"""Thin lines and small print stay clean from about 80 on."""
 
 MOST_FAILURES = 200
 """Listed one by one on the page; the tidy table has all."""
@@ -108,7 +100,7 @@ def _place(sweep: Sweep) -> tuple[int, str]:
 def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
     base = f"sweep_{sweep['sweep']['name']}"
     found = [
-        (picture, _embedded(path, picture.caption))
+        (picture, embedded(path, picture.caption))
         for picture in pictures_of(sweep)
         if (path := results / f"{base}{picture.ending}.png").is_file()
     ]
@@ -195,28 +187,5 @@ def _other_section(results: Path, name: str, title: str, pictures: Sequence[str]
         "anchor": name,
         "title": title,
         "body": Markup(html),
-        "pictures": [_embedded(path, caption) for path, caption in found if path.is_file()],
-    }
-
-
-def _embedded(path: Path, caption: str) -> dict[str, Any]:
-    """A picture within the page, no larger than it can be seen there."""
-    try:
-        with Image.open(path) as stored:
-            image = Image.new("RGB", stored.size, "white")
-            full = stored.convert("RGBA")
-            image.paste(full, mask=full)
-    except OSError as error:
-        raise InputError(f"cannot read the picture {path}: {error}") from error
-    if image.width > WIDEST_PIXELS:
-        height = round(image.height * WIDEST_PIXELS / image.width)
-        image = image.resize((WIDEST_PIXELS, height), Image.Resampling.LANCZOS)
-    stream = io.BytesIO()
-    image.save(stream, "WEBP", quality=WEBP_QUALITY, method=6)
-    data = base64.b64encode(stream.getvalue()).decode("ascii")
-    return {
-        "source": f"data:image/webp;base64,{data}",
-        "caption": caption,
-        "width": image.width,
-        "height": image.height,
+        "pictures": [embedded(path, caption) for path, caption in found if path.is_file()],
     }

@@ -1,0 +1,207 @@
+"""Shapes and fields of one case as its run stored them, turned so that the atrium is above.
+
+Everything that is drawn of a case is read here once. What a run did not store is None, so that a
+report can say so instead of drawing something else.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.typing import BoolArray, FloatArray, IntArray
+
+__all__ = ["CaseFields", "read_case_fields"]
+
+POINTS = "observed_points_"
+SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
+"""Arrays of positions, which turn with the valve."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseFields:
+    """A valve at rest, and how it was seen and predicted in ``f`` further frames.
+
+    Attributes
+    ----------
+    triangles : ndarray
+        ``(m, 3)``.
+    region : ndarray
+        ``(m,)`` leaflet of each triangle.
+    rest : ndarray
+        ``(n, 3)`` mm, the valve in the reference frame.
+    annulus, free_edge : ndarray
+        Vertices in loop order.
+    frames : tuple of str
+        ``f`` names, the reference frame not among them.
+    seen : ndarray
+        ``(f,)`` whether the filter was shown the frame.
+    tips : ndarray
+        ``(f + 1, t, 3)`` mm, papillary tips in the reference frame and then in the others.
+    chord_tip, chord_insertion : ndarray
+        ``(c,)`` papillary tip and vertex at which each chord begins and ends.
+    observed, generic, registered, fitted, truth : ndarray or None
+        ``(f, n, 3)`` mm; NaN where a vertex was not seen.
+    observed_points : mapping
+        ``(q, 3)`` mm for a frame that does not correspond to the reference frame.
+    distance_generic, distance_fitted : ndarray or None
+        ``(f, n)`` mm from what was observed; NaN where nothing was.
+    sensitivity : ndarray or None
+        ``(n, 3, p)`` mm per unit of each parameter, of the closed frame at the estimate.
+    innovation : ndarray or None
+        ``(n, 3)`` standardised innovation of the closed frame.
+    """
+
+    triangles: IntArray
+    region: IntArray
+    rest: FloatArray
+    annulus: IntArray
+    free_edge: IntArray
+    frames: tuple[str, ...]
+    seen: BoolArray
+    tips: FloatArray
+    chord_tip: IntArray
+    chord_insertion: IntArray
+    observed_points: Mapping[str, FloatArray]
+    observed: FloatArray | None = None
+    generic: FloatArray | None = None
+    registered: FloatArray | None = None
+    fitted: FloatArray | None = None
+    truth: FloatArray | None = None
+    distance_generic: FloatArray | None = None
+    distance_fitted: FloatArray | None = None
+    sensitivity: FloatArray | None = None
+    innovation: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        f, n = len(self.frames), len(self.rest)
+        if not f or self.seen.shape != (f,):
+            raise InputError(f"{f} frames and seen {self.seen.shape}, expected ({f},) and f > 0")
+        if self.region.shape != (len(self.triangles),):
+            raise InputError(f"region {self.region.shape}, expected ({len(self.triangles)},)")
+        for name in ("observed", "generic", "registered", "fitted", "truth"):
+            _check(name, getattr(self, name), (f, n, 3))
+        for name in ("distance_generic", "distance_fitted"):
+            _check(name, getattr(self, name), (f, n))
+        _check("innovation", self.innovation, (n, 3))
+        _check("tips", self.tips, (f + 1, None, 3))
+        _check("sensitivity", self.sensitivity, (n, 3, None))
+        for name in ("triangles", "annulus", "free_edge", "chord_insertion"):
+            index = getattr(self, name)
+            if index.size and not 0 <= index.min() <= index.max() < n:
+                raise InputError(f"{name} names vertices outside 0 to {n - 1}")
+        if self.chord_tip.shape != self.chord_insertion.shape or np.any(
+            self.chord_tip >= self.tips.shape[1]
+        ):
+            raise InputError("chord_tip and chord_insertion do not fit each other or the tips")
+
+    @property
+    def closed(self) -> int:
+        """The first frame that the filter was shown, or the first of all."""
+        return int(np.argmax(self.seen))
+
+    @property
+    def vertex_region(self) -> IntArray:
+        """Leaflet ``(n,)`` of each vertex: the smallest index among its triangles."""
+        result = np.full(len(self.rest), self.region.max(initial=0), dtype=np.int64)
+        np.minimum.at(result, self.triangles.ravel(), np.repeat(self.region, 3))
+        return result
+
+    def chords(self, points: FloatArray, frame: int) -> FloatArray:
+        """Ends ``(c, 2, 3)`` of the chordae; ``frame`` counts the reference frame as 0."""
+        return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
+
+
+def read_case_fields(path: Path) -> CaseFields:
+    """Read ``fields.npz`` and turn it: z to the atrium, the first leaflet towards positive y.
+
+    Parameters
+    ----------
+    path : Path
+        An ``.npz`` file with at least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames``
+        and ``seen``; the others as in `CaseFields`, and ``observed_points_<frame>``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, lacks one of those, or arrays do not fit each other.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = dict(stored)
+        points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
+        return _turned(_fields(arrays, points))
+    except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: no fields of a case ({error})") from error
+
+
+def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> CaseFields:
+    def indices(name: str) -> IntArray:
+        return np.asarray(arrays.get(name, []), dtype=np.int64)
+
+    def reals(name: str) -> FloatArray | None:
+        return None if name not in arrays else np.asarray(arrays[name], dtype=np.float64)
+
+    frames = tuple(str(name) for name in arrays["frames"])
+    tips = reals("tips")
+    return CaseFields(
+        triangles=np.asarray(arrays["triangles"], dtype=np.int64),
+        region=np.asarray(arrays["region"], dtype=np.int64),
+        rest=np.asarray(arrays["rest"], dtype=np.float64),
+        annulus=np.asarray(arrays["annulus"], dtype=np.int64),
+        free_edge=indices("free_edge"),
+        frames=frames,
+        seen=np.asarray(arrays["seen"], dtype=bool),
+        tips=np.empty((len(frames) + 1, 0, 3)) if tips is None else tips,
+        chord_tip=indices("chord_tip"),
+        chord_insertion=indices("chord_insertion"),
+        observed_points={k: np.asarray(v, dtype=np.float64) for k, v in points.items()},
+        observed=reals("observed"),
+        generic=reals("generic"),
+        registered=reals("registered"),
+        fitted=reals("fitted"),
+        truth=reals("truth"),
+        distance_generic=reals("distance_generic"),
+        distance_fitted=reals("distance_fitted"),
+        sensitivity=reals("sensitivity"),
+        innovation=reals("innovation"),
+    )
+
+
+def _check(name: str, array: FloatArray | None, shape: tuple[int | None, ...]) -> None:
+    if array is None:
+        return
+    fits = array.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        raise InputError(f"{name} has the shape {array.shape}, expected {shape}")
+
+
+def _turned(fields: CaseFields) -> CaseFields:
+    """The same valve about the middle of its annulus, its plane horizontal, its tips below."""
+    ring = fields.rest[fields.annulus]
+    middle = ring.mean(axis=0)
+    up = np.linalg.svd(ring - middle, full_matrices=False)[2][2]
+    below = fields.tips[0] if fields.tips.shape[1] else fields.rest
+    if (below.mean(axis=0) - middle) @ up > 0:
+        up = -up
+    first = np.unique(fields.triangles[fields.region == fields.region.min()])
+    front = fields.rest[first].mean(axis=0) - middle
+    front -= (front @ up) * up
+    front /= np.linalg.norm(front)
+    axes = np.stack([np.cross(front, up), front, up], axis=1)
+
+    shapes: dict[str, Any] = {
+        name: (array - middle) @ axes
+        for name in SHAPES
+        if (array := getattr(fields, name)) is not None
+    }
+    points = {name: (array - middle) @ axes for name, array in fields.observed_points.items()}
+    return replace(fields, observed_points=points, **shapes)

@@ -1,0 +1,53 @@
+"""Pictures put into a page, so that it needs no file beside it."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from mvest.errors import InputError
+
+__all__ = ["embedded"]
+
+WIDEST_PIXELS = 1500
+"""Two for each pixel of a page's column."""
+WEBP_QUALITY = 85
+"""Thin lines and small print stay clean from about 80 on."""
+
+
+def embedded(path: Path, caption: str) -> dict[str, Any]:
+    """A picture within a page, no larger than it can be seen there.
+
+    Returns
+    -------
+    dict
+        ``source`` (a data address), ``caption``, ``width`` and ``height`` in pixels.
+
+    Raises
+    ------
+    InputError
+        If the picture cannot be read.
+    """
+    try:
+        with Image.open(path) as stored:
+            image = Image.new("RGB", stored.size, "white")
+            full = stored.convert("RGBA")
+            image.paste(full, mask=full)
+    except OSError as error:
+        raise InputError(f"cannot read the picture {path}: {error}") from error
+    if image.width > WIDEST_PIXELS:
+        height = round(image.height * WIDEST_PIXELS / image.width)
+        image = image.resize((WIDEST_PIXELS, height), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    image.save(stream, "WEBP", quality=WEBP_QUALITY, method=6)
+    data = base64.b64encode(stream.getvalue()).decode("ascii")
+    return {
+        "source": f"data:image/webp;base64,{data}",
+        "caption": caption,
+        "width": image.width,
+        "height": image.height,
+    }
