@@ -35,7 +35,14 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.clinical import clinical_measurements
 from mvest.valve.proximity import surface_edges
 
-__all__ = ["case_record", "estimate_case", "read_configured", "run_case", "settings_of"]
+__all__ = [
+    "case_record",
+    "estimate_case",
+    "of_all_unknowns",
+    "read_configured",
+    "run_case",
+    "settings_of",
+]
 
 Values = Mapping[str, Any]
 
@@ -144,8 +151,12 @@ def case_record(
     innovation = record["innovation"]
     if innovation is not None:
         innovation = {**innovation, "tests": _whiteness(found)}
+    iterates = {key: record[key] for key in ("iterates", "iterate_std")}
+    # What every study's record tells is the moduli; ``unknowns`` tells all.
+    record = _of_moduli(record)
     return record | {
         "row": case.name,
+        "unknown_iterates": iterates,
         "case": {
             "name": case.name,
             "description": case.description,
@@ -189,6 +200,29 @@ def case_record(
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "parts_s": dict(found.seconds),
     }
+
+
+def of_all_unknowns(record: Values) -> dict[str, Any]:
+    """A record whose parameters are all unknowns, and not the moduli alone."""
+    return {**record, **record["unknown_iterates"], "parameters": record["unknowns"]}
+
+
+def _of_moduli(record: dict[str, Any]) -> dict[str, Any]:
+    """A record of the moduli among its parameters."""
+    kept = [k for k, name in enumerate(record["parameters"]) if name.startswith("E_f.")]
+
+    def part(values: list[Any] | None) -> list[Any] | None:
+        return None if values is None else [values[k] for k in kept]
+
+    out = dict(record)
+    for key in ("parameters", "initial", "estimate", "std"):
+        out[key] = part(record[key])
+    for key in ("iterates", "iterate_std"):
+        out[key] = None if record[key] is None else [part(row) for row in record[key]]
+    if record["identifiability"] is not None:
+        bound = part(record["identifiability"]["cramer_rao_std"])
+        out["identifiability"] = {**record["identifiability"], "cramer_rao_std": bound}
+    return out
 
 
 def fields_of(found: Personalised) -> dict[str, Any]:

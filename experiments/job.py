@@ -10,6 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from experiments.case import run_case
 from experiments.config import register
 from experiments.donor import run_donor
 from experiments.folder import (
@@ -23,6 +24,7 @@ from experiments.folder import (
 )
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.patient import run_patient
 from experiments.progress import announce_compilation
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
@@ -32,6 +34,7 @@ from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
+from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
 
@@ -186,6 +189,20 @@ STUDIES: dict[str, Study] = {
         donor_text,
         write_donor_tables,
         lambda results, _, record, folder: publish_donor(results, record, folder / "fields.npz"),
+    ),
+    "case": Study(
+        run_case,
+        case_text,
+        write_case_tables,
+        lambda _results, _name, _record, _folder: [],
+    ),
+    "patient": Study(
+        run_patient,
+        case_text,
+        write_case_tables,
+        lambda results, name, record, folder: publish_patient(
+            results, name, record, folder / "fields.npz"
+        ),
     ),
 }
 """Kinds of studies that a configuration can name."""

@@ -11,6 +11,7 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
+from mvest.reporting.patients import write_patient_tables, write_population_tables
 from mvest.reporting.publish import RECORDS, regenerate
 from mvest.reporting.report import write_report
 from mvest.reporting.sweeps import read_sweeps, write_sweep
@@ -41,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             record = results / f"{name}.json"
             if record.is_file():
                 written += write(results, json.loads(record.read_text(encoding="utf-8")))
+        written += write_patient_tables(results)
+        written += write_population_tables(results)
         for sweep in sweeps:
             written += write_sweep(results, sweep)
         written.append(write_report(results))

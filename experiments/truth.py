@@ -12,7 +12,7 @@ import os
 import sys
 import uuid
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,18 @@ FORWARD_MODEL = ("elements.py", "units.py", "model.py", "mechanics", "valve")
 """Files and folders of the library that decide what a closure gives."""
 
 
-def truth_key(values: Mapping[str, Any]) -> str:
-    """Key of a simulation described by plain values, for the present source of the library."""
+def truth_key(values: Mapping[str, Any], more: Sequence[str] = ()) -> str:
+    """Key of a simulation described by plain values, for the present source of the library.
+
+    Parameters
+    ----------
+    values : mapping
+    more : sequence of str
+        Modules of the library besides the forward model that the simulation uses.
+    """
     root = Path(mvest.__file__).parent
     source = hashlib.sha256()
-    for part in FORWARD_MODEL:
+    for part in (*FORWARD_MODEL, *more):
         place = root / part
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             about = path.stat()

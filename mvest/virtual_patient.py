@@ -66,8 +66,8 @@ class Hidden:
         Parameter -> true value: the moduli in MPa, factors on what the case states, and the
         displacement of the leaflets as they were seen.
     positions : mapping
-        Frame -> ``(n, 3)`` mm, where the vertices of the case truly were, before they were
-        displaced and seen with errors.
+        Frame -> ``(n, 3)`` mm, where the vertices of the case would have been seen without errors,
+        the displacement included.
     """
 
     values: Mapping[str, float]
@@ -183,8 +183,14 @@ def simulate_patient(
     if held is None:
         raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {LATE}")
     closed = prediction.y.reshape(2, -1, 3)[1]
-    true = {REFERENCE: seen.surface.vertices, CLOSED: closed, LATE: held}
-    case = _case(name, description, seen, true, values, simulation, mechanics, rng)
+    centre = seen.motion.annulus[-1].mean(axis=0)
+    registration = np.array([values[parameter] for parameter in REGISTRATION])
+    true = {
+        REFERENCE: seen.surface.vertices,
+        CLOSED: displace(closed, registration, centre),
+        LATE: displace(held, registration, centre),
+    }
+    case = _case(name, description, seen, true, simulation, mechanics, rng)
     return VirtualPatient(case, Hidden(dict(values), true))
 
 
@@ -237,17 +243,14 @@ def _case(
     description: str,
     seen: Valve,
     true: Mapping[str, FloatArray],
-    values: Mapping[str, float],
     simulation: Simulation,
     mechanics: MechanicsSettings,
     rng: np.random.Generator,
 ) -> ValveCase:
     surface = seen.surface
-    centre = seen.motion.annulus[-1].mean(axis=0)
-    registration = np.array([values[parameter] for parameter in REGISTRATION])
     correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
     error = CorrelatedNoise(simulation.std_mm, correlation)
-    moved = np.stack([displace(true[frame], registration, centre) for frame in (CLOSED, LATE)])
+    moved = np.stack([true[CLOSED], true[LATE]])
     closed, late = error(moved, moved, rng)
     boundary = {
         REFERENCE: (seen.motion.annulus[0], seen.papillary_tips),
