@@ -582,6 +582,34 @@ def test_curves_have_as_many_degrees_of_freedom_as_noise(std: float) -> None:
     assert np.mean(squares) == pytest.approx(1.0 - 1 / 72, abs=3 * 0.011)
 
 
+def test_points_near_the_curves_may_be_left_out() -> None:
+    vertices, _ = plane(11, 11)
+    loop = vertices[rim(11, 11)]
+    frame = seen(vertices + np.array([0, 0, 0.5]), np.arange(121) % 2 - 1, annulus=loop)
+    inner = frame.inner(1.1)
+    # Over the border are 40 of 11 x 11 points, 0.5 mm from it; the next are sqrt(1 + 0.5^2) mm
+    # from it, and those after sqrt(4 + 0.5^2).
+    assert len(inner.points) == 81
+    assert len(frame.inner(1.2).points) == 49
+    assert np.all((inner.points[:, :2] > 0.5) & (inner.points[:, :2] < 9.5))
+    kept = np.all((vertices[:, :2] > 0.5) & (vertices[:, :2] < 9.5), axis=1)
+    np.testing.assert_array_equal(inner.region, frame.region[kept])
+    np.testing.assert_array_equal(inner.annulus, loop)
+    # Without a curve nothing is known to be near it.
+    assert len(seen(vertices).inner(1.1).points) == 121
+
+
+def test_the_side_flips_beyond_the_border_and_inner_points_do_not_care() -> None:
+    # Two neighbours beyond the border, one above and one below the plane.
+    vertices, surface = plane()
+    pair = np.array([[10.5, 5.0, 0.01], [10.5, 5.0, -0.01]])
+    observation = SurfaceObservation((seen(pair),), surface, 0.5)
+    y = observation.of(model(translated(vertices)))(np.zeros(3)).y
+    np.testing.assert_allclose(y, np.hypot(0.5, 0.01) * np.array([1, -1]), atol=1e-14)
+    loop = vertices[surface.annulus]
+    assert len(seen(pair, annulus=loop).inner(3 * 0.5).points) == 0
+
+
 def test_too_many_correlated_points_are_to_be_thinned() -> None:
     _, surface = plane()
     points = scattered(MAX_CORRELATED_POINTS + 1, 0.0)
