@@ -19,7 +19,10 @@ What to know:
 * Where two parts of a surface are equally near (inside a fold, between leaflets for points of
   unknown leaflet), d has a kink; the derivative is that of one of them.
 * Beyond the border of a leaflet d is the distance to the border, and its sign changes across the
-  border triangle's plane. Independent errors do not see the sign; correlated ones do.
+  border triangle's plane. Independent errors do not see the sign, correlated ones do: leave such
+  points out then (`ObservedSurface.inner`, three standard deviations).
+* Errors that are rougher than they are said to be, as independent ones are, show in a normalised
+  innovation far above one per observation.
 * A point however far counts, at any distance; outliers are to be removed before.
 * Noise of s in every coordinate shifts d by about k s² on average, where k is the mean curvature:
   0.025 mm for s = 0.5 mm at a bend of radius 5 mm (k = 0.1/mm).
@@ -29,7 +32,7 @@ What to know:
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,6 +43,12 @@ from mvest.observation import FRAMES
 from mvest.observation_errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy import Valve, lumped_areas
+from mvest.valve.moving_distance import (
+    across_curve,
+    closest_on_loop,
+    curve_offsets,
+    signed_distances,
+)
 from mvest.valve.proximity import closest_points
 
 __all__ = [
@@ -57,13 +66,6 @@ UNKNOWN = -1
 
 MAX_CORRELATED_POINTS = 2000
 """Largest number of points of a frame whose correlation is factorised: 32 MB and half a second."""
-
-TOUCHING = 1e-9
-"""Distance in mm below which x - c has no direction of its own."""
-
-TANGENT_REACH = 6.0
-"""Standard deviations of a curve's points over which its direction is taken, to each side: the
-direction is then known to 1 / (6 sqrt(2)) rad, and 1.4 % of the information across it is lost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +111,18 @@ class ObservedSurface:
             if getattr(self, name) is not None:
                 what = f"{name} seen in frame {self.frame}"
                 object.__setattr__(self, name, _curve(what, getattr(self, name)))
+
+    def inner(self, distance: float) -> ObservedSurface:
+        """The same without the points nearer than ``distance`` mm to a curve that is seen.
+
+        They are the points that noise may put beyond the border; the curves tell where that is.
+        """
+        keep = np.ones(len(self.points), dtype=np.bool_)
+        for curve in (self.free_edge, self.annulus):
+            if curve is not None:
+                offset = closest_on_loop(self.points, curve)[2]
+                keep &= np.linalg.norm(offset, axis=1) >= distance
+        return replace(self, points=self.points[keep], region=self.region[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -358,14 +372,14 @@ class SurfaceFrames:
         surface = self.observation.surface
         h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
         for region, members in _by_region(seen):
-            h[members], H[members] = _signed_distances(
+            h[members], H[members] = signed_distances(
                 seen.points[members], vertices, surface.of(region), motion
             )
         yield h, H
         for curve, loop in _curves(seen, surface):
             assert self.observation.curve_std_mm is not None
-            across = _across(curve, self.observation.curve_std_mm)
-            yield _curve_offsets(curve, across, vertices[loop], motion[loop])
+            across = across_curve(curve, self.observation.curve_std_mm)
+            yield curve_offsets(curve, across, vertices[loop], motion[loop])
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -392,103 +406,6 @@ def mean_surface_distance(
     )
 
 
-def _signed_distances(
-    points: FloatArray, vertices: FloatArray, triangles: IntArray, motion: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Signed distances ``(q,)`` mm and derivatives ``(q, p)``, of vertices with ``(n, 3, p)``."""
-    closest = closest_points(points, vertices, triangles)
-    offset = points - closest.interpolate(vertices, triangles)
-    normal, inside = _normals(vertices, triangles, closest.triangle, closest.barycentric)
-    length = closest.distance[:, None]
-    side = np.where(np.einsum("qk,qk->q", offset, normal) < 0.0, -1.0, 1.0)[:, None]
-    apart = ~inside[:, None] & (length > TOUCHING)
-    direction = np.divide(side * offset, length, out=normal.copy(), where=apart)
-    moved = closest.interpolate(motion, triangles)
-    distance = np.einsum("qk,qk->q", direction, offset)
-    return distance, -np.einsum("qk,qkp->qp", direction, moved)
-
-
-def _normals(
-    vertices: FloatArray, triangles: IntArray, triangle: IntArray, barycentric: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Angle-weighted unit normals ``(q, 3)`` at closest points, and which are inside a triangle."""
-    corner = vertices[triangles]
-    ahead = _unit(np.roll(corner, -1, axis=1) - corner)
-    behind = _unit(np.roll(corner, 1, axis=1) - corner)
-    face = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
-    angle = np.arccos(np.clip(np.einsum("mck,mck->mc", ahead, behind), -1.0, 1.0))
-    of_vertex = np.zeros_like(vertices)
-    np.add.at(of_vertex, triangles, angle[..., None] * face[:, None])
-    # Edge c of a triangle lies opposite its corner c.
-    ends = np.sort(np.stack([np.roll(triangles, -1, 1), np.roll(triangles, -2, 1)], 2), axis=2)
-    keys, edge = np.unique(ends @ [len(vertices), 1], return_inverse=True)
-    edge = edge.reshape(triangles.shape)
-    of_edge = np.zeros((len(keys), 3))
-    np.add.at(of_edge, edge, face[:, None])
-
-    zeros = np.count_nonzero(barycentric == 0.0, axis=1)
-    at_edge = of_edge[edge[triangle, np.argmin(barycentric, axis=1)]]
-    at_vertex = of_vertex[triangles[triangle, np.argmax(barycentric, axis=1)]]
-    normal = np.choose(zeros[:, None], [face[triangle], at_edge, at_vertex])
-    return _unit(normal), zeros == 0
-
-
-def _across(curve: FloatArray, std: float) -> FloatArray:
-    """Two unit vectors ``(j, 3, 2)`` across a closed curve as it was seen, at each of its points.
-
-    The direction is that from a point before to a point after, ``TANGENT_REACH`` standard
-    deviations away but no more than an eighth of the points. Where it is wrong by an angle, one of
-    the components is too small by its cosine: information is lost, and none made up.
-    """
-    most = max(1, len(curve) // 8)
-    for reach in range(1, most + 1):
-        span = np.roll(curve, -reach, axis=0) - np.roll(curve, reach, axis=0)
-        if np.median(np.linalg.norm(span, axis=1)) >= 2.0 * TANGENT_REACH * std:
-            break
-    # The right singular vectors after the first are an orthonormal basis across it.
-    return np.linalg.svd(span[:, None, :])[2][:, 1:].swapaxes(1, 2)
-
-
-def _curve_offsets(
-    curve: FloatArray, across: FloatArray, loop: FloatArray, motion: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Offsets ``(2 j,)`` mm of seen points from a closed polyline, and ``(2 j, p)``.
-
-    With r = x - c, c = a + s (b - a) and the unit tangent t of length L, inside an edge::
-
-        dr = -(I - t tT) dc - t (r . (db - da)) / L,   dc = (1 - s) da + s db
-
-    and dr = -da at a vertex.
-
-    Parameters
-    ----------
-    curve : (j, 3) mm
-    across : (j, 3, 2)
-        Two directions at each point, from `_across`.
-    loop : (e, 3) mm
-        Vertices of the polyline, the last joined to the first.
-    motion : (e, 3, p)
-    """
-    step = np.roll(loop, -1, axis=0) - loop
-    squared = np.maximum(np.einsum("ek,ek->e", step, step), np.finfo(np.float64).tiny)
-    raw = np.einsum("jek,ek->je", curve[:, None] - loop, step) / squared
-    foot = loop + np.clip(raw, 0.0, 1.0)[..., None] * step
-    edge = np.argmin(np.linalg.norm(curve[:, None] - foot, axis=2), axis=1)
-
-    rows = np.arange(len(curve))
-    offset, raw = curve - foot[rows, edge], raw[rows, edge]
-    s = np.clip(raw, 0.0, 1.0)[:, None, None]
-    moved_step = (np.roll(motion, -1, axis=0) - motion)[edge]
-    moved = motion[edge] + s * moved_step
-    t = _unit(step[edge])
-    slide = np.einsum("jk,jkp->jp", offset, moved_step) / np.sqrt(squared[edge])[:, None]
-    along = np.einsum("jk,jkp->jp", t, moved) - slide
-    within: BoolArray = (raw >= 0.0) & (raw <= 1.0)
-    change = -moved + np.where(within[:, None, None], t[:, :, None] * along[:, None, :], 0.0)
-    h = np.einsum("jki,jk->ji", across, offset)
-    return h.ravel(), np.einsum("jki,jkp->jip", across, change).reshape(h.size, -1)
-
-
 def _by_region(seen: ObservedSurface) -> Iterator[tuple[int, BoolArray]]:
     """Each region that is seen, and which points ``(q,)`` are of it."""
     for region in np.unique(seen.region):
@@ -499,12 +416,6 @@ def _curves(seen: ObservedSurface, surface: PredictedSurface) -> list[tuple[Floa
     """The curves that are seen and the loops of vertices that they are compared with."""
     pairs = ((seen.free_edge, surface.free_edge), (seen.annulus, surface.annulus))
     return [(curve, loop) for curve, loop in pairs if curve is not None and loop is not None]
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    """Vectors ``(..., 3)`` of length one; zero where they were zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)
 
 
 def _points(what: str, values: FloatArray) -> FloatArray:
