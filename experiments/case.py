@@ -204,7 +204,16 @@ def case_record(
 
 def of_all_unknowns(record: Values) -> dict[str, Any]:
     """A record whose parameters are all unknowns, and not the moduli alone."""
-    return {**record, **record["unknown_iterates"], "parameters": record["unknowns"]}
+    distances = [
+        row if row["to_truth"] is None else {**row, "to_truth": row["to_truth"]["personalised"]}
+        for row in record["distances"]
+    ]
+    return {
+        **record,
+        **record["unknown_iterates"],
+        "parameters": record["unknowns"],
+        "distances": distances,
+    }
 
 
 def _of_moduli(record: dict[str, Any]) -> dict[str, Any]:

@@ -141,7 +141,8 @@ def _simulate(config: Values, described: Values, place: PatientPlace) -> None:
 def _hide(folder: Path, hidden: Hidden, described: Values, draws: int) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(folder / POSITIONS, **dict(hidden.positions))
+        arrays: dict[str, Any] = dict(hidden.positions)
+        np.savez_compressed(folder / POSITIONS, **arrays)
     except OSError as error:
         raise cannot_write(folder, error) from error
     # Written last: where it is, the patient is whole.

@@ -66,6 +66,9 @@ __all__ = [
     "personalise",
 ]
 
+BORDER = 3.0
+"""Standard deviations from the border of the leaflets within which points are not compared."""
+
 MOST_VERTICES = 2000
 """Vertices of a frame that are compared: more, nearer to each other than errors are alike, say
 nothing new, and their correlation is factorised."""
@@ -471,20 +474,15 @@ class _Chain:
             )
             seen = np.where(kept[:, None], frame.vertices, np.nan)
             return Observation(("closed",), seen[None], np.array(told.std_mm**2), correlation)
-        surface = self.case.surface
-        return SurfaceObservation(
-            (
-                ObservedSurface(
-                    "closed", frame.vertices[kept], _vertex_region(frame)[kept], frame.free_edge
-                ),
-            ),
-            PredictedSurface(
-                len(surface.vertices), surface.triangles, surface.region, self.case.free_edge
-            ),
-            told.std_mm,
-            told.std_mm,
-            length,
+        points = ObservedSurface(
+            "closed", frame.vertices[kept], _vertex_region(frame)[kept], frame.free_edge
         )
+        if length > 0:
+            # Beyond a border a distance changes its sign, which correlated errors do not.
+            near = replace(points, annulus=frame.annulus).inner(BORDER * told.std_mm)
+            points = replace(near, annulus=None)
+        surface = replace(PredictedSurface.of_valve(self.model.valve), annulus=None)
+        return SurfaceObservation((points,), surface, told.std_mm, told.std_mm, length)
 
     @property
     def corresponding(self) -> bool:

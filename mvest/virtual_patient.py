@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
-from mvest.errors import GeometryError
+from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
 from mvest.model import ClosureModel
@@ -33,8 +33,11 @@ __all__ = [
     "simulate_patient",
 ]
 
-REFERENCE, CLOSED, LATE = "open", "closed", "late"
-"""Names of the frames of a virtual patient."""
+REFERENCE, CLOSED = "open", "closed"
+"""Names of the frames of a virtual patient that are shown; the others are held out."""
+
+FRAME_INTERVAL = 0.05
+"""s between the closed frame and those that are held out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,12 +102,12 @@ class Simulation:
     std_mm, correlation_length_mm : float
         Error of each coordinate of each vertex in each frame but the first, and over which distance
         it is alike. Frames are independent.
-    late_pressure_mmHg : float
-        In the frame that is held out.
-    late_relaxation : float
-        Share of its way back to the open shape that the annulus has gone in it.
-    late_tips : (float, float, float)
-        mm, displacement of the papillary tips in it.
+    held_pressure_mmHg : tuple of float
+        In the frames that are held out, one after another.
+    held_relaxation : tuple of float
+        Share of its way back to the open shape that the annulus has gone in each.
+    held_tips : (float, float, float)
+        mm, displacement of the papillary tips per unit of relaxation.
     """
 
     element: str = "hex18"
@@ -117,9 +120,16 @@ class Simulation:
     seen_rows: int = 21
     std_mm: float = 0.6
     correlation_length_mm: float = 10.0
-    late_pressure_mmHg: float = 80.0
-    late_relaxation: float = 0.3
-    late_tips: tuple[float, float, float] = (0.0, 0.0, 0.7)
+    held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
+    held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
+    held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
+
+    def __post_init__(self) -> None:
+        if len(self.held_pressure_mmHg) != len(self.held_relaxation):
+            raise InputError(
+                f"held_pressure_mmHg has {len(self.held_pressure_mmHg)} frames, held_relaxation "
+                f"{len(self.held_relaxation)}; expected as many"
+            )
 
 
 def draw_hidden(
@@ -176,22 +186,16 @@ def simulate_patient(
     prediction = model(at)
     if not prediction.converged:
         raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
-    late = _late(simulation, model.contact_valve)
-    held = model.held(
-        at, replace(late, pressure_mmHg=late.pressure_mmHg * values["pressure_scale"])
-    )
-    if held is None:
-        raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {LATE}")
-    closed = prediction.y.reshape(2, -1, 3)[1]
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
-    true = {
-        REFERENCE: seen.surface.vertices,
-        CLOSED: displace(closed, registration, centre),
-        LATE: displace(held, registration, centre),
-    }
+    true = {CLOSED: displace(prediction.y.reshape(2, -1, 3)[1], registration, centre)}
+    for frame, state in _held(simulation, model.contact_valve).items():
+        found = model.held(at, state)
+        if found is None:
+            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+        true[frame] = displace(found, registration, centre)
     case = _case(name, description, seen, true, simulation, mechanics, rng)
-    return VirtualPatient(case, Hidden(dict(values), true))
+    return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
 
 
 def _model(
@@ -224,18 +228,20 @@ def _model(
     return guide
 
 
-def _late(simulation: Simulation, valve: Valve) -> HeldState:
-    """The frame that is held out, on the annulus of a valve."""
-    return HeldState(
-        simulation.late_pressure_mmHg,
-        _late_annulus(simulation, valve),
-        valve.motion.papillary_tips[-1] + np.array(simulation.late_tips),
-    )
-
-
-def _late_annulus(simulation: Simulation, valve: Valve) -> FloatArray:
+def _held(simulation: Simulation, valve: Valve) -> dict[str, HeldState]:
+    """The frames that are held out, on the annulus of a valve."""
     start, end = valve.motion.annulus[0], valve.motion.annulus[-1]
-    return np.asarray(end + simulation.late_relaxation * (start - end))
+    tips = valve.motion.papillary_tips[-1]
+    return {
+        f"held_{pressure:g}_mmHg": HeldState(
+            pressure,
+            end + relaxation * (start - end),
+            tips + relaxation * np.array(simulation.held_tips),
+        )
+        for pressure, relaxation in zip(
+            simulation.held_pressure_mmHg, simulation.held_relaxation, strict=True
+        )
+    }
 
 
 def _case(
@@ -250,34 +256,40 @@ def _case(
     surface = seen.surface
     correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
     error = CorrelatedNoise(simulation.std_mm, correlation)
-    moved = np.stack([true[CLOSED], true[LATE]])
-    closed, late = error(moved, moved, rng)
-    boundary = {
-        REFERENCE: (seen.motion.annulus[0], seen.papillary_tips),
-        CLOSED: (seen.motion.annulus[-1], seen.motion.papillary_tips[-1]),
-        LATE: (
-            _late_annulus(simulation, seen),
-            seen.motion.papillary_tips[-1] + np.array(simulation.late_tips),
-        ),
-    }
+    moved = np.stack(list(true.values()))
+    motion = seen.motion
+    closed = HeldState(
+        mechanics.protocol.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1]
+    )
+    states = {CLOSED: closed, **_held(simulation, seen)}
 
-    def frame(which: str, time: float, role: Role, pressure: float, vertices: FloatArray) -> Frame:
-        annulus, tips = boundary[which]
+    def frame(name: str, time: float, role: Role, state: HeldState, vertices: FloatArray) -> Frame:
         return Frame(
-            which,
+            name,
             time,
             role,
-            pressure,
+            state.pressure_mmHg,
             vertices,
             surface.triangles,
             surface.region,
-            annulus,
+            state.annulus,
             vertices[seen.free_edge],
-            tips,
+            state.papillary_tips,
             True,
         )
 
-    peak = mechanics.protocol.pressure_mmHg
+    rest = HeldState(0.0, motion.annulus[0], seen.papillary_tips)
+    end = mechanics.protocol.ramp
+    later = [
+        frame(
+            which,
+            end + k * FRAME_INTERVAL,
+            Role.CLOSED if which == CLOSED else Role.HELD_OUT,
+            states[which],
+            vertices,
+        )
+        for k, (which, vertices) in enumerate(zip(true, error(moved, moved, rng), strict=True))
+    ]
     return ValveCase(
         name=name,
         description=description,
@@ -287,11 +299,7 @@ def _case(
         surface=surface,
         annulus=seen.annulus,
         free_edge=seen.free_edge,
-        frames=(
-            frame(REFERENCE, 0.0, Role.REFERENCE, 0.0, surface.vertices),
-            frame(CLOSED, 0.3, Role.CLOSED, peak, closed),
-            frame(LATE, 0.4, Role.HELD_OUT, simulation.late_pressure_mmHg, late),
-        ),
+        frames=(frame(REFERENCE, 0.0, Role.REFERENCE, rest, surface.vertices), *later),
         chordae=seen.chordae,
         uncertainty=Uncertainty(simulation.std_mm, simulation.correlation_length_mm),
     )

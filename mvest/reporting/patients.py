@@ -56,6 +56,9 @@ KEPT_ARRAYS = (
 )  # fmt: skip
 """Arrays that Figure 3 needs."""
 
+WHICH = ("generic", "registered", "personalised")
+"""The closed valves whose distances are told; registered is generic, laid on the frame rigidly."""
+
 NOTE = (
     "Simulated valves; the moduli and distances in the rows of the paper belong to five patients "
     "whose images are not public, and the anatomies here have nothing to do with theirs. The truth "
@@ -197,13 +200,13 @@ def table3(records: Sequence[Record]) -> pd.DataFrame:
                 "frame": distance["frame"],
                 "shown to the filter": distance["seen"],
             }
-            for which in ("generic", "registered", "personalised"):
+            for which in WHICH:
                 plain[f"{which} mean [mm]"] = distance[which]["mean"]
                 plain[f"{which} SD [mm]"] = distance[which]["std"]
             generic, own = distance["generic"]["mean"], distance["personalised"]["mean"]
             plain["closer [%]"] = 100.0 * (generic - own) / generic
             truth = distance["to_truth"]
-            for which in ("generic", "registered", "personalised"):
+            for which in WHICH:
                 plain[f"{which} to the truth [mm]"] = (
                     None if truth is None else truth[which]["mean"]
                 )
@@ -272,14 +275,10 @@ def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
             {
                 "patient (simulated)": _words(row["patient"]),
                 "frame": frame,
-                **{
-                    f"{which} [mm]": f"{row[f'{which} mean [mm]']:.2f} ± {row[f'{which} SD [mm]']:.2f}"
-                    for which in ("generic", "registered", "personalised")
-                },
+                **{f"{which} [mm]": _mean_and_sd(row, which) for which in WHICH},
                 "closer": f"{row['closer [%]']:.0f} %",
-                "to the truth, generic / registered / personalised [mm]": " / ".join(
-                    number(row[f"{which} to the truth [mm]"], 2)
-                    for which in ("generic", "registered", "personalised")
+                "to the truth, each of these [mm]": " / ".join(
+                    number(row[f"{which} to the truth [mm]"], 2) for which in WHICH
                 ),
                 "paper [mm]": MISSING
                 if pd.isna(row["paper generic [mm]"])
@@ -287,6 +286,10 @@ def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
             }
         )
     return rows
+
+
+def _mean_and_sd(row: Any, which: str) -> str:
+    return f"{row[f'{which} mean [mm]']:.2f} ± {row[f'{which} SD [mm]']:.2f}"
 
 
 def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
@@ -376,7 +379,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
                     ha="right", fontsize=11,
                 )  # fmt: skip
             drawn.append(positions[k])
-        same_scale(grid[:, column], drawn, ATRIUM)
+        same_scale(list(grid[:, column]), drawn, ATRIUM)
     bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.01, extend="max")
     bar.set_label("distance from the observed closed valve [mm]")
     figure.suptitle(
