@@ -440,6 +440,7 @@ CASES = {
     "no units": (drop("units"), I, "units", "is missing; expected a mapping with length"),
     "no name of a frame": (drop("frames", 0, "name"), I, "frames.0.name", "is missing"),
     "a list of regions with a number": (put("regions", ["a", 1]), I, "regions.1", "found 1"),
+    "regions of one name": (put("regions", ["a", "b", "a"]), I, "regions", "'a' occurs twice"),
     "regions as text": (put("regions", "anterior"), I, "regions", "found 'anterior'; expected a"),
     "standard deviation 0": (
         put("observation", {"std_mm": 0, "correlation_length_mm": 1}),
