@@ -49,6 +49,18 @@ def test_phi_is_stretched_between_the_commissures(roll, backwards):
     np.testing.assert_allclose(found, [*expected, at_angle(-90, 0)], atol=1e-9)
 
 
+def test_places_do_not_depend_on_where_the_annulus_begins():
+    # On the template the border of the leaflets runs over 15 degrees of harmonic angle, so that for
+    # some of these beginnings the angle jumps from 2 pi to 0 along it.
+    valve = Template().valve(24, 8)
+    x, t, r = valve.surface.vertices, valve.surface.triangles, valve.surface.region
+    phi, s = np.linspace(-180.0, 540.0, 50), np.linspace(0.0, 1.0, 50)
+    expected = LeafletBand.of(x, t, r, valve.annulus, valve.free_edge, 0).position(phi, s)
+    for roll in range(1, 24):
+        band = LeafletBand.of(x, t, r, np.roll(valve.annulus, roll), valve.free_edge, 0)
+        np.testing.assert_allclose(band.position(phi, s), expected, atol=1e-8)
+
+
 def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one():
     band = LeafletBand.of(*cylinder(), anterior=1)
     layout = ChordLayout(
