@@ -34,6 +34,7 @@ __all__ = [
     "check_frames",
     "check_no_handle",
     "check_normals",
+    "check_regions",
     "check_thickness",
     "check_tips",
     "ventricular_side",
@@ -58,6 +59,14 @@ def at(file: Path, field: str) -> Iterator[None]:
         yield
     except InputError as fault:
         raise wrong(file, field, str(fault), type(fault)) from fault
+
+
+def check_regions(file: Path, document: CaseFile) -> None:
+    """Raise unless the regions have different names."""
+    names = list(document.region_names().values())
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise wrong(file, "regions", f"{twice[0]!r} occurs twice; expected different names")
 
 
 def check_frames(file: Path, document: CaseFile) -> None:

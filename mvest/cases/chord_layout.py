@@ -2,8 +2,10 @@
 
 The template (`mvest.valve.template`) places its chordae by an angle phi, with the commissures at 0
 and 180 degrees and the anterior leaflet between them, and by s from the annulus to the free edge.
-Any band has such coordinates (`mvest.valve.surface_coordinates`); here the harmonic angle is made
-to fit by stretching it linearly on either side of the commissures.
+Any band has harmonic coordinates (`mvest.valve.surface_coordinates`), but their angle is not spread
+along the edges as the template's is, and the leaflets' common borders are no lines of it. So phi is
+the share of the arc length between the commissures, on the annulus (s = 0) and on the free edge
+(s = 1), and between the two the harmonic angle of a phi is linear in s.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvest.cases.rims import commissures, directed
+from mvest.cases.rims import arc_shares, commissures, directed
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy import Chordae
@@ -33,13 +35,15 @@ class LeafletBand:
     vertices : ndarray
         ``(n, 3)`` mm.
     coordinates : SurfaceCoordinates
-    anterior : tuple of float
-        Harmonic angle (rad) at which the anterior leaflet begins, and its width.
+    annulus_angle, edge_angle : ndarray
+        ``(2, k)`` tables of phi (degrees, 0 to 360) and the harmonic angle (rad, unwrapped) along
+        the annulus and along the free edge.
     """
 
     vertices: FloatArray
     coordinates: SurfaceCoordinates
-    anterior: tuple[float, float]
+    annulus_angle: FloatArray
+    edge_angle: FloatArray
 
     @classmethod
     def of(
@@ -65,20 +69,25 @@ class LeafletBand:
         Raises
         ------
         GeometryError
-            The coordinates fold over, or the leaflets do not each meet the annulus in one piece.
+            The coordinates fold over, or a leaflet does not meet the annulus or the free edge in
+            one piece.
         """
-        loop = directed(annulus, triangles)
-        begin, end = commissures(loop, triangles, region)[anterior]
-        coordinates = surface_coordinates(vertices, triangles, loop, free_edge)
-        start, stop = coordinates.theta[loop[begin]], coordinates.theta[loop[end]]
-        return cls(vertices, coordinates, (float(start), float(np.mod(stop - start, 2 * np.pi))))
+        around, edge = directed(annulus, triangles), directed(free_edge, triangles)
+        coordinates = surface_coordinates(vertices, triangles, around, free_edge)
+
+        on_annulus = _angle_table(vertices, triangles, region, around, coordinates.theta, anterior)
+        # The free edge runs against the annulus.
+        on_edge = _angle_table(
+            vertices, triangles, region, edge, coordinates.theta, anterior, backwards=True
+        )
+        on_edge[1] += 2 * np.pi * np.round((on_annulus[1, 0] - on_edge[1, 0]) / (2 * np.pi))
+        return cls(vertices, coordinates, on_annulus, on_edge)
 
     def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Corners ``(k, 3)`` and weights ``(k, 3)`` of points at phi (degrees) and s."""
-        start, width = self.anterior
-        turn = np.mod(phi, 360.0) / 180.0
-        theta = start + np.where(
-            turn <= 1.0, turn * width, width + (turn - 1.0) * (2 * np.pi - width)
+        turn = np.mod(phi, 360.0)
+        theta = (1 - s) * np.interp(turn, *self.annulus_angle) + s * np.interp(
+            turn, *self.edge_angle
         )
         triangle, weights = self.coordinates.locate(np.mod(theta, 2 * np.pi), s)
         return self.coordinates.triangles[triangle], weights
@@ -87,6 +96,28 @@ class LeafletBand:
         """Positions ``(k, 3)`` mm of points at phi (degrees) and s."""
         corners, weights = self.locate(phi, s)
         return _weighted(self.vertices, corners, weights)
+
+
+def _angle_table(
+    vertices: FloatArray,
+    triangles: IntArray,
+    region: IntArray,
+    loop: IntArray,
+    theta: FloatArray,
+    anterior: int,
+    backwards: bool = False,
+) -> FloatArray:
+    """Phi (degrees) and harmonic angle (rad, unwrapped) ``(2, k)`` along a loop."""
+    pieces = commissures(loop, triangles, region)
+    tables = []
+    for label in sorted(pieces, key=lambda piece: piece != anterior):
+        positions, share = arc_shares(vertices[loop], *pieces[label])
+        if backwards:
+            positions, share = positions[::-1], 1.0 - share[::-1]
+        start = 0.0 if label == anterior else 180.0
+        tables.append((start + 180.0 * share, theta[loop[positions]]))
+    phi, angle = (np.concatenate(parts) for parts in zip(*tables, strict=True))
+    return np.stack([phi, np.unwrap(angle)])
 
 
 def _weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> FloatArray:

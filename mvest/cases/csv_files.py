@@ -29,7 +29,10 @@ def read_columns(file: Path, names: Sequence[str]) -> dict[str, list[str]]:
         raise InputError(f"{file}: byte {fault.start} is no UTF-8 text") from fault
     except OSError as fault:
         raise InputError(f"{file}: cannot be read: {fault.strerror or fault}") from fault
-    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    try:
+        rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    except csv.Error as fault:
+        raise InputError(f"{file}: no comma-separated text: {fault}") from fault
     header = [cell.strip() for cell in rows[0]] if rows else []
     if sorted(header) != sorted(names):
         raise InputError(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mvest.cases.case import Role, Uncertainty, ValveCase
-from mvest.cases.checks import at, check_closing_pressure, check_frames
+from mvest.cases.checks import at, check_closing_pressure, check_frames, check_regions
 from mvest.cases.csv_files import read_numbers
 from mvest.cases.frames import SECONDS_PER, check_reference, place_frame, read_frame
 from mvest.cases.paths import CASE_FILE, CaseFolder
@@ -45,6 +45,7 @@ def read_case(path: Path | str) -> ValveCase:
     if not folder.case.is_file():
         raise InputError(f"{folder.root}: no {CASE_FILE} in this folder")
     document = read_case_file(folder.case)
+    check_regions(folder.case, document)
     check_frames(folder.case, document)
     derived = list(document.derived)
     seen = [read_frame(folder, document, number) for number in range(len(document.frames))]

@@ -121,7 +121,10 @@ def _read_curve(
             by_number = stream.readline().strip().removeprefix(b"\xef\xbb\xbf") == b"vertex"
         if by_number:
             return read_vertices(file)
-        return scale * read_numbers(file, POINT_COLUMNS)
+        points = scale * read_numbers(file, POINT_COLUMNS)
+        if len(points) < 3:
+            raise InputError(f"{given}: {len(points)} points, expected three or more of a curve")
+        return points
 
 
 def check_reference(file: Path, seen: SeenFrame, derived: list[str]) -> ReferenceFrame:
@@ -189,7 +192,7 @@ def place_frame(
     corresponds = _corresponds(file, document, first, seen)
     rims, region = reference.rims, reference.region
     if seen is not first and corresponds:
-        _check_alike(file, seen, region)
+        _check_alike(file, seen, reference)
     elif seen is not first:
         rims, region = _own_band(file, seen)
     annulus = _frame_annulus(file, reference, seen, rims, region, corresponds, derived)
@@ -218,8 +221,9 @@ def place_frame(
     return frame, rims
 
 
-def _check_alike(file: Path, seen: SeenFrame, region: IntArray) -> None:
-    """Raise unless a corresponding frame is in good order and labelled like the reference."""
+def _check_alike(file: Path, seen: SeenFrame, reference: ReferenceFrame) -> None:
+    """Raise unless a corresponding frame is in good order and has the reference's labels."""
+    region, rims = reference.region, reference.rims
     with at(file, f"{seen.where}.surface"):
         check_band(seen.vertices, seen.triangles, self_intersections=False)
         if seen.region is not None and not np.array_equal(seen.region, region):
@@ -227,6 +231,17 @@ def _check_alike(file: Path, seen: SeenFrame, region: IntArray) -> None:
             raise InputError(
                 f"triangles {odd[:5].tolist()} ({len(odd)} in all) belong to another region than "
                 "in the reference frame, to which they correspond"
+            )
+
+    for name, given, loop in (
+        ("annulus", seen.annulus, rims.annulus),
+        ("free_edge", seen.free_edge, rims.free_edge),
+    ):
+        if given is not None and given.ndim == 1 and sorted(given) != sorted(loop):
+            raise wrong(
+                file,
+                f"{seen.where}.{name}",
+                "other vertices than in the reference frame, to which this frame corresponds",
             )
 
 
@@ -289,12 +304,6 @@ def _frame_annulus(
             )
         return seen.annulus.astype(np.float64)
     if corresponds:
-        if seen.annulus is not None and set(seen.annulus.tolist()) != set(
-            reference.rims.annulus.tolist()
-        ):
-            raise wrong(
-                file, where, "other vertices than in the reference frame, to which it corresponds"
-            )
         return seen.vertices[reference.rims.annulus]
     first = reference.seen
     with at(file, where):

@@ -30,11 +30,16 @@ class CaseFolder:
         given = Path(name)
         path = self.root / given
         outside = given.is_absolute() or ".." in given.parts or "\\" in name or "\0" in name
-        if outside or not path.resolve().is_relative_to(self.root.resolve()):
+        try:
+            found = not outside and path.is_file()
+            outside = outside or not path.resolve().is_relative_to(self.root.resolve())
+        except (OSError, RuntimeError) as fault:  # a name too long, a link to itself
+            raise wrong(self.case, where, f"{name[:60]!r} cannot be found: {fault}") from fault
+        if outside:
             raise wrong(
                 self.case, where, f"{name!r} leads out of the folder; expected a file inside it"
             )
-        if not path.is_file():
+        if not found:
             raise wrong(self.case, where, f"{name!r}: no such file in {self.root}")
         self.used[given.as_posix()] = path
         return path

@@ -14,7 +14,15 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.surface_coordinates import boundary_loops
 
-__all__ = ["Rims", "commissures", "find_rims", "loop_vector_area", "match_annulus", "two_loops"]
+__all__ = [
+    "Rims",
+    "arc_shares",
+    "commissures",
+    "find_rims",
+    "loop_vector_area",
+    "match_annulus",
+    "two_loops",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,17 +195,19 @@ def commissures(
     begins = np.flatnonzero(labels != np.roll(labels, 1))
     present = labels[begins]
     if len(begins) < 2:
-        raise GeometryError("the annulus belongs to one region only, so that it has no commissures")
+        raise GeometryError(
+            "a boundary loop belongs to one region only, so that it has no commissures"
+        )
     if len(set(present.tolist())) != len(present):
         raise GeometryError(
-            f"along the annulus the regions are {present.tolist()} one after the other; expected "
-            "each once, in one piece"
+            f"along a boundary loop the regions are {present.tolist()} one after the other; "
+            "expected each once, in one piece"
         )
     ends = np.roll(begins, -1)
     return {int(r): (int(a), int(b)) for r, a, b in zip(present, begins, ends, strict=True)}
 
 
-def _arc(loop: FloatArray, begin: int, end: int) -> tuple[IntArray, FloatArray]:
+def arc_shares(loop: FloatArray, begin: int, end: int) -> tuple[IntArray, FloatArray]:
     """Positions in a closed curve from ``begin`` to ``end``, and their share of the arc length."""
     count = (end - begin) % len(loop)
     at = (begin + np.arange(count + 1)) % len(loop)
@@ -248,8 +258,8 @@ def match_annulus(
     curve, other_curve = vertices[loop], seen[0][other]
     placed = np.zeros((len(vertices), 3))
     for label, (begin, end) in pieces.items():
-        at, share = _arc(curve, begin, end)
-        other_at, other_share = _arc(other_curve, *other_pieces[label])
+        at, share = arc_shares(curve, begin, end)
+        other_at, other_share = arc_shares(other_curve, *other_pieces[label])
         for axis in range(3):
             placed[loop[at], axis] = np.interp(share, other_share, other_curve[other_at, axis])
     return placed[reference_annulus]

@@ -123,6 +123,13 @@ def _merged(surface: RegionSurface) -> RegionSurface:
 
 
 def _labels(file: Path, found: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
+    for data, rows in (
+        (found.cell_data, len(found.triangles)),
+        (found.point_data, len(found.vertices)),
+    ):
+        for name, values in data.items():
+            if len(values) != rows:
+                raise InputError(f"data {name!r} has {len(values)} rows, expected {rows}")
     if "region" in found.cell_data:
         return _numbered(found.cell_data["region"], regions, "triangles", "cell data region")
     if "region" in found.point_data:

@@ -30,6 +30,13 @@ def bad(plain, tmp_path):
     return tmp_path / "case", copy.deepcopy(document)
 
 
+def test_a_seam_within_the_tolerance_is_closed(bad):
+    # A hundred-thousandth of the diagonal (45 mm) is 0.00045 mm.
+    folder, document = bad
+    seam(0.0002)(folder, document)
+    assert len(read_case(save(folder, document)).surface.vertices) == 192
+
+
 def test_the_folder_is_in_order_before_it_is_broken(bad):
     read_case(save(*bad))
 
@@ -143,6 +150,45 @@ def lid(x, t, r):
     return np.vstack([x, x[-24:].mean(axis=0)]), np.vstack([t, more]), np.append(r, [0, 1] * 12)
 
 
+def handle(x, t, r):
+    """A tube from one triangle to another, both of which are taken away."""
+    a, b = t[60], t[75][[0, 2, 1]]
+    tube = [
+        corners
+        for i, j in ((0, 1), (1, 2), (2, 0))
+        for corners in ([a[i], a[j], b[i]], [a[j], b[j], b[i]])
+    ]
+    x, t, r = without(60, 75)(x, t, r)
+    return x, np.vstack([t, tube]), np.append(r, [0] * 6)
+
+
+def seam(gap):
+    """One STL for each leaflet, those of the second moved by a gap (mm)."""
+
+    def change(folder, document):
+        for entry in document["frames"]:
+            old = read_surface(folder / entry["surface"])
+            files = {n: f"{entry['name']}_{n}.stl" for n in document["regions"]}
+            for number, file in enumerate(files.values()):
+                moved = old.vertices + np.array([0.0, 0.0, gap * number])
+                save_surface(folder / file, moved, old.triangles[region_of(old) == number], None)
+            entry["surface"] = files
+
+    return change
+
+
+def short_data(folder, document):
+    """A file whose labels are fewer than its triangles."""
+    text = (folder / "open.vtp").read_text()
+    short = text.replace('Name="region"', 'Name="region" format="ascii"', 1)
+    start = short.index(">", short.index('Name="region"')) + 1
+    end = short.index("</DataArray>", start)
+    short = short[:start].replace(' format="binary"', "", 0) + "0 1 1" + short[end:]
+    head = short.index("<DataArray")
+    tag = short[head:start].replace(' format="ascii"', "").replace("binary", "ascii")
+    (folder / "open.vtp").write_text(short[:head] + tag + short[start:])
+
+
 def turned(some):
     def edit(x, t, r):
         t[some] = t[some][:, ::-1]
@@ -235,6 +281,9 @@ CASES = {
             np.vstack([x, x + 60.0]), np.vstack([t, t + len(x)]), np.append(r, r)
         )), G, OPEN, r"2 pieces that do not touch \(192, 192 vertices\)",
     ),
+    "handle": (
+        surface(handle, "closed"), G, CLOSED, "Euler number -2, expected 0: .* has 1 handle"
+    ),
     "unused vertex": (
         surfaces(lambda x, t, r: (np.vstack([x, x[:1]]), t, r)), G, OPEN, r"vertices \[192\]"
     ),
@@ -247,7 +296,11 @@ CASES = {
         surface(lambda x, t, r: (x, t, 1 - r), "closed"),
         I, CLOSED, r"belong to another region than in the reference",
     ),
+    "a seam that gapes": (
+        seam(0.01), G, OPEN, r"2 pieces that do not touch .* sharing the vertices of their seams"
+    ),
     # Labels.
+    "too few labels": (short_data, I, OPEN, "data 'region' has 3 rows, expected 336"),
     "no labels": (
         surfaces(lambda x, t, r: (x, t, None)), I, OPEN, "without labels; expected cell data"
     ),
@@ -285,6 +338,21 @@ CASES = {
     "too few points of the annulus": (
         tip_table, I, "frames.1.annulus", "3 points, expected 24: one for every annulus vertex"
     ),
+    "other free edge of a corresponding frame": (
+        put("frames", 1, "free_edge", list(range(24))),
+        I, "frames.1.free_edge", "other vertices than in the reference",
+    ),
+    "a free edge of one point": (
+        both(text("x,y,z\n1,2,3\n", "f.csv"), put("frames", 1, "free_edge", "f.csv")),
+        I, "frames.1.free_edge", "1 points, expected three",
+    ),
+    "points for the reference": (
+        both(text("x,y,z\n1,2,3\n4,5,6\n7,8,9", "f.csv"), put("frames", 0, "annulus", "f.csv")),
+        I, "frames.0.annulus", "holds points; expected vertex numbers",
+    ),
+    "a loop in another file": (
+        put("frames", 1, "annulus", "open.vtp"), I, "frames.1.annulus", "extension '.vtp'"
+    ),
     "tips above the annulus": (
         put("frames", 0, "papillary_tips", [[16.0, 0.0, 25.0], [-16.0, 0.0, 25.0]]),
         G, "frames.0", "nearest to the wider edge.*atrial side",
@@ -318,6 +386,10 @@ CASES = {
     "pressure in mmHg": (
         put("units", {"length": "mm", "pressure": "kPa"}),
         I, "frames.1.pressure", "900.* mmHg .*is it in mmHg",
+    ),
+    "pressure of a held-out frame": (
+        both(frame(2, "held_out", 0.5), put("frames", 2, "pressure", 5.0)),
+        I, "frames.2.pressure", "5 mmHg on the closed valve, expected 20 to 250",
     ),
     "time outside the curve": (
         drop("frames", 1, "pressure"),
@@ -426,6 +498,17 @@ CASES = {
     "path out of the folder": (
         put("frames", 0, "surface", "../case/open.vtp"), I, OPEN, "leads out of the folder"
     ),
+    "a long name": (put("chordae", "x" * 300), I, "chordae", "cannot be found"),
+    "a link to itself": (
+        both(
+            lambda folder, _: (folder / "a.csv").symlink_to(folder / "a.csv"),
+            put("chordae", "a.csv"),
+        ), I, "chordae", "cannot be found|no such file",
+    ),
+    "an open quote": (
+        text("tip,x,y,z,family,rest_length_mm,stiffness_n\n\"" + "0," * 70000, "chordae.csv"),
+        I, "chordae", "no comma-separated text",
+    ),
     "absolute path": (put("chordae", "/" + "etc/hosts"), I, "chordae", "leads out of the folder"),
     "link out of the folder": (link_out, I, OPEN, "leads out of the folder"),
     # The document.
@@ -440,6 +523,7 @@ CASES = {
     "no units": (drop("units"), I, "units", "is missing; expected a mapping with length"),
     "no name of a frame": (drop("frames", 0, "name"), I, "frames.0.name", "is missing"),
     "a list of regions with a number": (put("regions", ["a", 1]), I, "regions.1", "found 1"),
+    "regions of one name": (put("regions", ["a", "b", "a"]), I, "regions", "'a' occurs twice"),
     "regions as text": (put("regions", "anterior"), I, "regions", "found 'anterior'; expected a"),
     "standard deviation 0": (
         put("observation", {"std_mm": 0, "correlation_length_mm": 1}),

@@ -1,0 +1,145 @@
+"""The layout on a cylinder, where the harmonic coordinates are angle and height."""
+
+import numpy as np
+import pytest
+
+from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.cases.folder import read_case
+from mvest.errors import InputError
+from mvest.valve.template import ChordLayout, Template
+from tests.cases.folders import closing, plain_folder, save, save_surface
+
+RADIUS, HEIGHT = 15.0, 12.0
+
+
+def cylinder(columns=36, rows=5, begin=20.0, end=160.0):
+    """A band round z from the annulus at z = 0 to the free edge at -12, normals outwards.
+
+    The anterior leaflet, region 1, lies between the angles begin and end (degrees).
+    """
+    i, j = np.meshgrid(np.arange(columns), np.arange(rows))
+    angle = 2 * np.pi * i.ravel() / columns
+    z = -HEIGHT * j.ravel() / (rows - 1)
+    x = np.column_stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), z])
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
+    a, b = j * columns + i, j * columns + (i + 1) % columns
+    c, d = b + columns, a + columns
+    triangles = np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+    middle = np.tile(360.0 * (i + 0.5) / columns, 2)
+    region = ((middle > begin) & (middle < end)).astype(np.int64)
+    annulus, free_edge = np.arange(columns), np.arange(columns) + columns * (rows - 1)
+    return x, triangles, region, annulus, free_edge
+
+
+def at_angle(degrees, s, radius=RADIUS):
+    angle = np.deg2rad(degrees)
+    return [radius * np.cos(angle), radius * np.sin(angle), -HEIGHT * s]
+
+
+@pytest.mark.parametrize("roll", [0, 11])
+@pytest.mark.parametrize("backwards", [False, True])
+def test_phi_is_stretched_between_the_commissures(roll, backwards):
+    x, t, r, annulus, free_edge = cylinder()
+    annulus = np.roll(annulus[::-1] if backwards else annulus, roll)
+    band = LeafletBand.of(x, t, r, annulus, free_edge, anterior=1)
+    # Along the triangles the annulus runs backwards here, so the anterior leaflet begins at 160
+    # and phi runs with decreasing angle: 90 is 160 - 70, and 270 is 20 - 110 = -90.
+    found = band.position(np.array([0.0, 90.0, 180.0, 270.0, -90.0]), np.array([0, 0.5, 1, 0.5, 0]))
+    expected = [at_angle(160, 0), at_angle(90, 0.5), at_angle(20, 1), at_angle(-90, 0.5)]
+    np.testing.assert_allclose(found, [*expected, at_angle(-90, 0)], atol=1e-9)
+
+
+def test_places_do_not_depend_on_where_the_annulus_begins():
+    # On the template the border of the leaflets runs over 15 degrees of harmonic angle, so that for
+    # some of these beginnings the angle jumps from 2 pi to 0 along it.
+    valve = Template().valve(24, 8)
+    x, t, r = valve.surface.vertices, valve.surface.triangles, valve.surface.region
+    phi, s = np.linspace(-180.0, 540.0, 50), np.linspace(0.0, 1.0, 50)
+    expected = LeafletBand.of(x, t, r, valve.annulus, valve.free_edge, 0).position(phi, s)
+    for roll in range(1, 24):
+        band = LeafletBand.of(x, t, r, np.roll(valve.annulus, roll), valve.free_edge, 0)
+        np.testing.assert_allclose(band.position(phi, s), expected, atol=1e-8)
+
+
+def test_rest_lengths_follow_the_closed_frame_but_never_fall_below_the_open_one():
+    band = LeafletBand.of(*cylinder(), anterior=1)
+    layout = ChordLayout(
+        marginal_phi=(180.0 / 14 * 3,), basal=((-90.0, 0.5),), marginal_s=1.0, open_slack=1.1,
+        marginal_slack=0.9, basal_slack=2.0,
+    )  # fmt: skip
+    tips = np.array([[20.0, 0.0, -30.0], [-20.0, 0.0, -30.0]])
+    closed, lower = band.vertices * [0.5, 0.5, 1.0], np.array([0.0, 0.0, 5.0])
+    chordae = lay_out_chordae(band, tips, closed, tips - lower, layout)
+    # phi = 180 - 3/14 180 from the side of 160 degrees: angles 130 and 50, and -90 twice.
+    places = np.array([at_angle(130, 1), at_angle(-90, 0.5), at_angle(50, 1), at_angle(-90, 0.5)])
+    np.testing.assert_allclose(chordae.insertion, places, atol=1e-9)
+    np.testing.assert_array_equal(chordae.tip[[0, 2]], [1, 0])
+    open_length = np.linalg.norm(places - tips[chordae.tip], axis=1)
+    moved = places * [0.5, 0.5, 1.0]
+    closed_length = np.linalg.norm(moved - (tips - lower)[chordae.tip], axis=1)
+    expected = np.maximum([0.9, 2.0, 0.9, 2.0] * closed_length, 1.1 * open_length)
+    # Both branches of the maximum occur.
+    assert (expected > 1.1 * open_length).tolist() == [False, True, False, True]
+    np.testing.assert_allclose(chordae.rest_length, expected, rtol=1e-12)
+    assert [chordae.family_names[k] for k in chordae.family] == ["marginal", "basal"] * 2
+
+
+def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
+    band = LeafletBand.of(*cylinder(), anterior=1)
+    x, t, r, annulus, free_edge = cylinder(72, 9)
+    tips = np.array([[20.0, 1.0, -30.0], [-20.0, 0.0, -30.0]])
+    shape = [0.9, 0.9, 1.4]
+    other = LeafletBand.of(x * shape, t, r, annulus, free_edge, anterior=1)
+    same = lay_out_chordae(band, tips, band.vertices * shape, tips)
+    found = lay_out_chordae(band, tips, other, tips)
+    np.testing.assert_array_equal(found.insertion, same.insertion)
+    # The finer polygon lies within R (1 - cos 5 deg) = 0.06 mm of the coarser.
+    np.testing.assert_allclose(found.rest_length, same.rest_length, atol=0.06)
+
+
+def test_three_tips_are_refused():
+    band = LeafletBand.of(*cylinder(), anterior=1)
+    with pytest.raises(InputError, match="3 papillary tips; the layout of chordae needs two"):
+        lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)))
+
+
+def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
+    document = plain_folder(tmp_path, 40, 12)
+    given = read_case(save(tmp_path, document)).chordae
+    del document["chordae"]
+    laid_out = read_case(save(tmp_path, document)).chordae
+    assert len(laid_out) == len(given)
+    # The two sets are mirror images in order. On both edges phi means the same in both; s is
+    # harmonic here and differs by 0.02 in the middle of a leaflet of 24 mm: 0.5 mm. Half way down
+    # the leaflet phi differs too, by less than to the next marginal chord (2.8 mm).
+    order = np.roll(np.arange(len(given)), len(given) // 2)
+    gap = np.linalg.norm(laid_out.insertion - given.insertion[order], axis=1)
+    assert gap[laid_out.family == 0].max() < 0.5
+    assert gap[laid_out.family == 1].max() < 2.8
+    np.testing.assert_array_equal(laid_out.tip, given.tip[order])
+    np.testing.assert_array_equal(laid_out.family, given.family[order])
+
+
+def test_frames_without_correspondence_are_matched(tmp_path):
+    document = plain_folder(tmp_path, 40, 12)
+    del document["chordae"]
+    expected = read_case(save(tmp_path, document))
+    surface = Template().valve(56, 14).surface
+    save_surface(
+        tmp_path / "closed.vtp", closing(surface.vertices), surface.triangles, surface.region
+    )
+    case = read_case(save(tmp_path, document))
+    assert not case.frames[1].corresponds
+    assert sum("annulus of frame 'closed'" in sentence for sentence in case.derived) == 1
+    assert sum("material coordinates" in sentence for sentence in case.derived) == 1
+    # The motion shrinks x by 1 % and y by 6 %, so shares of arc length are not quite material: two
+    # halves of an arc L that shrink differently by e move its middle by e L / 4, and the
+    # posterior arc is 62 mm long. A vertex is 2.5 mm from its neighbours.
+    gap = np.linalg.norm(case.frames[1].annulus - expected.frames[1].annulus, axis=1)
+    assert gap.max() < 0.056 * 62 / 4
+    np.testing.assert_array_equal(case.chordae.insertion, expected.chordae.insertion)
+    # And the closed end of a chord by no more than the annulus at its phi.
+    np.testing.assert_allclose(
+        case.chordae.rest_length, expected.chordae.rest_length, atol=0.056 * 62 / 4
+    )
+    assert case.valve.motion.annulus.shape == (2, 40, 3)

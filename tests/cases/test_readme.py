@@ -1,0 +1,70 @@
+"""What the README of the format says is so."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import mvest.cases
+from mvest.cases.folder import read_case
+from mvest.cases.schema import CaseFile, FrameEntry, case_schema
+from mvest.valve.io import write_surface
+from mvest.valve.template import Template
+from tests.cases.folders import closing, save
+
+README = (Path(mvest.cases.__file__).parent / "README.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```yaml\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_every_field_is_in_the_readme_and_no_other():
+    documented = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, flags=re.MULTILINE)
+    names = {name for cell in documented for name in re.findall(r"\w+", cell)}
+    assert names == set(CaseFile.model_fields) | set(FrameEntry.model_fields)
+
+
+def test_the_schema_describes_every_field_and_allows_no_other():
+    schema = case_schema()
+    for part in [schema, *schema["$defs"].values()]:
+        assert part["additionalProperties"] is False
+        assert all("description" in field for field in part["properties"].values())
+    assert schema["required"] == ["version", "name", "units", "regions", "frames"]
+
+
+def position(share, surface):
+    return surface.vertices if share == 0 else closing(surface.vertices, share)
+
+
+def test_the_smallest_example_is_read(tmp_path):
+    surface = Template().valve(24, 8).surface
+    for name, share in (("open", 0.0), ("closed", 1.0)):
+        file = tmp_path / f"{name}.vtp"
+        x = position(share, surface)
+        write_surface(file, x, surface.triangles, None, {"region": surface.region})
+    case = read_case(save(tmp_path, EXAMPLES[0]))
+    assert [frame.corresponds for frame in case.frames] == [True, True]
+    assert len(case.chordae) == 34
+
+
+def test_the_example_without_correspondence_is_read(tmp_path):
+    # Another mesh in every frame, in cm.
+    for name, share, size in (("open", 0.0, 40), ("closing", 0.7, 48), ("closed", 1.0, 56)):
+        surface = Template().valve(size, 12).surface
+        for number, region in enumerate(surface.region_names):
+            x = position(share, surface) / 10.0
+            file = tmp_path / f"{name}_{region}.stl"
+            write_surface(file, x, surface.triangles[surface.region == number])
+    (tmp_path / "pressure.csv").write_text("time,pressure\n0,0\n200,10\n400,16.5\n")
+    case = read_case(save(tmp_path, EXAMPLES[1]))
+    assert [frame.corresponds for frame in case.frames] == [True, False, False]
+    assert [len(frame.annulus) for frame in case.frames] == [40, 40, 40]
+    assert case.frames[1].pressure_mmHg == pytest.approx(10.0 / 0.133322387415)
+    assert case.frames[2].time == pytest.approx(0.35)
+    assert np.ptp(case.surface.vertices[:, 0]) == pytest.approx(36.0, rel=0.01)
+    assert case.valve.chordae is case.chordae
+
+
+def test_the_examples_are_all_there():
+    assert len(EXAMPLES) == 2
+    assert all(yaml.safe_load(text)["version"] == 1 for text in EXAMPLES)

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from mvest.cases.rims import commissures, directed, find_rims, match_annulus
+from mvest.errors import GeometryError, InputError
+from mvest.valve.template import Template
+from tests.cases.folders import TIPS
+
+
+def parts(valve):
+    surface = valve.surface
+    return surface.vertices, surface.triangles, surface.region
+
+
+def renumbered(vertices, triangles, region, seed=0):
+    """The same surface with vertices and triangles in another order."""
+    rng = np.random.default_rng(seed)
+    order, rows = rng.permutation(len(vertices)), rng.permutation(len(triangles))
+    place = np.argsort(order)
+    turn = rng.integers(0, 3, len(triangles))
+    columns = (np.arange(3) + turn[:, None]) % 3
+    moved = np.take_along_axis(place[triangles], columns, axis=1)
+    return vertices[order], moved[rows], region[rows]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_loops_are_named_whatever_the_numbering(seed):
+    valve = Template().valve(24, 8)
+    x, t, _ = renumbered(*parts(valve), seed)
+    rims = find_rims(x, t, np.array(TIPS))
+    for name in ("annulus", "free_edge"):
+        ours, theirs = x[getattr(rims, name)], valve.surface.vertices[getattr(valve, name)]
+        assert set(map(tuple, ours)) == set(map(tuple, theirs))
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_annulus_of_another_mesh_is_matched_from_commissure_to_commissure(reverse, seed):
+    ours, other = Template().valve(40, 8), Template().valve(72, 9)
+    annulus = np.roll(ours.annulus[::-1] if reverse else ours.annulus, 7)
+    x, t, r = renumbered(*parts(other), seed)
+    shift = np.array([1.0, -2.0, 3.0])
+    seen = find_rims(x, t, np.array(TIPS)).annulus
+    found = match_annulus(parts(ours), annulus, (x + shift, t, r), np.roll(seen, 5)) - shift
+    # Both polygons are inscribed in one curve of circumference C = 101 mm, whose radius of
+    # curvature R is 11 mm at least: chords of h = C / 40 leave it by h^2 / 8 R < 0.08 mm. An
+    # annulus turned by one vertex would be off by h = 2.5 mm, a mirrored one by centimetres.
+    gap = np.linalg.norm(found - ours.surface.vertices[annulus], axis=1)
+    assert gap.max() < 0.08
+
+
+def test_commissures_are_met_exactly():
+    ours, other = Template().valve(40, 8), Template().valve(72, 9)
+    found = match_annulus(parts(ours), ours.annulus, parts(other), other.annulus)
+    for column in (0, 20):
+        np.testing.assert_array_equal(found[column], ours.surface.vertices[column])
+
+
+def test_leaflets_in_another_order_are_no_match():
+    ours, other = Template().valve(24, 8), Template().valve(24, 8)
+    x, t, _ = parts(other)
+    # Three regions, one after the other in opposite senses.
+    third = np.argmax(np.isin(t % 24, range(0, 24, 8)), axis=1) * 0 + (t.min(axis=1) % 24) // 8
+    loop = directed(ours.annulus, t)
+    three = region_by_column(x, t, 3)
+    assert third.shape == three.shape
+    swapped = np.array([0, 2, 1])[three]
+    assert len(commissures(loop, t, three)) == 3
+    with pytest.raises(InputError, match="regions follow each other as"):
+        match_annulus((x, t, three), ours.annulus, (x, t, swapped), ours.annulus)
+
+
+def region_by_column(x, t, count):
+    """Regions of equal width by the angle of the triangle's centre."""
+    centre = x[t].mean(axis=1)
+    angle = np.mod(np.arctan2(centre[:, 1], centre[:, 0]), 2 * np.pi)
+    return (angle * count / (2 * np.pi)).astype(np.int64)
+
+
+def test_a_region_in_two_parts_has_no_commissures_of_its_own():
+    valve = Template().valve(24, 8)
+    x, t, _ = parts(valve)
+    four = region_by_column(x, t, 4) % 2
+    with pytest.raises(GeometryError, match="each once, in one piece"):
+        commissures(directed(valve.annulus, t), t, four)
+    with pytest.raises(GeometryError, match="one region only"):
+        commissures(directed(valve.annulus, t), t, 0 * four)
