@@ -6,6 +6,7 @@ and every panel can have the same scale.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -110,7 +111,7 @@ def draw_valve(
     width: list[float] = [0.3] * len(triangles)
 
     def add(line: FloatArray, colour: Any, thickness: float) -> None:
-        for start, end in zip(line[:-1], line[1:], strict=True):
+        for start, end in itertools.pairwise(line):
             if np.isfinite(start).all() and np.isfinite(end).all():
                 polygons.append(np.stack([start[:2], end[:2], start[:2]]))
                 depth.append(float(start[2] + end[2]) / 2 + LIFT_MM)

@@ -38,7 +38,7 @@ __all__ = [
     "spread",
 ]
 
-INFORMATION_MAP = "magma"
+INFORMATION_MAP = "YlOrRd"
 HIGH_QUANTILE = 0.99
 
 
@@ -79,7 +79,7 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
         shapes.append(("closed, personalised model", fields.fitted[k], k + 1))
     elif fields.generic is not None:
         shapes.append(("closed, generic model", fields.generic[k], k + 1))
-    figure = Figure(figsize=(3.4 * len(shapes), 6.6), layout="constrained")
+    figure = Figure(figsize=(3.0 * len(shapes), 5.9), layout="constrained")
     grid = figure.subplots(2, len(shapes), squeeze=False, height_ratios=[1.0, 1.15])
     colours = leaflet_colours(fields.region)
     for row, view in enumerate(VIEWS):
@@ -140,11 +140,11 @@ def figure3_caption(fields: CaseFields) -> str:
         raise InputError("Figure 3 needs the distances of the generic and the personalised valve")
     generic, fitted = spread(fields.distance_generic[k]), spread(fields.distance_fitted[k])
     return (
-        f"Closed valve ({fields.frames[k]}), coloured by the distance of each point from where the "
-        f"valve was observed; mean ± standard deviation over {fitted.count} points. Left: generic "
-        f"stiffness, {generic} (largest {generic.largest:.2f} mm). Right: personalised stiffness, "
-        f"{fitted} (largest {fitted.largest:.2f} mm). Both on one colour scale; black line: "
-        "annulus. Grey: not observed."
+        f"The closed valve (frame “{fields.frames[k]}”), coloured by the distance of each point "
+        f"from where the valve was observed; mean ± standard deviation over {fitted.count} points. "
+        f"Left: generic stiffness, {generic} (largest {generic.largest:.2f} mm). Right: "
+        f"personalised stiffness, {fitted} (largest {fitted.largest:.2f} mm). Both on one colour "
+        "scale; black line: annulus. Grey: not observed."
     )
 
 
@@ -173,7 +173,7 @@ def information_figure(fields: CaseFields, found: Sequence[Information]) -> Figu
     figure = Figure(figsize=(max(3.1 * len(found), 4.6), 6.0), layout="constrained")
     grid = figure.subplots(2, len(found), squeeze=False)
     for column, information in enumerate(found):
-        top = max(float(information.raw.max()), 1e-12)
+        top = max(float(np.nanmax(information.raw)), 1e-12)
         scale = ScalarMappable(PowerNorm(0.5, 0.0, top), INFORMATION_MAP)
         for row, field in enumerate((information.raw, information.beyond)):
             axes = grid[row, column]

@@ -22,7 +22,7 @@ from mvest.typing import FloatArray
 
 __all__ = ["Information", "columns_of", "information", "where_words"]
 
-ZONES = ("next to the annulus", "in the belly", "at the free edge")
+ZONES = ("annular third", "belly", "third at the free edge")
 """Thirds of the way from the annulus to the free edge."""
 MODULUS, NUISANCE = "modulus", "nuisance"
 
@@ -35,7 +35,8 @@ class Information:
     ----------
     name, label : str
     raw : ndarray
-        ``(n,)`` Fisher information on the logarithm of the modulus that each vertex adds.
+        ``(n,)`` Fisher information on the logarithm of the modulus that each vertex adds; NaN
+        where the valve was not seen.
     beyond : ndarray
         ``(n,)`` the same after removing what the nuisances explain.
     kept : float
@@ -95,8 +96,8 @@ def information(
             Information(
                 str(parameter["name"]),
                 str(parameter["label"]),
-                (own.reshape(n, 3) ** 2).sum(axis=1),
-                (rest.reshape(n, 3) ** 2).sum(axis=1),
+                np.where(seen, (own.reshape(n, 3) ** 2).sum(axis=1), np.nan),
+                np.where(seen, (rest.reshape(n, 3) ** 2).sum(axis=1), np.nan),
                 float(rest @ own) / raw if raw > 0 else 0.0,
             )
         )
@@ -133,7 +134,7 @@ def where_words(
     fields: CaseFields, field: FloatArray, names: Sequence[str], most: int = 3
 ) -> list[tuple[str, float]]:
     """Parts of the valve that hold most of a field: words and shares, the largest first."""
-    total = float(field.sum())
+    total = float(np.nansum(field))
     if total <= 0:
         return []
     region, zone = fields.vertex_region, _zone(fields)
@@ -141,8 +142,8 @@ def where_words(
     for r in range(int(region.max()) + 1):
         leaflet = f"{names[r]} leaflet" if r < len(names) else f"leaflet {r + 1}"
         for z, place in enumerate(ZONES):
-            share = float(field[(region == r) & (zone == z)].sum()) / total
-            shares.append((f"{leaflet} {place}", share))
+            share = float(np.nansum(field[(region == r) & (zone == z)])) / total
+            shares.append((f"{place} of the {leaflet}", share))
     return sorted(shares, key=lambda part: -part[1])[:most]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from mvest.errors import InputError
 from mvest.reporting.case_fields import CaseFields
@@ -26,6 +27,8 @@ Record = Mapping[str, Any]
 PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
 TWO_SIDED = 1.96
 """Standard deviations within which 95 % of a normal distribution lie."""
+WIDE_RATIO = 30.0
+"""Of the largest objective to the smallest, beyond which its axis is logarithmic."""
 MODELS = (("generic", "0.55"), ("registered", COLOURS[4]), ("personalised", COLOURS[0]))
 
 
@@ -70,9 +73,7 @@ def estimates_figure(record: Record) -> Figure:
     return figure
 
 
-def _intervals(
-    axes: Any, row: int, parameter: Record, without: Record | None, in_sd: bool
-) -> None:
+def _intervals(axes: Any, row: int, parameter: Record, without: Record | None, in_sd: bool) -> None:
     mean, std = parameter.get("prior_mean"), parameter.get("prior_std")
     shift, scale = (mean or 0.0, std or 1.0) if in_sd else (0.0, 1.0)
 
@@ -144,13 +145,13 @@ def iterations_figure(record: Record) -> Figure:
     if objective:
         axes = next(panels)
         axes.plot(np.arange(len(objective)), objective, "o-", color="black", markersize=4)
-        if min(objective) > 0:
+        if 0 < WIDE_RATIO * min(objective) < max(objective):
             axes.set_yscale("log")
         axes.set_ylabel("objective")
         axes.set_title("misfit plus departure from the prior", fontsize=9)
     for axes in figure.axes:
         axes.set_xlabel("iteration")
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.get_legend_handles_labels()[0]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from mvest.errors import InputError, cannot_write
 from mvest.reporting import case_words as words
@@ -40,6 +41,8 @@ __all__ = ["REPORT", "write_case_report"]
 
 REPORT = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
+FULL_WIDTH_INCHES = 8.6
+"""Of a picture as wide as the page; print is equally large in narrower ones."""
 FLAT_SHARE = 0.25
 """A modulus of whose information less than this remains is said to hide behind the nuisances."""
 
@@ -81,8 +84,10 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         except InputError as error:
             missing[name] = f"Not shown: {error}."
             continue
+        _print_dollars(figure)
         paths = save_figure_with(folder / name, figure, note)
-        pictures[name] = embedded(paths[0], text)
+        share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
+        pictures[name] = embedded(paths[0], text) | {"percent": round(100 * share)}
         written += paths
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -110,9 +115,9 @@ def _figures(
         "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary tips.",
         "estimates": "What was believed before the images (grey) and what they add (blue).",
         "identifiability": "Fisher information on the logarithm of each modulus that each observed "
-        "point of the closed valve adds, seen from the atrium. Bright: how the valve closes there "
+        "point of the closed valve adds, seen from the atrium. Dark: how the valve closes there "
         "depends on the modulus. Both pictures of a column have one colour scale, which is finer "
-        "for small values.",
+        "for small values. Grey: not observed.",
         "iterations": "How the filter got there.",
         "innovation": "The innovation (observed minus predicted before the update), each over its "
         "predicted standard deviation. Left: histogram. Right: its quantiles; points on the line "
@@ -194,7 +199,9 @@ def _where(
         if not parts:
             text = "the closed valve does not depend on it at all."
         else:
-            text = "most is learnt from the " + ", ".join(f"{p} ({100 * s:.0f} %)" for p, s in parts)
+            text = "most is learnt from the " + ", ".join(
+                f"{p} ({100 * s:.0f} %)" for p, s in parts
+            )
             text += f". {100 * one.kept:.0f} % of the information remains beyond the nuisances"
             if one.kept < FLAT_SHARE:
                 text += ": what the images show of it could as well be their doing"
@@ -203,6 +210,13 @@ def _where(
             text += "."
         rows.append({"label": one.label, "text": text})
     return rows
+
+
+def _print_dollars(figure: Figure) -> None:
+    """Have text of the record printed as it stands: matplotlib sets dollars as mathematics."""
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and "$" in text.get_text():
+            text.set_parse_math(False)
 
 
 def _observation_std(record: Record) -> float | None:

@@ -1,4 +1,4 @@
-"""The valve of one case to be turned by hand: a plotly scene, its script and what its buttons do."""
+"""The valve of one case to be turned by hand: a plotly scene, its script, and its buttons."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from mvest.reporting.case_drawing import LEAFLET_COLOURS
 from mvest.reporting.case_fields import CaseFields
 from mvest.reporting.case_figures import distance_top
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["CaseView", "case_view"]
+__all__ = ["CaseView", "case_view", "small"]
 
 DECIMALS = 2
 """Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
@@ -28,24 +29,12 @@ SCALE = "Viridis"
 
 PERSONALISED = "closed, personalised"
 
-ORTHOGRAPHIC = {"type": "orthographic"}
 CAMERAS: Mapping[str, Any] = {
-    "oblique": {
-        "eye": {"x": 0.55, "y": -1.20, "z": 1.45},
-        "up": {"x": 0, "y": 0, "z": 1},
-        "projection": ORTHOGRAPHIC,
-    },
-    "from the atrium": {
-        "eye": {"x": 0.0, "y": -0.01, "z": 2.0},
-        "up": {"x": 0, "y": 1, "z": 0},
-        "projection": ORTHOGRAPHIC,
-    },
-    "from the side": {
-        "eye": {"x": 0.95, "y": -1.65, "z": 0.42},
-        "up": {"x": 0, "y": 0, "z": 1},
-        "projection": ORTHOGRAPHIC,
-    },
+    "obliquely": {"eye": {"x": 0.48, "y": -1.04, "z": 1.25}, "up": {"x": 0, "y": 0, "z": 1}},
+    "from the atrium": {"eye": {"x": 0.0, "y": -0.01, "z": 1.75}, "up": {"x": 0, "y": 1, "z": 0}},
+    "from the side": {"eye": {"x": 0.85, "y": -1.50, "z": 0.38}, "up": {"x": 0, "y": 0, "z": 1}},
 }
+"""In perspective: plotly lights no surface from the front in an orthographic scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +85,7 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> CaseView:
         showlegend=False,
         scene={
             "aspectmode": "data",
-            "camera": CAMERAS["oblique"],
+            "camera": CAMERAS["obliquely"],
             "xaxis": axis,
             "yaxis": axis,
             "zaxis": axis,
@@ -133,23 +122,16 @@ def _states(fields: CaseFields, names: Sequence[str]) -> list[tuple[str, list[An
         top = distance_top(*(distance for _, _, distance in known))
         for label, shape, distance in known:
             states.append((f"distance, {label}", _coloured(fields, shape, distance, top)))
-    if fields.fitted is not None and (fields.observed is not None or points is not None):
-        seen = _ghost(fields, fields.observed[k]) if fields.observed is not None else None
-        states.append(
-            (
-                "observed (grey) over personalised",
-                [
-                    *_anatomy(fields, fields.fitted[k], k + 1, names),
-                    seen if seen is not None else _cloud(points),
-                ],
-            )
-        )
+    seen = None if points is None else _cloud(points)
+    if fields.observed is not None:
+        seen = _ghost(fields, fields.observed[k])
+    if fields.fitted is not None and seen is not None:
+        model = _anatomy(fields, fields.fitted[k], k + 1, names)
+        states.append(("observed (grey) over personalised", [*model, seen]))
     return states
 
 
-def _anatomy(
-    fields: CaseFields, points: FloatArray, frame: int, names: Sequence[str]
-) -> list[Any]:
+def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence[str]) -> list[Any]:
     """One mesh for each leaflet, lines, chordae and papillary tips."""
     parts = []
     for r in range(int(fields.region.max()) + 1):
@@ -191,12 +173,12 @@ def _mesh(points: FloatArray, triangles: IntArray, values: FloatArray | None = N
     known = np.isfinite(points[triangles]).all(axis=(1, 2))
     used, corner = np.unique(triangles[known], return_inverse=True)
     i, j, k = corner.reshape(-1, 3).T.astype(np.int32)
-    x, y, z = _small(points[used]).T
+    x, y, z = small(points[used]).T
     mesh = go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, flatshading=False)
     if values is not None:
-        mesh.intensity = _small(values[used])
-    mesh.lighting = {"ambient": 0.55, "diffuse": 0.7, "specular": 0.12, "roughness": 0.7}
-    mesh.lightposition = {"x": -1500, "y": 1500, "z": 4000}
+        mesh.intensity = small(values[used])
+    mesh.lighting = {"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "roughness": 0.6}
+    mesh.lightposition = {"x": -4e4, "y": -4e4, "z": 1e5}
     return mesh
 
 
@@ -204,7 +186,7 @@ def _rings(fields: CaseFields, points: FloatArray) -> list[Any]:
     rings = []
     for loop, width in ((fields.annulus, 6), (fields.free_edge, 2)):
         if len(loop):
-            x, y, z = _small(points[np.append(loop, loop[0])]).T
+            x, y, z = small(points[np.append(loop, loop[0])]).T
             rings.append(_line(x, y, z, LINE, width))
     return rings
 
@@ -215,10 +197,10 @@ def _lines(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
         ends = fields.chords(points, frame)
         # A gap after each chord, so that all of them are one line.
         broken = np.concatenate([ends, np.full((len(ends), 1, 3), np.nan)], axis=1)
-        x, y, z = _small(broken.reshape(-1, 3)).T
+        x, y, z = small(broken.reshape(-1, 3)).T
         lines.append(_line(x, y, z, CHORD, 2))
     if fields.tips.shape[1]:
-        x, y, z = _small(fields.tips[frame]).T
+        x, y, z = small(fields.tips[frame]).T
         marker = {"size": 6, "color": TIP}
         lines.append(
             go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="name",
@@ -233,10 +215,11 @@ def _line(x: Any, y: Any, z: Any, colour: str, width: int) -> Any:
 
 
 def _cloud(points: FloatArray) -> Any:
-    x, y, z = _small(points).T
+    x, y, z = small(points).T
     marker = {"size": 2.2, "color": GHOST}
     return go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, hoverinfo="skip")
 
 
-def _small(values: FloatArray) -> Any:
+def small(values: FloatArray) -> NDArray[np.float32]:
+    """Values as they are stored in a page: rounded, in single precision."""
     return np.round(values, DECIMALS).astype(np.float32)

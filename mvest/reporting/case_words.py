@@ -42,6 +42,7 @@ MODULUS_NAMES = {
 }
 MODULUS_UNIT = "MPa"
 HASH_DIGITS = 12
+NO_BREAK = "\N{NO-BREAK SPACE}"
 DISTANCES = ("generic", "registered", "personalised", "to_truth")
 WHICH = ("observed", "generic", "personalised")
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
@@ -61,10 +62,11 @@ def interval(entry: Record, unit: str) -> str:
     """``5.8 MPa (95 % interval 4.1 to 8.2)``, without what is missing."""
     if entry.get("estimate") is None:
         return "no estimate"
-    text = f"{number(entry['estimate'], 2)} {unit}".rstrip()
+    text = f"{number(entry['estimate'], 2)}{NO_BREAK}{unit}".rstrip()
     if entry.get("low") is None or entry.get("high") is None:
         return text
-    return f"{text} (95 % interval {number(entry['low'], 2)} to {number(entry['high'], 2)})"
+    low, high = number(entry["low"], 2), number(entry["high"], 2)
+    return f"{text} (95{NO_BREAK}% interval {low} to {high})"
 
 
 def answer(record: Record) -> str:

@@ -27,7 +27,7 @@ def closed_shape(m: dict[str, float], late: float = 0.0) -> np.ndarray:
     s, phi = row / (ROWS - 1), 360.0 * column / COLUMNS
     start, edge = rest[column], rest[column + (ROWS - 1) * COLUMNS]
     u = np.clip(edge[:, 0] / 15.5, -1, 1)
-    side = np.where(phi < 180, 0.7, -0.7) * np.sqrt(1 - 0.98 * u**2)
+    side = np.where(phi < 180, 0.3, -0.3) * np.sqrt(1 - 0.98 * u**2)
     drop = -10.5 - 3.0 * u**2 - 60.0 * m["chord_slack"] * (1 - u**2)
     end = np.stack([13.5 * u, 1.8 - 6.5 * (1 - u**2) + side, drop], axis=1)
     middle = end * [1, 1, 0] + np.stack([0 * u, 0 * u, -3.0 - 1.5 * u**2], axis=1)
@@ -68,7 +68,7 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "seen": np.array([True, False]),
         "observed": observed,
         "generic": generic,
-        "registered": generic + [0.0, 0.1, 0.2],
+        "registered": generic + np.array([0.0, 0.1, 0.2]),
         "fitted": fitted,
         "truth": truth,
         "distance_generic": np.linalg.norm(generic - observed, axis=2),
@@ -193,8 +193,16 @@ def _record(fields: dict[str, np.ndarray]) -> dict[str, Any]:
             "observation_std_mm": NOISE_MM,
         },
         "narrow": [
-            {"what": "E_f anterior, if the pressure were known", "std_now": 0.8, "std_if_known": 0.71},
-            {"what": "E_f anterior, if the chordae were known", "std_now": 0.8, "std_if_known": 0.5},
+            {
+                "what": "E_f anterior, if the pressure were known",
+                "std_now": 0.8,
+                "std_if_known": 0.71,
+            },
+            {
+                "what": "E_f anterior, if the chordae were known",
+                "std_now": 0.8,
+                "std_if_known": 0.5,
+            },
         ],
         "measurements": {
             "open": {"observed": shape | {"annulus_area_mm2": 801.0}},
