@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.special import ndtri
 
 from mvest.errors import InputError
 from mvest.reporting.case_fields import CaseFields
@@ -175,7 +176,7 @@ def innovation_figure(fields: CaseFields) -> Figure:
     left.set_xlabel("innovation over its predicted SD")
     left.set_ylabel("share per SD")
     left.legend(frameon=False, fontsize=8)
-    expected = _normal_quantiles(len(values))
+    expected = ndtri((np.arange(len(values)) + 0.5) / len(values))
     step = max(len(values) // 2000, 1)
     right.plot(expected[::step], values[::step], ".", color=COLOURS[0], markersize=3)
     right.axline((0, 0), slope=1, color="black", linewidth=1)
@@ -185,12 +186,6 @@ def innovation_figure(fields: CaseFields) -> Figure:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
     return figure
-
-
-def _normal_quantiles(count: int) -> Any:
-    from scipy.stats import norm
-
-    return norm.ppf((np.arange(count) + 0.5) / count)
 
 
 def distances_figure(distances: Sequence[Record]) -> Figure:
