@@ -190,8 +190,9 @@ def same_scale(panels: Sequence[Any], shapes: Sequence[FloatArray], view: View) 
     margin = 0.09 * float((high - low).max())
     for axes in panels:
         axes.set_xlim(low[0] - margin, high[0] + margin)
-        axes.set_ylim(low[1] - margin, high[1] + margin)
-    x, y = low[0] - 0.5 * margin, low[1] - 0.6 * margin
+        axes.set_ylim(low[1] - 1.8 * margin, high[1] + margin)
+    # Below everything else, where no leaflet's name is written.
+    x, y = low[0] - 0.5 * margin, low[1] - 1.6 * margin
     panels[0].plot([x, x + SCALE_MM], [y, y], color="black", linewidth=2, solid_capstyle="butt")
     panels[0].text(
         x + SCALE_MM / 2, y + 0.15 * margin, f"{SCALE_MM:.0f} mm", fontsize=8, ha="center"

@@ -95,8 +95,14 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     return figure
 
 
-def case_figure(fields: CaseFields) -> Figure:
+def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
     """The closed valve coloured by pointwise distance: generic beside personalised, on one scale.
+
+    Parameters
+    ----------
+    fields : CaseFields
+    names : sequence of str
+        Of the leaflets, written beside them.
 
     Raises
     ------
@@ -123,6 +129,7 @@ def case_figure(fields: CaseFields) -> Figure:
             draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
             if row == 0:
                 axes.set_title(f"{title}\n{spread(distance)}", fontsize=11)
+                name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
         _say_view(grid[row, 0], view.name)
     beyond = any(np.nanmax(distance) > top for _, _, distance in panels)

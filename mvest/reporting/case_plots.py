@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy.special import ndtri
 
 from mvest.errors import InputError
 from mvest.reporting.case_fields import CaseFields
@@ -29,7 +30,12 @@ TWO_SIDED = 1.96
 """Standard deviations within which 95 % of a normal distribution lie."""
 WIDE_RATIO = 30.0
 """Of the largest objective to the smallest, beyond which its axis is logarithmic."""
-MODELS = (("generic", "0.55"), ("registered", COLOURS[4]), ("personalised", COLOURS[0]))
+MODELS = (
+    ("generic", "generic", "0.55"),
+    ("registered", "generic, moved rigidly", COLOURS[4]),
+    ("personalised", "personalised", COLOURS[0]),
+)
+"""Name in the record, in the legend, and colour."""
 
 
 def estimates_figure(record: Record) -> Figure:
@@ -89,7 +95,8 @@ def _intervals(axes: Any, row: int, parameter: Record, without: Record | None, i
         (without, WITHOUT, 0.17, "s", "estimate if the nuisances were taken as known"),
     )
     for source, colour, offset, marker, label in shown:
-        if source is None or source.get("estimate") is None:
+        # What is only considered stays as it was believed to be.
+        if not source or source.get("estimate") is None or source["treatment"] == "considered":
             continue
         if source.get("low") is not None and source.get("high") is not None:
             axes.plot(place(source["low"], source["high"]), [row + offset] * 2, color=colour,
@@ -175,7 +182,7 @@ def innovation_figure(fields: CaseFields) -> Figure:
     left.set_xlabel("innovation over its predicted SD")
     left.set_ylabel("share per SD")
     left.legend(frameon=False, fontsize=8)
-    expected = _normal_quantiles(len(values))
+    expected = ndtri((np.arange(len(values)) + 0.5) / len(values))
     step = max(len(values) // 2000, 1)
     right.plot(expected[::step], values[::step], ".", color=COLOURS[0], markersize=3)
     right.axline((0, 0), slope=1, color="black", linewidth=1)
@@ -187,26 +194,20 @@ def innovation_figure(fields: CaseFields) -> Figure:
     return figure
 
 
-def _normal_quantiles(count: int) -> Any:
-    from scipy.stats import norm
-
-    return norm.ppf((np.arange(count) + 0.5) / count)
-
-
 def distances_figure(distances: Sequence[Record]) -> Figure:
     """Mean distance from the observed valve, frame by frame, of each model; bars end at + 1 SD."""
-    known = [(name, colour) for name, colour in MODELS if any(d.get(name) for d in distances)]
+    known = [model for model in MODELS if any(d.get(model[0]) for d in distances)]
     if not known:
         raise InputError("no frame has a distance to draw")
-    figure = Figure(figsize=(max(1.9 * len(distances) + 2.6, 5.2), 3.4), layout="constrained")
+    figure = Figure(figsize=(max(1.9 * len(distances) + 3.4, 5.8), 3.4), layout="constrained")
     axes = figure.subplots()
     width = 0.8 / len(known)
-    for k, (name, colour) in enumerate(known):
+    for k, (name, label, colour) in enumerate(known):
         at = [i for i, d in enumerate(distances) if d.get(name)]
         x = np.array(at) + (k - (len(known) - 1) / 2) * width
         mean = np.array([distances[i][name]["mean"] for i in at])
         spread = np.array([distances[i][name]["std"] for i in at])
-        axes.bar(x, mean, 0.92 * width, color=colour, label=name)
+        axes.bar(x, mean, 0.92 * width, color=colour, label=label)
         axes.errorbar(x, mean, yerr=[np.zeros_like(spread), spread], fmt="none", ecolor="0.2",
                       elinewidth=1, capsize=2)  # fmt: skip
         for place, value, top in zip(x, mean, mean + spread, strict=True):

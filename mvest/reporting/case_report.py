@@ -174,7 +174,8 @@ def _content(
         "moduli": words.moduli_rows(record),
         "parameters": words.parameter_rows(record),
         "has_without": bool((record.get("without_nuisances") or {}).get("parameters")),
-        "has_truth": any(m.get("truth") is not None for m in record.get("moduli") or []),
+        "has_truth": bool(case.get("simulated"))
+        and any(m.get("truth") is not None for m in record.get("moduli") or []),
         "where": _where(shapes, names, found),
         "identifiability": words.identifiability_words(record),
         "shares": words.share_rows(record),
@@ -199,14 +200,14 @@ def _where(
         if not parts:
             text = "the closed valve does not depend on it at all."
         else:
-            text = "most is learnt from the " + ", ".join(
-                f"{p} ({100 * s:.0f} %)" for p, s in parts
-            )
-            text += f". {100 * one.kept:.0f} % of the information remains beyond the nuisances"
+            told = ", ".join(f"{place} ({words.percent(share)})" for place, share in parts)
+            text = f"learnt mostly from the {told}. "
+            text += f"{words.percent(one.kept)} of the information remains beyond the nuisances"
             if one.kept < FLAT_SHARE:
                 text += ": what the images show of it could as well be their doing"
             elif beyond := where_words(shapes, one.beyond, names, 1):
-                text += f", most of it from the {beyond[0][0]} ({100 * beyond[0][1]:.0f} %)"
+                place, share = beyond[0]
+                text += f", the largest part of it in the {place} ({words.percent(share)})"
             text += "."
         rows.append({"label": one.label, "text": text})
     return rows

@@ -157,9 +157,12 @@ def _coloured(
         colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
         hovertemplate="%{intensity:.2f} mm<extra></extra>",
     )
-    unseen = _mesh(points, fields.triangles[~known])
-    unseen.update(color=UNOBSERVED, hoverinfo="skip")
-    return [mesh, unseen, *_rings(fields, points)]
+    parts = [mesh, *_rings(fields, points)]
+    if not known.all():
+        unseen = _mesh(points, fields.triangles[~known])
+        unseen.update(color=UNOBSERVED, hoverinfo="skip")
+        parts.append(unseen)
+    return parts
 
 
 def _ghost(fields: CaseFields, points: FloatArray) -> Any:

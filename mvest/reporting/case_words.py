@@ -25,6 +25,7 @@ __all__ = [
     "moduli_rows",
     "narrow_words",
     "parameter_rows",
+    "percent",
     "provenance_note",
     "provenance_rows",
     "setting_rows",
@@ -90,6 +91,11 @@ def badges(record: Record) -> list[str]:
     if "tricuspid" in told and not any("TRICUSPID" in text.upper() for text in found):
         found.append("DONOR TRICUSPID" if "donor" in told else "TRICUSPID")
     return [*found, "NOT FOR DIAGNOSIS"]
+
+
+def percent(share: float) -> str:
+    """A share as ``38 %`` that no line breaks."""
+    return f"{100 * share:.0f}{NO_BREAK}%"
 
 
 def moduli_rows(record: Record) -> Rows:
@@ -193,8 +199,8 @@ def distance_words(record: Record) -> str:
         before, after = d["generic"]["mean"], d["personalised"]["mean"]
         verdict = "nearer than" if after < before else "NOT nearer than"
         parts.append(
-            f"{d['frame']}: {after:.2f} mm on average with the personalised stiffness, {verdict} "
-            f"{before:.2f} mm with the generic one"
+            f"{d['frame']}: the personalised valve is {after:.2f} mm away on average, {verdict} "
+            f"the generic one ({before:.2f} mm)"
         )
     return "In frames that the filter was not shown: " + "; ".join(parts) + "."
 
@@ -249,16 +255,16 @@ def innovation_words(record: Record) -> list[str]:
     words = []
     if found.get("rms") is not None:
         words.append(
-            f"Root mean square of the {number(found.get('size'))} standardised innovations: "
+            f"Root mean square of the {_large(found.get('size'))} standardised innovations: "
             f"{number(found['rms'])}; 1 is expected where model and noise are as assumed."
         )
     band = found.get("nis_band")
     if found.get("nis") is not None and band:
         inside = band[0] <= found["nis"] <= band[1]
         words.append(
-            f"Normalised innovation squared {number(found['nis'])}, "
+            f"Normalised innovation squared {_large(found['nis'])}, "
             + ("inside" if inside else "OUTSIDE")
-            + f" its 95 % band {number(band[0])} to {number(band[1])}."
+            + f" its 95 % band {_large(band[0])} to {_large(band[1])}."
         )
     return words
 
@@ -279,12 +285,12 @@ def whiteness_rows(record: Record) -> Rows:
 def narrow_words(narrow: Sequence[Record]) -> str:
     """Which knowledge would narrow an interval most."""
     best = min(narrow, key=lambda r: r["std_if_known"] / r["std_now"])
-    share = 100 * (1 - best["std_if_known"] / best["std_now"])
-    if share < 1:
+    share = 1 - best["std_if_known"] / best["std_now"]
+    if share < 0.01:
         return "Knowing any one of these exactly would narrow the interval by less than 1 %."
     return (
-        f"Most would be gained by knowing this: {best['what']}. The standard deviation would fall "
-        f"by {share:.0f} %, from {number(best['std_now'])} to {number(best['std_if_known'])}."
+        f"Most would be gained here: {best['what']}. The standard deviation would fall by "
+        f"{percent(share)}, from {number(best['std_now'])} to {number(best['std_if_known'])}."
     )
 
 
@@ -300,9 +306,15 @@ def measurement_rows(record: Record) -> Rows:
     names = dict.fromkeys(name for _, _, values in columns for name in values)
     return [
         {"measurement": _measurement_label(name)}
-        | {f"{frame}, {which}": number(values.get(name)) for frame, which, values in columns}
+        | {f"{frame}, {which}": _large(values.get(name)) for frame, which, values in columns}
         for name in names
     ]
+
+
+def _large(value: Any) -> str:
+    """A number whose thousands are written out."""
+    whole = isinstance(value, int | float) and 1e4 <= abs(value) < 1e7
+    return f"{value:.0f}" if whole else number(value)
 
 
 def _measurement_label(name: str) -> str:

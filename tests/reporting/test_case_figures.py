@@ -278,8 +278,8 @@ def test_intervals_are_where_the_record_has_them(case) -> None:
 def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
     axes = estimates_figure(case[0]).axes[1]
     dots = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
-    # Slack 0.026 over 0.02; the pressure stays where it was believed to be.
-    assert dots == pytest.approx([1.3, 0.0])
+    # Slack 0.026 over 0.02; the pressure is only considered and has no estimate.
+    assert dots == pytest.approx([1.3])
 
 
 def test_iterations_that_fit_no_parameters_are_refused(case) -> None:
