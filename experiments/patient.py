@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock
-from mvest.valve.variation import vary
 
 from experiments.blind import estimate_blindly
 from experiments.build import mechanics_of, template_of
@@ -24,6 +23,7 @@ from mvest.provenance import write_json
 from mvest.reporting.case_report import write_case_report
 from mvest.typing import FloatArray
 from mvest.valve.template import Template
+from mvest.valve.variation import vary
 from mvest.virtual_patient import Deviations, Hidden, Simulation, draw_hidden, simulate_patient
 
 __all__ = ["PatientPlace", "make_patient", "reveal", "run_patient"]
