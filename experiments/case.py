@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy import sparse
 
 from experiments.build import mechanics_of
 from experiments.mirror import build
 from experiments.progress import SolveBar
 from experiments.record import make_record
-from mvest.cases.case import Role, ValveCase
+from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError
 from mvest.estimation import moran, zero_mean
@@ -27,9 +28,12 @@ from mvest.personalise import (
     PersonaliseSettings,
     Treatment,
     Unknown,
+    build_model,
     personalise,
 )
+from mvest.reporting.case_frames import frame_fields, frames_figure
 from mvest.reporting.case_report import write_case_report
+from mvest.reporting.figures import save_figure_with
 from mvest.study import StudyResult
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.clinical import clinical_measurements
@@ -37,6 +41,7 @@ from mvest.valve.proximity import surface_edges
 
 __all__ = [
     "case_record",
+    "check_case",
     "estimate_case",
     "of_all_unknowns",
     "read_configured",
@@ -97,6 +102,64 @@ def read_configured(config: Values) -> ValveCase:
             "mvest/cases/README.md says what it holds"
         )
     return read_case(Path(config["case"]))
+
+
+def check_case(config: Values, folder: Path) -> str:
+    """Read, check and draw a case without simulating anything: what to tell the user.
+
+    Raises
+    ------
+    MvestError
+        If the study has no case, or the case is not in order.
+    """
+    if config["study"] != "case":
+        raise ConfigurationError(
+            f"check=true checks a case folder; experiment {config['name']} has none: expected "
+            "experiment=own_valve"
+        )
+    case = read_configured(config)
+    settings = settings_of(config)
+    model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")
+    files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
+    surface = case.surface
+    lines = [
+        f"{case.name}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles, "
+        f"leaflets {', '.join(surface.region_names)}; {len(case.chordae)} chordae from "
+        f"{len(case.frame(Role.REFERENCE).papillary_tips)} papillary tips",
+        *(f"  {_told(frame)}" for frame in case.frames),
+        *(f"  derived: {sentence}" for sentence in case.derived),
+        f"  mesh: {len(model.mesh.nodes)} nodes, {len(model.mesh.elements)} "
+        f"{model.mesh.element_type}",
+        f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
+        f"In order; drawn in {files[0]}",
+    ]
+    return "\n".join(lines)
+
+
+def _drawn(case: ValveCase) -> Figure:
+    chordae = case.chordae
+    shapes = {
+        f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg": (
+            frame_fields(
+                frame.vertices,
+                frame.triangles,
+                frame.region,
+                frame.annulus,
+                frame.papillary_tips,
+                *((chordae.tip, chordae.insertion) if frame.role is Role.REFERENCE else ()),
+            )
+        )
+        for frame in case.frames
+    }
+    return frames_figure(shapes, case.surface.region_names)
+
+
+def _told(frame: Frame) -> str:
+    same = "same vertices as the reference" if frame.corresponds else "without correspondence"
+    return (
+        f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
+        f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices, {same}"
+    )
 
 
 def run_case(

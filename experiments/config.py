@@ -34,6 +34,7 @@ NOT_THE_RESULT = (
     "dry_run",
     "time_limit_s",
     "isolate",
+    "check",
 )
 """Parts of a configuration that change no number of the result, left out of its hash."""
 

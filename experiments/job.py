@@ -10,7 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from experiments.case import run_case
+from experiments.case import check_case, run_case
 from experiments.config import register
 from experiments.donor import run_donor
 from experiments.folder import (
@@ -71,6 +71,9 @@ def run_job(config: DictConfig) -> None:
     study = require_study(values)
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
+    if values["check"]:
+        print(check_case(values, folder))
+        return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
         record = run_apart(request)

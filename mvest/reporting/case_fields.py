@@ -17,7 +17,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["CaseFields", "read_case_fields"]
+__all__ = ["CaseFields", "read_case_fields", "turned"]
 
 POINTS = "observed_points_"
 SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
@@ -136,7 +136,7 @@ def read_case_fields(path: Path) -> CaseFields:
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
-        return _turned(_fields(arrays, points))
+        return turned(_fields(arrays, points))
     except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: no fields of a case ({error})") from error
 
@@ -184,7 +184,7 @@ def _check(name: str, array: FloatArray | None, shape: tuple[int | None, ...]) -
         raise InputError(f"{name} has the shape {array.shape}, expected {shape}")
 
 
-def _turned(fields: CaseFields) -> CaseFields:
+def turned(fields: CaseFields) -> CaseFields:
     """The same valve about the middle of its annulus, its plane horizontal, its tips below."""
     ring = fields.rest[fields.annulus]
     middle = ring.mean(axis=0)
