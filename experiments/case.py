@@ -31,6 +31,7 @@ from mvest.personalise import (
     build_model,
     personalise,
 )
+from mvest.reporting.case_fields import turn_of
 from mvest.reporting.case_frames import frame_fields, frames_figure
 from mvest.reporting.case_report import write_case_report
 from mvest.reporting.figures import save_figure_with
@@ -137,20 +138,22 @@ def check_case(config: Values, folder: Path) -> str:
 
 
 def _drawn(case: ValveCase) -> Figure:
-    chordae = case.chordae
-    shapes = {
-        f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg": (
-            frame_fields(
-                frame.vertices,
-                frame.triangles,
-                frame.region,
-                frame.annulus,
-                frame.papillary_tips,
-                *((chordae.tip, chordae.insertion) if frame.role is Role.REFERENCE else ()),
-            )
+    surface, chordae = case.surface, case.chordae
+    tips = case.frame(Role.REFERENCE).papillary_tips
+    middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
+    shapes = {}
+    for frame in case.frames:
+        at_rest = frame.role is Role.REFERENCE
+        title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
+        shapes[title] = frame_fields(
+            (frame.vertices - middle) @ axes,
+            frame.triangles,
+            frame.region,
+            (frame.annulus - middle) @ axes,
+            (frame.papillary_tips - middle) @ axes,
+            chordae.tip if at_rest else None,
+            (chordae.insertion - middle) @ axes if at_rest else None,
         )
-        for frame in case.frames
-    }
     return frames_figure(shapes, case.surface.region_names)
 
 

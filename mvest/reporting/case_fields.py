@@ -17,7 +17,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["CaseFields", "read_case_fields", "turned"]
+__all__ = ["CaseFields", "read_case_fields", "turn_of"]
 
 POINTS = "observed_points_"
 SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
@@ -136,7 +136,7 @@ def read_case_fields(path: Path) -> CaseFields:
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
-        return turned(_fields(arrays, points))
+        return _turned(_fields(arrays, points))
     except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: no fields of a case ({error})") from error
 
@@ -184,20 +184,31 @@ def _check(name: str, array: FloatArray | None, shape: tuple[int | None, ...]) -
         raise InputError(f"{name} has the shape {array.shape}, expected {shape}")
 
 
-def turned(fields: CaseFields) -> CaseFields:
-    """The same valve about the middle of its annulus, its plane horizontal, its tips below."""
-    ring = fields.rest[fields.annulus]
+def turn_of(
+    rest: FloatArray, annulus: IntArray, triangles: IntArray, region: IntArray, tips: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Middle ``(3,)`` and axes ``(3, 3)`` of a valve: annulus horizontal, tips below.
+
+    The first leaflet lies towards positive y; ``(points - middle) @ axes`` turns.
+    """
+    ring = rest[annulus]
     middle = ring.mean(axis=0)
     up = np.linalg.svd(ring - middle, full_matrices=False)[2][2]
-    below = fields.tips[0] if fields.tips.shape[1] else fields.rest
+    below = tips if len(tips) else rest
     if (below.mean(axis=0) - middle) @ up > 0:
         up = -up
-    first = np.unique(fields.triangles[fields.region == fields.region.min()])
-    front = fields.rest[first].mean(axis=0) - middle
+    first = np.unique(triangles[region == region.min()])
+    front = rest[first].mean(axis=0) - middle
     front -= (front @ up) * up
     front /= np.linalg.norm(front)
-    axes = np.stack([np.cross(front, up), front, up], axis=1)
+    return middle, np.stack([np.cross(front, up), front, up], axis=1)
 
+
+def _turned(fields: CaseFields) -> CaseFields:
+    """The same valve about the middle of its annulus."""
+    middle, axes = turn_of(
+        fields.rest, fields.annulus, fields.triangles, fields.region, fields.tips[0]
+    )
     shapes: dict[str, Any] = {
         name: (array - middle) @ axes
         for name in SHAPES

@@ -15,7 +15,7 @@ from mvest.reporting.case_drawing import (
     name_leaflets,
     same_scale,
 )
-from mvest.reporting.case_fields import CaseFields, turned
+from mvest.reporting.case_fields import CaseFields
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.surface_coordinates import boundary_loops
 
@@ -31,7 +31,7 @@ def frame_fields(
     chord_tip: IntArray | None = None,
     chord_insertion: FloatArray | None = None,
 ) -> CaseFields:
-    """One frame by itself, turned with its annulus horizontal and its tips below.
+    """One frame by itself.
 
     Parameters
     ----------
@@ -47,20 +47,18 @@ def frame_fields(
     else:
         gaps = np.linalg.norm(chord_insertion[:, None] - vertices[None], axis=2)
         insertion = gaps.argmin(axis=1)
-    return turned(
-        CaseFields(
-            triangles,
-            region,
-            vertices,
-            loops[0],
-            loops[-1],
-            ("frame",),
-            np.array([True]),
-            np.stack([tips, tips]),
-            chord_tip,
-            insertion,
-            {},
-        )
+    return CaseFields(
+        triangles,
+        region,
+        vertices,
+        loops[0],
+        loops[-1],
+        ("frame",),
+        np.array([True]),
+        np.stack([tips, tips]),
+        chord_tip,
+        insertion,
+        {},
     )
 
 
