@@ -8,6 +8,7 @@ the start, and the fitted closure is nearer to the recording than the one with g
 from __future__ import annotations
 
 import hashlib
+import resource
 import time
 from collections.abc import Mapping
 from copy import copy
@@ -27,6 +28,7 @@ from mvest.model import ClosureModel
 from mvest.reporting.donor import donor_figure
 from mvest.reporting.figures import save_figure
 from mvest.study import Case, Observation, StudyResult, estimate
+from mvest.surface_observation import mean_surface_distance
 from mvest.typing import FloatArray
 from mvest.valve.donor import DonorRecording, read_donor
 from mvest.valve.donor_file import CITATION, donor_file
@@ -262,6 +264,7 @@ def run_donor(
         "summary": _summary(study, rows, results),
         "forward_solves": sum(row["forward_solves"] for row in rows),
         "seconds": sum(row["seconds"] for row in rows),
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }
     failed = [row for row in rows if row["status"] != "converged"]
     if failed:
@@ -335,7 +338,11 @@ def _closed(prediction: Prediction) -> FloatArray:
 
 
 def _distances(study: DonorStudy, closed: FloatArray) -> dict[str, float]:
-    """Distances (mm) of the vertices from where they were recorded, in numbers."""
+    """Distances (mm) from the recording, in numbers.
+
+    Of the vertices from where they were recorded, but for ``surface``: the mean distance of the
+    whole closed surface from the recorded one, both ways, whatever its points are.
+    """
     d = np.linalg.norm(closed - study.observation.positions[-1], axis=1)
     surface = study.coarse.surface
     leaflets = {
@@ -347,6 +354,12 @@ def _distances(study: DonorStudy, closed: FloatArray) -> dict[str, float]:
         "median": float(np.median(d)),
         "rms": float(np.sqrt(np.mean(d**2))),
         "max": float(d.max()),
+        "surface": mean_surface_distance(
+            closed,
+            surface.triangles,
+            study.recording.frames[-1],
+            study.recording.surface.triangles,
+        ),
         **leaflets,
     }
 
@@ -405,5 +418,8 @@ def _summary(
         "recorded_motion_mm": float(motion.mean()),
         "generic_mean_mm": means[0],
         "fitted_mean_mm": means[1],
+        "closer_percent": None if None in means else 100.0 * (means[0] - means[1]) / means[0],  # type: ignore[operator]
+        "generic_surface_mm": None if generic is None else generic["surface"],
+        "fitted_surface_mm": None if fitted is None else fitted["surface"],
         "closer_than_generic": None if None in means else bool(means[1] < means[0]),  # type: ignore[operator]
     }

@@ -113,7 +113,7 @@ def _frame(record: Record) -> pd.DataFrame:
                 for name, value in zip(record["parameters"], values, strict=True)
             }
         distance = row["distance_mm"] or {}
-        for part in ("mean", "median", "rms", "max", *record["regions"]):
+        for part in ("mean", "median", "rms", "max", "surface", *record["regions"]):
             plain[f"distance {part} [mm]"] = distance.get(part)
         for key in ("iterations", "forward_solves", "equilibria", "seconds", "reason"):
             plain[key.replace("_", " ")] = row[key]
@@ -131,6 +131,7 @@ def _readable(record: Record) -> str:
         "median [mm]",
         "rms [mm]",
         "max [mm]",
+        "surface [mm]",
         "forward solves",
         "equilibria",
         "time [s]",
@@ -146,7 +147,7 @@ def _readable(record: Record) -> str:
             for v, s in zip(values, std, strict=True)
         ]
         distance = row["distance_mm"] or {}
-        for part in ("mean", "median", "rms", "max"):
+        for part in ("mean", "median", "rms", "max", "surface"):
             cells.append(f"{distance[part]:.2f}" if part in distance else MISSING)
         cells += [
             str(row["forward_solves"]),
@@ -171,8 +172,12 @@ def _readable(record: Record) -> str:
         verdict = "nearer to" if summary["closer_than_generic"] else "NOT nearer to"
         facts.append(
             f"The fitted closure is {verdict} the recording than the generic one: mean distance "
-            f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm."
+            f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm "
+            f"({summary['closer_percent']:.0f} % less) of the vertices from where they were "
+            f"recorded, {summary['generic_surface_mm']:.2f} → {summary['fitted_surface_mm']:.2f} mm "
+            "of the whole surface from the recorded one, both ways."
         )
+    facts.append(f"{record['seconds']:.0f} s and {record['memory_mb']:.0f} MB.")
     bound = (record["identifiability"] or {}).get("cramer_rao_std")
     if bound:
         alone = ", ".join(MISSING if v is None else f"{v:.2g}" for v in bound)
