@@ -174,8 +174,9 @@ def _readable(record: Record) -> str:
             f"The fitted closure is {verdict} the recording than the generic one: mean distance "
             f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm "
             f"({summary['closer_percent']:.0f} % less) of the vertices from where they were "
-            f"recorded, {summary['generic_surface_mm']:.2f} → {summary['fitted_surface_mm']:.2f} mm "
-            "of the whole surface from the recorded one, both ways."
+            f"recorded, {summary['generic_surface_mm']:.2f} → "
+            f"{summary['fitted_surface_mm']:.2f} mm of the whole surface from the recorded one, "
+            "both ways."
         )
     facts.append(f"{record['seconds']:.0f} s and {record['memory_mb']:.0f} MB.")
     bound = (record["identifiability"] or {}).get("cramer_rao_std")
