@@ -277,6 +277,7 @@ def of_all_unknowns(record: Values) -> dict[str, Any]:
     return {
         **record,
         **record["unknown_iterates"],
+        "title": record["case"]["description"] or record["case"]["name"],
         "parameters": record["unknowns"],
         "distances": distances,
     }

@@ -407,7 +407,7 @@ def estimate(
         bound = identifiability(
             filtered.prediction.jacobian,
             R,
-            np.abs(filtered.mean),
+            np.maximum(np.abs(filtered.mean), case.prior.std),
             names=case.parameters,
         )
     return StudyResult(

@@ -102,6 +102,8 @@ class Simulation:
     std_mm, correlation_length_mm : float
         Error of each coordinate of each vertex in each frame but the first, and over which distance
         it is alike. Frames are independent.
+    rest_std_mm : float
+        Error of the open shape from which an estimator takes its model; 0: it is seen exactly.
     held_pressure_mmHg : tuple of float
         In the frames that are held out, one after another.
     held_relaxation : tuple of float
@@ -120,6 +122,7 @@ class Simulation:
     seen_rows: int = 21
     std_mm: float = 0.6
     correlation_length_mm: float = 10.0
+    rest_std_mm: float = 0.0
     held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
     held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
@@ -257,6 +260,11 @@ def _case(
     correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
     error = CorrelatedNoise(simulation.std_mm, correlation)
     moved = np.stack(list(true.values()))
+    seen_later = error(moved, moved, rng)
+    if simulation.rest_std_mm:
+        rest_error = CorrelatedNoise(simulation.rest_std_mm, correlation)
+        exact = surface.vertices[None]
+        surface = replace(surface, vertices=rest_error(exact, exact, rng)[0])
     motion = seen.motion
     closed = HeldState(
         mechanics.protocol.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1]
@@ -278,7 +286,7 @@ def _case(
             True,
         )
 
-    rest = HeldState(0.0, motion.annulus[0], seen.papillary_tips)
+    rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips)
     end = mechanics.protocol.ramp
     later = [
         frame(
@@ -288,7 +296,7 @@ def _case(
             states[which],
             vertices,
         )
-        for k, (which, vertices) in enumerate(zip(true, error(moved, moved, rng), strict=True))
+        for k, (which, vertices) in enumerate(zip(true, seen_later, strict=True))
     ]
     return ValveCase(
         name=name,
