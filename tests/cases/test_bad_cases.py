@@ -184,7 +184,7 @@ def labels_as_text(content):
         text = (folder / "open.vtp").read_text()
         start = text.rindex("<", 0, text.index('Name="region"'))
         end = text.index("</DataArray>", start)
-        array = f'<DataArray type="Int64" Name="region" format="ascii">{content}'
+        array = f'<DataArray type="Float64" Name="region" format="ascii">{content}'
         (folder / "open.vtp").write_text(text[:start] + array + text[end:])
 
     return change
