@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mvest.cases.schema import LARGEST_NUMBER
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
@@ -55,8 +56,11 @@ def numbers(file: Path, name: str, cells: Sequence[str]) -> FloatArray:
             value = float(cell)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
-            raise InputError(f"{file}: {name} of row {row} is {cell!r}, expected a finite number")
+        if not abs(value) <= LARGEST_NUMBER:
+            raise InputError(
+                f"{file}: {name} of row {row} is {cell[:40]!r}, expected a finite number "
+                f"(at most {LARGEST_NUMBER:g})"
+            )
         result.append(value)
     return np.array(result, dtype=np.float64)
 
@@ -65,7 +69,7 @@ def indices(file: Path, name: str, cells: Sequence[str]) -> IntArray:
     """A column as numbers from 0."""
     for row, cell in enumerate(cells):
         if not (cell.isascii() and cell.isdigit() and len(cell) < 10):
-            raise InputError(f"{file}: {name} of row {row} is {cell!r}, expected 0, 1, 2, ...")
+            raise InputError(f"{file}: {name} of row {row} is {cell[:40]!r}, expected 0, 1, 2, ...")
     return np.array([int(cell) for cell in cells], dtype=np.int64)
 
 

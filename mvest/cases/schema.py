@@ -17,6 +17,7 @@ from mvest.cases.yaml_file import read_yaml
 from mvest.errors import InputError
 
 __all__ = [
+    "LARGEST_NUMBER",
     "VERSION",
     "CaseFile",
     "ChordaeEntry",
@@ -31,6 +32,10 @@ __all__ = [
 
 VERSION = 1
 """The version of the format that is read and written."""
+LARGEST_NUMBER = 1e9
+"""Of any number in a case, whatever its unit: far beyond sense, and far from overflow."""
+LONGEST_FAULT = 800
+"""Characters; what other libraries say of a damaged file may quote much of it."""
 
 
 def _kind(value: Any) -> str:
@@ -44,7 +49,10 @@ def _kind(value: Any) -> str:
     return "<text>" if isinstance(value, str) else "<number>"
 
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Number = Annotated[
+    float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)
+]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST_NUMBER)]
 Text = Annotated[str, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, min_length=1)]
 Index = Annotated[int, Field(strict=True, ge=0)]
@@ -129,8 +137,8 @@ class ObservationEntry(_Model):
     """How well the vertices of a frame are seen."""
 
     std_mm: Number = Field(gt=0, description="standard deviation of a coordinate in mm, > 0")
-    correlation_length_mm: Number = Field(
-        ge=0, description="mm along the leaflets over which errors are alike, >= 0"
+    correlation_length_mm: NotNegative = Field(
+        description="mm along the leaflets over which errors are alike, >= 0"
     )
 
 
@@ -196,8 +204,9 @@ def case_schema() -> dict[str, Any]:
 
 
 def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
-    """The error for one field of a case: file, field, and what is wrong with it."""
-    return kind(f"{file}: {field}: {what}")
+    """The error for one field of a case: file, field, and what is wrong with it, in one line."""
+    line = " ".join(what.split())
+    return kind(f"{file}: {field}: {line if len(line) <= LONGEST_FAULT else line[:LONGEST_FAULT]}")
 
 
 def read_case_file(file: Path) -> CaseFile:

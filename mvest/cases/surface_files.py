@@ -18,6 +18,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mvest.cases.schema import LARGEST_NUMBER
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io import SurfaceFile, read_surface
@@ -71,7 +72,7 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
         A missing, damaged or empty file, unknown or missing labels, a region without triangles.
     """
     if isinstance(files, Path):
-        found = read_surface(files)
+        found = _read(files)
         region = _labels(files, found, regions)
         surface = RegionSurface(found.vertices, found.triangles, region, found.point_data)
         if files.suffix.lower() == ".stl":
@@ -85,6 +86,23 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     return surface
 
 
+def _read(file: Path) -> SurfaceFile:
+    found = read_surface(file)
+    far = np.flatnonzero((np.abs(found.vertices) > LARGEST_NUMBER).any(axis=1))
+    if len(far):
+        raise GeometryError(
+            f"{file}: points {far[:5].tolist()} have coordinates beyond {LARGEST_NUMBER:g}"
+        )
+    for data, rows in (
+        (found.cell_data, len(found.triangles)),
+        (found.point_data, len(found.vertices)),
+    ):
+        for name, values in data.items():
+            if len(values) != rows:
+                raise InputError(f"{file}: data {name!r} has {len(values)} rows, expected {rows}")
+    return found
+
+
 def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:
     unknown = [name for name in files if name not in names]
     if unknown:
@@ -92,7 +110,7 @@ def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:
     missing = [name for name in names if name not in files]
     if missing:
         raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
-    parts = [read_surface(files[name]) for name in names]
+    parts = [_read(files[name]) for name in names]
     shared = set.intersection(*(set(part.point_data) for part in parts))
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return RegionSurface(
@@ -123,13 +141,6 @@ def _merged(surface: RegionSurface) -> RegionSurface:
 
 
 def _labels(file: Path, found: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
-    for data, rows in (
-        (found.cell_data, len(found.triangles)),
-        (found.point_data, len(found.vertices)),
-    ):
-        for name, values in data.items():
-            if len(values) != rows:
-                raise InputError(f"data {name!r} has {len(values)} rows, expected {rows}")
     if "region" in found.cell_data:
         return _numbered(found.cell_data["region"], regions, "triangles", "cell data region")
     if "region" in found.point_data:

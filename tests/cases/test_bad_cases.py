@@ -177,16 +177,17 @@ def seam(gap):
     return change
 
 
-def short_data(folder, document):
-    """A file whose labels are fewer than its triangles."""
-    text = (folder / "open.vtp").read_text()
-    short = text.replace('Name="region"', 'Name="region" format="ascii"', 1)
-    start = short.index(">", short.index('Name="region"')) + 1
-    end = short.index("</DataArray>", start)
-    short = short[:start].replace(' format="binary"', "", 0) + "0 1 1" + short[end:]
-    head = short.index("<DataArray")
-    tag = short[head:start].replace(' format="ascii"', "").replace("binary", "ascii")
-    (folder / "open.vtp").write_text(short[:head] + tag + short[start:])
+def labels_as_text(content):
+    """The labels of the reference surface are replaced by some text."""
+
+    def change(folder, document):
+        text = (folder / "open.vtp").read_text()
+        start = text.rindex("<", 0, text.index('Name="region"'))
+        end = text.index("</DataArray>", start)
+        array = f'<DataArray type="Float64" Name="region" format="ascii">{content}'
+        (folder / "open.vtp").write_text(text[:start] + array + text[end:])
+
+    return change
 
 
 def turned(some):
@@ -292,6 +293,10 @@ CASES = {
         G, CLOSED, "degenerate triangle",
     ),
     "NaN in vertices": (not_a_number("open"), G, OPEN, r"open.obj: points \[7\] are not finite"),
+    "vertex beyond sense": (
+        surfaces(lambda x, t, r: (np.vstack([[1e200] * 3, x[1:]]), t, r)),
+        G, OPEN, r"points \[0\] have coordinates beyond 1e\+09",
+    ),
     "another region": (
         surface(lambda x, t, r: (x, t, 1 - r), "closed"),
         I, CLOSED, r"belong to another region than in the reference",
@@ -300,7 +305,7 @@ CASES = {
         seam(0.01), G, OPEN, r"2 pieces that do not touch .* sharing the vertices of their seams"
     ),
     # Labels.
-    "too few labels": (short_data, I, OPEN, "data 'region' has 3 rows, expected 336"),
+    "too few labels": (labels_as_text("0 1 1"), I, OPEN, "data 'region' has 3 rows, expected 336"),
     "no labels": (
         surfaces(lambda x, t, r: (x, t, None)), I, OPEN, "without labels; expected cell data"
     ),
@@ -412,6 +417,7 @@ CASES = {
     "a time is text": (
         put("frames", 1, "time", "1e-3"), I, "frames.1.time", "this is text: YAML wants .* 1.0e-3"
     ),
+    "a time beyond sense": (put("frames", 1, "time", 1e300), I, "frames.1.time", "found 1e.300"),
     "a time is true": (put("frames", 1, "time", True), I, "frames.1.time", "found True"),
     "two references": (
         put("frames", 1, "role", "reference"),
@@ -455,6 +461,7 @@ CASES = {
     "negative tip index": (cell(5, "tip", "-1"), I, "chordae", "tip of row 5 is '-1'"),
     "rest length 0": (cell(2, "rest_length_mm", "0"), I, "chordae", "rest_length of chord 2 is 0"),
     "stiffness negative": (cell(2, "stiffness_n", "-1"), I, "chordae", "stiffness of .* 2 is -1"),
+    "chord beyond sense": (cell(1, "x", "1e300"), I, "chordae", "x of row 1 .*at most 1e.09"),
     "NaN in chordae": (cell(1, "x", "nan"), I, "chordae", "x of row 1 is 'nan'"),
     "another column": (
         text("tip,x,y,z\n0,1,2,3\n", "chordae.csv"), I, "chordae", "columns tip,x,y,z, expected tip"
@@ -484,6 +491,7 @@ CASES = {
         I, OPEN, r"extension '.off', expected .vtu, .vtp, .stl, .obj, .ply",
     ),
     "damaged file": (text("<VTKFile", "open.vtp"), I, OPEN, "damaged or no VTK XML file"),
+    "a file that is quoted": (labels_as_text("x" * 5000), I, OPEN, "damaged .*'xxxx"),
     "truncated file": (
         lambda folder, document: os.truncate(folder / "closed.vtp", 3000), I, CLOSED, "damaged"
     ),
@@ -529,6 +537,10 @@ CASES = {
         put("observation", {"std_mm": 0, "correlation_length_mm": 1}),
         I, "observation.std_mm", "found 0; expected standard deviation",
     ),
+    "correlation negative": (
+        put("observation", {"std_mm": 1, "correlation_length_mm": -1.0}),
+        I, "observation.correlation_length_mm", "found -1.0; expected mm along .* >= 0",
+    ),
     "an object": (
         text("version: !!python/object/apply:os.system ['true']"),
         I, "line 1", "asks for an object; expected plain values",
@@ -556,6 +568,7 @@ def test_what_is_wrong_is_one_clear_error(bad, change, error, field, message):
     said = str(caught.value)
     assert said.startswith(f"{folder / 'case.yaml'}: {field}"), said
     assert "\n" not in said
+    assert len(said) < 1000
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty"])
