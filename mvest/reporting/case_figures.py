@@ -87,7 +87,7 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
             axes = grid[row, column]
             draw_valve(axes, fields, points, colours, view, frame, chords=True)
             if row == 0:
-                axes.set_title(title, fontsize=10)
+                axes.set_title(title, fontsize=10, pad=10)
                 name_leaflets(axes, fields, names)
         tips = [fields.tips.reshape(-1, 3)] if view is SIDE else []
         same_scale(grid[row], [points for _, points, _ in shapes] + tips, view)
@@ -125,10 +125,10 @@ def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
     for row, view in enumerate(VIEWS):
         for column, (title, points, distance) in enumerate(panels):
             axes = grid[row, column]
-            colours = face_colours(scale, distance, fields.triangles)
+            colours = corner_colours(scale, distance, fields.triangles)
             draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
             if row == 0:
-                axes.set_title(f"{title}\n{spread(distance)}", fontsize=11)
+                axes.set_title(f"{title}\n{spread(distance)}", fontsize=11, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
         _say_view(grid[row, 0], view.name)
@@ -184,7 +184,7 @@ def information_figure(fields: CaseFields, found: Sequence[Information]) -> Figu
         scale = ScalarMappable(PowerNorm(0.5, 0.0, top), INFORMATION_MAP)
         for row, field in enumerate((information.raw, information.beyond)):
             axes = grid[row, column]
-            colours = face_colours(scale, field, fields.triangles)
+            colours = corner_colours(scale, field, fields.triangles)
             draw_valve(axes, fields, points, colours, ATRIUM, fields.closed + 1, strength=0.2)
             share = "" if row == 0 else f"{100 * information.kept:.0f} % remains"
             axes.set_title(information.label if row == 0 else share, fontsize=10)
@@ -209,7 +209,7 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     figure = Figure(figsize=(8.6, 3.6), layout="constrained")
     grid = figure.subplots(1, 2, width_ratios=[1.0, 1.1])
     for axes, view in zip(grid, VIEWS, strict=True):
-        colours = face_colours(scale, size, fields.triangles)
+        colours = corner_colours(scale, size, fields.triangles)
         draw_valve(axes, fields, points, colours, view, fields.closed + 1, strength=0.2)
         same_scale([axes], [points], view)
         axes.set_title(view.name, fontsize=10, pad=14)
@@ -220,12 +220,15 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     return figure
 
 
-def face_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
-    """Colours ``(m, 3)`` of triangles from a field ``(n,)``, grey where a corner has none."""
-    mean = values[triangles].mean(axis=1)
-    known = np.isfinite(mean)
-    colours: FloatArray = scale.to_rgba(np.where(known, mean, 0.0))[:, :3]
-    return np.where(known[:, None], colours, UNSEEN)
+def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
+    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
+
+    A triangle is grey where one of its corners has no value.
+    """
+    known = np.isfinite(values)
+    colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
+    whole = np.asarray(known[triangles].all(axis=1))
+    return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
 def _closed_shape(fields: CaseFields) -> FloatArray:
