@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from mvest.reporting.case_drawing import (
     name_leaflets,
     same_scale,
 )
-from mvest.reporting.case_fields import CaseFields
+from mvest.reporting.case_fields import CaseFields, read_case_fields
 from mvest.reporting.case_information import Information
 from mvest.reporting.figures import DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
@@ -95,12 +96,13 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     return figure
 
 
-def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
+def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     """The closed valve coloured by pointwise distance: generic beside personalised, on one scale.
 
     Parameters
     ----------
-    fields : CaseFields
+    fields : CaseFields or Path
+        A path is read by `mvest.reporting.case_fields.read_case_fields`.
     names : sequence of str
         Of the leaflets, written beside them.
 
@@ -109,6 +111,8 @@ def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
     InputError
         If a shape or its distances are missing.
     """
+    if isinstance(fields, Path):
+        fields = read_case_fields(fields)
     k = fields.closed
     if fields.generic is None or fields.fitted is None:
         raise InputError("Figure 3 needs the generic and the personalised closed valve")

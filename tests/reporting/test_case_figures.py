@@ -127,7 +127,7 @@ def test_both_panels_of_figure_3_have_one_scale(fields) -> None:
     assert different.sum() == len(fields.triangles) * pieces(figure.axes[0], fields)
 
 
-def test_captions_tell_which_panel_is_which(fields) -> None:
+def test_captions_tell_which_panel_is_which(case, fields) -> None:
     generic, fitted = fields.distance_generic[0], fields.distance_fitted[0]
     told = figure3_caption(fields)
     left = f"Left: generic stiffness, {np.nanmean(generic):.2f} ± {np.nanstd(generic):.2f} mm"
@@ -141,6 +141,7 @@ def test_captions_tell_which_panel_is_which(fields) -> None:
     )
     assert figure3_caption(swapped) != told
     titles = [axes.get_title() for axes in case_figure(fields).axes[:2]]
+    assert [axes.get_title() for axes in case_figure(case[1]).axes[:2]] == titles
     assert titles == [
         f"generic stiffness\n{np.nanmean(generic):.2f} ± {np.nanstd(generic):.2f} mm",
         f"personalised stiffness\n{np.nanmean(fitted):.2f} ± {np.nanstd(fitted):.2f} mm",
