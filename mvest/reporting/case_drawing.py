@@ -6,14 +6,12 @@ and every panel can have the same scale.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import PolyCollection
-from numpy.typing import ArrayLike
 
 from mvest.reporting.case_fields import CaseFields
 from mvest.typing import FloatArray, IntArray
@@ -22,6 +20,7 @@ from mvest.valve.anatomy import vertex_normals
 __all__ = [
     "ATRIUM",
     "LEAFLET_COLOURS",
+    "LINE_PIECES",
     "SIDE",
     "UNSEEN",
     "VIEWS",
@@ -29,19 +28,27 @@ __all__ = [
     "draw_valve",
     "leaflet_colours",
     "name_leaflets",
+    "quartered",
     "same_scale",
 ]
 
 LEAFLET_COLOURS = np.array([[0.87, 0.57, 0.49], [0.50, 0.66, 0.86], [0.58, 0.77, 0.57]])
 """Of the leaflets in the order of their regions, light enough to be shaded."""
 UNSEEN = np.array([0.75, 0.75, 0.75])
-LINE = (0.10, 0.10, 0.10)
-CHORD = (0.45, 0.42, 0.40)
-TIP = (0.35, 0.22, 0.20)
+LINE = np.array([0.10, 0.10, 0.10])
+CHORD = np.array([0.45, 0.42, 0.40])
+TIP = np.array([0.35, 0.22, 0.20])
 TIP_RADIUS_MM = 0.9
-LIFT_MM = 0.4
+LIFT_MM = 0.7
 """By which lines are drawn nearer, so that the surface they lie on does not swallow them."""
+LARGEST_EDGE_MM = 1.2
+"""Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
+MOST_SPLITS = 2
+LINE_PIECES = 6
 SCALE_MM = 10.0
+
+Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Triangles ``(k, 3, 2)`` on the page, their depth ``(k,)``, colour ``(k, 3)`` and line width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +74,15 @@ VIEWS = (ATRIUM, SIDE)
 
 
 def leaflet_colours(region: IntArray) -> FloatArray:
-    """A colour ``(m, 3)`` for each triangle by its leaflet."""
-    return LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)]
+    """Colours ``(m, 3, 3)`` of the corners of triangles by their leaflet."""
+    return np.repeat(LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)][:, None], 3, axis=1)
 
 
 def draw_valve(
     axes: Any,
     fields: CaseFields,
     points: FloatArray,
-    colours: ArrayLike,
+    colours: FloatArray,
     view: View,
     frame: int,
     chords: bool = False,
@@ -89,8 +96,8 @@ def draw_valve(
     fields : CaseFields
     points : ndarray
         ``(n, 3)`` mm; triangles with a vertex that is NaN are left out.
-    colours : array_like
-        ``(m, 3)`` of the triangles before shading.
+    colours : ndarray
+        ``(m, 3, 3)`` of the corners of the triangles before shading: triangle, corner, channel.
     view : View
     frame : int
         Whose papillary tips are drawn; 0 is the reference frame.
@@ -99,50 +106,25 @@ def draw_valve(
     strength : float
         How much darker a triangle on edge is than one that faces the light.
     """
-    seen = points @ view.axes
-    known = np.isfinite(seen[fields.triangles]).all(axis=(1, 2))
-    triangles = fields.triangles[known]
-    shade = _shade(points, triangles, view, strength)
-    faces = np.clip(np.asarray(colours)[known] * shade[:, None], 0, 1)
-    polygons: list[FloatArray] = list(seen[triangles][:, :, :2])
-    depth: list[float] = list(seen[triangles][:, :, 2].mean(axis=1))
-    face: list[Any] = list(faces)
-    edge: list[Any] = list(faces)
-    width: list[float] = [0.3] * len(triangles)
-
-    def add(line: FloatArray, colour: Any, thickness: float) -> None:
-        for start, end in itertools.pairwise(line):
-            if np.isfinite(start).all() and np.isfinite(end).all():
-                polygons.append(np.stack([start[:2], end[:2], start[:2]]))
-                depth.append(float(start[2] + end[2]) / 2 + LIFT_MM)
-                face.append(colour)
-                edge.append(colour)
-                width.append(thickness)
-
-    for loop, thickness in ((fields.annulus, 1.8), (fields.free_edge, 0.7)):
+    known = np.isfinite(points[fields.triangles]).all(axis=(1, 2))
+    parts = [_surface(points, fields.triangles[known], colours[known], view, strength)]
+    for loop, width in ((fields.annulus, 1.8), (fields.free_edge, 0.7)):
         if len(loop):
-            add(seen[np.append(loop, loop[0])], LINE, thickness)
-    if chords:
-        share = np.linspace(0, 1, 9)[:, None]
-        for start, end in fields.chords(points, frame) @ view.axes:
-            add(start + share * (end - start), CHORD, 0.6)
-        circle = np.linspace(0, 2 * np.pi, 24)
-        for tip in fields.tips[frame] @ view.axes:
-            polygons.append(
-                tip[:2] + TIP_RADIUS_MM * np.stack([np.cos(circle), np.sin(circle)], axis=1)
-            )
-            depth.append(float(tip[2]))
-            face.append(TIP)
-            edge.append(TIP)
-            width.append(0.3)
-
+            start, end = points[loop], points[np.roll(loop, -1)]
+            parts.append(_lines(start, end, view, LINE, width))
+    if chords and len(fields.chord_tip):
+        ends = fields.chords(points, frame)
+        parts.append(_lines(ends[:, 0], ends[:, 1], view, CHORD, 0.6))
+    if chords and fields.tips.shape[1]:
+        parts.append(_dots(fields.tips[frame], view, TIP))
+    polygons, depth, colour, widths = (np.concatenate(of) for of in zip(*parts, strict=True))
     order = np.argsort(depth, kind="stable")
     axes.add_collection(
         PolyCollection(
-            [polygons[k] for k in order],
-            facecolors=[face[k] for k in order],
-            edgecolors=[edge[k] for k in order],
-            linewidths=[width[k] for k in order],
+            list(polygons[order]),
+            facecolors=colour[order],
+            edgecolors=colour[order],
+            linewidths=widths[order],
             capstyle="round",
             joinstyle="round",
             rasterized=True,
@@ -152,17 +134,72 @@ def draw_valve(
     axes.set_axis_off()
 
 
-def _shade(points: FloatArray, triangles: IntArray, view: View, strength: float) -> FloatArray:
-    """Brightness ``(m,)`` of triangles, smooth over the surface; both sides are lit alike."""
-    corner = points[triangles]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+def _surface(
+    points: FloatArray, triangles: IntArray, colours: FloatArray, view: View, strength: float
+) -> Part:
+    """Shaded triangles, small enough to be told apart in depth where leaflets touch."""
     # A vertex of no triangle that is drawn has no normal, and none is asked for.
     with np.errstate(invalid="ignore"):
-        normal = vertex_normals(points, triangles)[triangles].mean(axis=1)
-    normal = np.where(np.isfinite(normal), normal, face)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        normals = vertex_normals(points, triangles)
+    corner, normal = points[triangles], normals[triangles]
+    edge = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2)
+    for _ in range(MOST_SPLITS):
+        if not len(edge) or np.median(edge) <= LARGEST_EDGE_MM:
+            break
+        corner, normal, colours = (quartered(values) for values in (corner, normal, colours))
+        edge = edge / 2
+    direction = normal.mean(axis=1)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
     light = view.axes @ np.array([-0.40, 0.45, 0.80])
-    return 1.0 - strength * (1.0 - np.abs(normal @ light))
+    # Both sides are lit alike.
+    shade = 1.0 - strength * (1.0 - np.abs(direction @ light))
+    seen = corner @ view.axes
+    return (
+        seen[..., :2],
+        seen[..., 2].mean(axis=1),
+        np.clip(colours.mean(axis=1) * shade[:, None], 0, 1),
+        np.full(len(seen), 0.3),
+    )
+
+
+def quartered(values: FloatArray) -> FloatArray:
+    """Values at the corners of four triangles for each: ``(m, 3, 3)`` to ``(4 m, 3, 3)``."""
+    a, b, c = values[:, 0], values[:, 1], values[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(triangle, axis=1) for triangle in corners])
+
+
+def _lines(
+    start: FloatArray, end: FloatArray, view: View, colour: FloatArray, width: float
+) -> Part:
+    """Straight lines in pieces, each a triangle without area; NaN are left out."""
+    known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    share = np.linspace(0, 1, LINE_PIECES + 1)[:, None, None]
+    beads = (start[known] + share * (end[known] - start[known])) @ view.axes
+    a, b = beads[:-1].reshape(-1, 3), beads[1:].reshape(-1, 3)
+    return (
+        np.stack([a, b, a], axis=1)[..., :2],
+        (a[:, 2] + b[:, 2]) / 2 + LIFT_MM,
+        np.tile(colour, (len(a), 1)),
+        np.full(len(a), width),
+    )
+
+
+def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
+    """Discs that face the eye, of triangles around their centres."""
+    angle = np.linspace(0, 2 * np.pi, 25)
+    rim = TIP_RADIUS_MM * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    seen = centres @ view.axes
+    disc = np.stack([0 * rim[:-1], rim[:-1], rim[1:]], axis=1)
+    polygons = (seen[:, None, None, :2] + disc).reshape(-1, 3, 2)
+    count = len(polygons)
+    return (
+        polygons,
+        np.repeat(seen[:, 2], len(disc)),
+        np.tile(colour, (count, 1)),
+        np.full(count, 0.3),
+    )
 
 
 def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str], view: View = ATRIUM) -> None:

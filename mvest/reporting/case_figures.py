@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from mvest.reporting.case_drawing import (
     name_leaflets,
     same_scale,
 )
-from mvest.reporting.case_fields import CaseFields
+from mvest.reporting.case_fields import CaseFields, read_case_fields
 from mvest.reporting.case_information import Information
 from mvest.reporting.figures import DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
@@ -87,7 +88,7 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
             axes = grid[row, column]
             draw_valve(axes, fields, points, colours, view, frame, chords=True)
             if row == 0:
-                axes.set_title(title, fontsize=10)
+                axes.set_title(title, fontsize=10, pad=10)
                 name_leaflets(axes, fields, names)
         tips = [fields.tips.reshape(-1, 3)] if view is SIDE else []
         same_scale(grid[row], [points for _, points, _ in shapes] + tips, view)
@@ -95,12 +96,13 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     return figure
 
 
-def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
+def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     """The closed valve coloured by pointwise distance: generic beside personalised, on one scale.
 
     Parameters
     ----------
-    fields : CaseFields
+    fields : CaseFields or Path
+        A path is read by `mvest.reporting.case_fields.read_case_fields`.
     names : sequence of str
         Of the leaflets, written beside them.
 
@@ -109,6 +111,8 @@ def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
     InputError
         If a shape or its distances are missing.
     """
+    if isinstance(fields, Path):
+        fields = read_case_fields(fields)
     k = fields.closed
     if fields.generic is None or fields.fitted is None:
         raise InputError("Figure 3 needs the generic and the personalised closed valve")
@@ -125,10 +129,10 @@ def case_figure(fields: CaseFields, names: Sequence[str] = ()) -> Figure:
     for row, view in enumerate(VIEWS):
         for column, (title, points, distance) in enumerate(panels):
             axes = grid[row, column]
-            colours = face_colours(scale, distance, fields.triangles)
+            colours = corner_colours(scale, distance, fields.triangles)
             draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
             if row == 0:
-                axes.set_title(f"{title}\n{spread(distance)}", fontsize=11)
+                axes.set_title(f"{title}\n{spread(distance)}", fontsize=11, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
         _say_view(grid[row, 0], view.name)
@@ -184,7 +188,7 @@ def information_figure(fields: CaseFields, found: Sequence[Information]) -> Figu
         scale = ScalarMappable(PowerNorm(0.5, 0.0, top), INFORMATION_MAP)
         for row, field in enumerate((information.raw, information.beyond)):
             axes = grid[row, column]
-            colours = face_colours(scale, field, fields.triangles)
+            colours = corner_colours(scale, field, fields.triangles)
             draw_valve(axes, fields, points, colours, ATRIUM, fields.closed + 1, strength=0.2)
             share = "" if row == 0 else f"{100 * information.kept:.0f} % remains"
             axes.set_title(information.label if row == 0 else share, fontsize=10)
@@ -209,7 +213,7 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     figure = Figure(figsize=(8.6, 3.6), layout="constrained")
     grid = figure.subplots(1, 2, width_ratios=[1.0, 1.1])
     for axes, view in zip(grid, VIEWS, strict=True):
-        colours = face_colours(scale, size, fields.triangles)
+        colours = corner_colours(scale, size, fields.triangles)
         draw_valve(axes, fields, points, colours, view, fields.closed + 1, strength=0.2)
         same_scale([axes], [points], view)
         axes.set_title(view.name, fontsize=10, pad=14)
@@ -220,12 +224,15 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
     return figure
 
 
-def face_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
-    """Colours ``(m, 3)`` of triangles from a field ``(n,)``, grey where a corner has none."""
-    mean = values[triangles].mean(axis=1)
-    known = np.isfinite(mean)
-    colours: FloatArray = scale.to_rgba(np.where(known, mean, 0.0))[:, :3]
-    return np.where(known[:, None], colours, UNSEEN)
+def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
+    """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
+
+    A triangle is grey where one of its corners has no value.
+    """
+    known = np.isfinite(values)
+    colours: FloatArray = scale.to_rgba(np.where(known, values, 0.0))[:, :3]
+    whole = np.asarray(known[triangles].all(axis=1))
+    return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
 def _closed_shape(fields: CaseFields) -> FloatArray:

@@ -132,7 +132,7 @@ def _figures(
 
     return [
         ("shapes", lambda: shapes_figure(shapes, names), said("shapes")),
-        ("figure3", lambda: case_figure(shapes), lambda: figure3_caption(shapes) + marked),
+        ("figure3", lambda: case_figure(shapes, names), lambda: figure3_caption(shapes) + marked),
         ("estimates", lambda: estimates_figure(record), said("estimates")),
         (
             "identifiability",

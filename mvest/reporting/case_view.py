@@ -22,7 +22,6 @@ __all__ = ["CaseView", "case_view", "small"]
 DECIMALS = 2
 """Positions are stored to 0.01 mm, a fiftieth of what is seen of a valve."""
 ELEMENT = "valve"
-HEIGHT_PIXELS = 560
 LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
 GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
 SCALE = "Viridis"
@@ -79,7 +78,6 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> CaseView:
     scene = go.Figure(traces)
     scene.update_layout(
         template=None,
-        height=HEIGHT_PIXELS,
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         paper_bgcolor="white",
         showlegend=False,
@@ -95,7 +93,7 @@ def case_view(fields: CaseFields, names: Sequence[str]) -> CaseView:
         full_html=False,
         include_plotlyjs=True,
         div_id=ELEMENT,
-        default_height=f"{HEIGHT_PIXELS}px",
+        default_height="100%",
         config={"displaylogo": False, "displayModeBar": False, "responsive": True},
     )
     shown = tuple((label, tuple((owner == k).tolist())) for k, label in enumerate(labels))

@@ -41,6 +41,7 @@ MODULUS_NAMES = {
     "E_perp": "stiffness across the fibres, E_perp",
     "G": "shear stiffness, G",
 }
+CONVERGED = "converged"
 MODULUS_UNIT = "MPa"
 HASH_DIGITS = 12
 NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -90,6 +91,9 @@ def badges(record: Record) -> list[str]:
     told = " ".join(str(case.get(key) or "") for key in ("name", "description", "source")).lower()
     if "tricuspid" in told and not any("TRICUSPID" in text.upper() for text in found):
         found.append("DONOR TRICUSPID" if "donor" in told else "TRICUSPID")
+    status = record.get("status")
+    if status and status != CONVERGED:
+        found.append(f"RUN {str(status).upper()}")
     return [*found, "NOT FOR DIAGNOSIS"]
 
 

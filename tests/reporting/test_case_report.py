@@ -56,6 +56,7 @@ def quickly(*arguments):
     """The same report with coarse pictures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvest.reporting.figures.DPI", 30)
+        patch.setattr("mvest.reporting.case_drawing.MOST_SPLITS", 0)
         return write_case_report(*arguments)
 
 
@@ -170,7 +171,9 @@ def bare_page(case, tmp_path_factory):
         kept = ("triangles", "region", "rest", "annulus", "frames", "seen")
         np.savez(folder / "fields.npz", **{name: stored[name] for name in kept})
     record = {"title": "Nothing yet", "status": "failed", "reason": "no equilibrium", "gate": None}
-    return quickly(folder / "page", record, folder / "fields.npz")
+    pages = [quickly(folder / name, record, folder / "fields.npz") for name in ("page", "again")]
+    assert pages[0][0].read_bytes() == pages[1][0].read_bytes()
+    return pages[0]
 
 
 def test_what_is_missing_is_said(bare_page) -> None:
@@ -254,6 +257,12 @@ def test_a_donor_tricuspid_valve_is_named_as_one(case) -> None:
     }
     assert words.badges(donor) == ["DONOR TRICUSPID", "NOT FOR DIAGNOSIS"]
     assert words.badges(record) == ["SIMULATED", "NOT FOR DIAGNOSIS"]
+
+
+def test_a_run_that_did_not_converge_says_so_at_the_top(case) -> None:
+    # Its last iterate still stands in the answer.
+    assert "RUN FAILED" in words.badges(case[0] | {"status": "failed"})
+    assert "RUN CONVERGED" not in words.badges(case[0])
 
 
 def test_a_truth_outside_its_interval_is_not_hidden(case) -> None:
