@@ -144,6 +144,12 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
     return figure
 
 
+MIDSURFACES = (
+    "Drawn are midsurfaces: leaflets that touch lie a thickness apart, so that a white slit is not "
+    "yet a leak."
+)
+
+
 def figure3_caption(fields: CaseFields) -> str:
     """What Figure 3 shows, with the mean ± SD of both panels."""
     k = fields.closed
@@ -155,7 +161,7 @@ def figure3_caption(fields: CaseFields) -> str:
         f"from where the valve was observed; mean ± standard deviation over {fitted.count} points. "
         f"Left: generic stiffness, {generic} (largest {generic.largest:.2f} mm). Right: "
         f"personalised stiffness, {fitted} (largest {fitted.largest:.2f} mm). Both on one colour "
-        "scale; black line: annulus. Grey: not observed."
+        "scale; black line: annulus. Grey: not observed. " + MIDSURFACES
     )
 
 

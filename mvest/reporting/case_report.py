@@ -18,6 +18,7 @@ from mvest.errors import InputError, cannot_write
 from mvest.reporting import case_words as words
 from mvest.reporting.case_fields import CaseFields, read_case_fields
 from mvest.reporting.case_figures import (
+    MIDSURFACES,
     case_figure,
     figure3_caption,
     information_figure,
@@ -112,7 +113,8 @@ def _figures(
     marked = " Simulated." if (record.get("case") or {}).get("simulated") else ""
     texts = {
         "shapes": "The valve open and closed, from the atrium and from the side. Colours tell the "
-        "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary tips.",
+        "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary tips. "
+        + MIDSURFACES,
         "estimates": "What was believed before the images (grey) and what they add (blue).",
         "identifiability": "Fisher information on the logarithm of each modulus that each observed "
         "point of the closed valve adds, seen from the atrium. Dark: how the valve closes there "

@@ -24,7 +24,7 @@ from mvest.errors import InputError, cannot_write
 from mvest.provenance import write_json
 from mvest.reporting.case_drawing import ATRIUM, draw_valve, same_scale
 from mvest.reporting.case_fields import CaseFields, read_case_fields
-from mvest.reporting.case_figures import distance_top, face_colours, spread
+from mvest.reporting.case_figures import corner_colours, distance_top, spread
 from mvest.reporting.figures import DISTANCE_MAP, save_figure
 from mvest.reporting.files import provenance_line, write_text
 from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
@@ -369,7 +369,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
             assert positions is not None
             assert distance is not None
             axes = grid[row, column]
-            colours = face_colours(scale, distance[k], found.triangles)
+            colours = corner_colours(scale, distance[k], found.triangles)
             draw_valve(axes, found, positions[k], colours, ATRIUM, k + 1, strength=0.3)
             title = f"{_words(name)}\n" if row == 0 else ""
             axes.set_title(f"{title}{spread(distance[k])}", fontsize=9)
