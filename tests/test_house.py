@@ -63,6 +63,15 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.surface_observation",
     ),
+    "mvest.virtual_patient": (
+        *LEAVES,
+        "mvest.cases",
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.model",
+        "mvest.observation_errors",
+        "mvest.registration",
+    ),
     "mvest.personalise": (
         *LEAVES,
         "mvest.cases",
