@@ -217,12 +217,14 @@ def case_record(
     innovation = record["innovation"]
     if innovation is not None:
         innovation = {**innovation, "tests": _whiteness(found)}
-    iterates = {key: record[key] for key in ("iterates", "iterate_std")}
+    of_all = {key: record[key] for key in ("iterates", "iterate_std", "identifiability")}
+    if of_all["identifiability"] is not None:
+        of_all["identifiability"]["observation_std_mm"] = case.uncertainty.std_mm
     # What every study's record tells is the moduli; ``unknowns`` tells all.
     record = _of_moduli(record)
     return record | {
         "row": case.name,
-        "unknown_iterates": iterates,
+        "of_all_unknowns": of_all,
         "case": {
             "name": case.name,
             "description": case.description,
@@ -276,7 +278,7 @@ def of_all_unknowns(record: Values) -> dict[str, Any]:
     ]
     return {
         **record,
-        **record["unknown_iterates"],
+        **record["of_all_unknowns"],
         "title": record["case"]["description"] or record["case"]["name"],
         "parameters": record["unknowns"],
         "distances": distances,
