@@ -404,10 +404,12 @@ def estimate(
     )
     bound = None
     if filtered.prediction is not None:
+        # What is estimated or considered at zero has its prior for a size.
+        size = np.abs(filtered.mean)
         bound = identifiability(
             filtered.prediction.jacobian,
             R,
-            np.abs(filtered.mean),
+            np.where(size > 0, size, case.prior.std),
             names=case.parameters,
         )
     return StudyResult(
