@@ -377,7 +377,8 @@ def personalise(
     """
     chain = _Chain(case, settings, store, on_step)
     started = time.perf_counter()
-    generic = chain.shared(chain.prior.mean)
+    # Not the prior's mean, which may differ from where filters start by its last bit.
+    generic = chain.shared(chain.shared.start)
     seconds = {"generic": time.perf_counter() - started}
     result = chain.estimate(chain.filter, chain.observation())
     seconds["estimate"] = result.seconds
