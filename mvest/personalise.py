@@ -66,6 +66,9 @@ __all__ = [
     "personalise",
 ]
 
+FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
+"""Unknowns of the whole valve that act on its closure."""
+
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
 
@@ -214,6 +217,12 @@ class PersonaliseSettings:
         names = [unknown.name for unknown in self.unknowns]
         if len(set(names)) != len(names):
             raise InputError(f"unknowns {', '.join(names)} are not all different")
+        for u in self.unknowns:
+            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
+                raise InputError(
+                    f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
+                    "estimated or considered"
+                )
         if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
             raise InputError(
                 f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
@@ -311,6 +320,12 @@ def build_model(
         If the leaflets cannot be meshed.
     """
     mechanical = [u for u in settings.unknowns if u.name not in REGISTRATION]
+    strange = [u.name for u in mechanical if not u.is_modulus and u.name not in FACTORS]
+    if strange:
+        raise InputError(
+            f"unknowns {', '.join(strange)}; expected E_f.REGION, {', '.join(FACTORS)} or some of "
+            f"{', '.join(REGISTRATION)}"
+        )
     needed = {f"E_f.{region}" for region in case.surface.region_names}
     given = {u.name for u in mechanical if u.is_modulus}
     if given != needed:
@@ -377,7 +392,8 @@ def personalise(
     """
     chain = _Chain(case, settings, store, on_step)
     started = time.perf_counter()
-    generic = chain.shared(chain.prior.mean)
+    # Not the prior's mean, which may differ from where filters start by its last bit.
+    generic = chain.shared(chain.shared.start)
     seconds = {"generic": time.perf_counter() - started}
     result = chain.estimate(chain.filter, chain.observation())
     seconds["estimate"] = result.seconds

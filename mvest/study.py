@@ -404,6 +404,7 @@ def estimate(
     )
     bound = None
     if filtered.prediction is not None:
+        # What is estimated near zero has its prior for a size.
         bound = identifiability(
             filtered.prediction.jacobian,
             R,

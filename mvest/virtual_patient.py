@@ -7,7 +7,7 @@ belongs in another place than it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +35,9 @@ __all__ = [
 
 REFERENCE, CLOSED = "open", "closed"
 """Names of the frames of a virtual patient that are shown; the others are held out."""
+
+GUIDES = (("hex18", 24, 3), ("hex18", 36, 4))
+"""Element, columns and rows of the coarser meshes on which a closure is followed."""
 
 FRAME_INTERVAL = 0.05
 """s between the closed frame and those that are held out."""
@@ -133,6 +136,11 @@ class Simulation:
                 f"held_pressure_mmHg has {len(self.held_pressure_mmHg)} frames, held_relaxation "
                 f"{len(self.held_relaxation)}; expected as many"
             )
+        if len(set(self.held_pressure_mmHg)) != len(self.held_pressure_mmHg):
+            raise InputError(
+                f"held_pressure_mmHg = {self.held_pressure_mmHg}, expected different ones: they "
+                "name the frames"
+            )
 
 
 def draw_hidden(
@@ -181,7 +189,7 @@ def simulate_patient(
     Raises
     ------
     GeometryError
-        If the valve does not close, or has no equilibrium in the frame that is held out.
+        If the valve does not close, or has no equilibrium in a frame that is held out.
     """
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
     model = _model(template, seen, values, simulation, mechanics)
@@ -212,12 +220,10 @@ def _model(
     protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
     contact = template.valve(simulation.contact_columns, simulation.contact_rows)
     guide = None
-    cells: Sequence[tuple[str, int, int]] = (
-        ("hex18", 24, 3),
-        ("hex18", 36, 4),
-        (simulation.element, simulation.columns, simulation.rows),
-    )
-    for element, columns, rows in cells:
+    own = (simulation.element, simulation.columns, simulation.rows)
+    # Closures are followed on coarser meshes only.
+    guides = [cells for cells in GUIDES if cells[1] * cells[2] < own[1] * own[2]]
+    for element, columns, rows in (*guides, own):
         guide = ClosureModel(
             seen,
             contact,

@@ -141,6 +141,8 @@ class _Problem:
         considered: BoolArray,
     ) -> None:
         self.model, self.prior, self.transform, self.names = model, prior, transform, names
+        # As the finished estimate states them, to the last bit.
+        self._mean = transform.inverse(transform.forward(prior.mean))
         self.kept = np.flatnonzero(~considered)
         self.considered = np.flatnonzero(considered)
         self.estimated = _part(prior, self.kept)
@@ -167,7 +169,7 @@ class _Problem:
 
     def _filled(self, m: FloatArray) -> FloatArray:
         """All parameters (p,), the considered ones at their prior mean."""
-        whole = np.array(self.prior.mean, dtype=np.float64)
+        whole = np.array(self._mean)
         whole[self.kept] = m
         return whole
 
