@@ -3,7 +3,8 @@
 A virtual patient's truth lies in a folder of its own. This process is started for the estimation
 alone, is told nothing of the patient but the folder of its case, and refuses to open, list or
 rename anything within the sealed folder for as long as it lives: Python's audit hooks cannot be
-removed once they are set (PEP 578).
+removed once they are set (PEP 578). They see what Python opens; a file that a compiled library or a
+program started from here opened by itself would not be seen.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ __all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
 
-SECRET = ("patient", "truth", "valve", "seed", "parameters")
+SECRET = ("patient", "truth", "valve", "seed", "parameters", "row", "factors")
 """Parts of a configuration that describe the patient, and that the estimator is not given."""
 
 
@@ -37,13 +38,15 @@ def seal(folder: Path) -> None:
     sealed = os.path.realpath(folder)
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
-        if not (event == "open" or event.startswith(("os.", "shutil.", "glob."))):
+        if not (event == "open" or event.startswith(("os.", "shutil.", "glob.", "sqlite3."))):
             return
         for argument in arguments:
             if not isinstance(argument, (str, bytes, os.PathLike)):
                 continue
             path = os.path.realpath(os.fsdecode(argument))
-            if path == sealed or path.startswith(sealed + os.sep):
+            # Under another name of a folder above, the sealed one would not be known again.
+            renamed = event in ("os.rename", "shutil.move") and sealed.startswith(path + os.sep)
+            if renamed or path == sealed or path.startswith(sealed + os.sep):
                 raise PermissionError(f"{path} is sealed: an estimator does not see the truth")
 
     sys.addaudithook(refuse)
@@ -77,6 +80,8 @@ def estimate_blindly(
         "folder": str(folder),
         "sealed": str(sealed),
     }
+    path = folder / ESTIMATE
+    path.unlink(missing_ok=True)
     places = [str(Path(__file__).resolve().parent.parent), os.environ.get("PYTHONPATH", "")]
     ended = subprocess.run(
         [sys.executable, "-m", "experiments.blind"],
@@ -90,7 +95,6 @@ def estimate_blindly(
         | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
         check=False,
     )
-    path = folder / ESTIMATE
     if ended.returncode or not path.is_file():
         last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
         raise InputError(f"the estimation of {case} left no result: {last.removeprefix('error: ')}")
@@ -105,7 +109,7 @@ def main() -> int:
     register()
     announce_compilation()
     # The case says what it is; nothing here does.
-    values = request["values"] | {"seed": None, "parameters": []}
+    values = request["values"] | {"seed": None, "parameters": [], "row": None}
     try:
         record, _ = estimate_case(values, request["config_hash"], folder, time.time())
         write_json(folder / ESTIMATE, record)

@@ -130,7 +130,9 @@ def test_the_boundary_is_tracked_without_the_displacement(patient):
     # A tenth of the way back, and tips lifted by a tenth of 2 mm.
     way = 0.9 * motion.annulus[-1] + 0.1 * motion.annulus[0]
     np.testing.assert_allclose(held.annulus, way, atol=1e-12)
-    np.testing.assert_allclose(held.papillary_tips, closed.papillary_tips + [0, 0, 0.2])
+    np.testing.assert_allclose(
+        held.papillary_tips, closed.papillary_tips + np.array([0.0, 0.0, 0.2])
+    )
 
 
 def test_what_a_case_states_is_not_what_is_true(patient, values):
