@@ -85,15 +85,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.study",
         "mvest.surface_observation",
     ),
-    "mvest.virtual_patient": (
-        *LEAVES,
-        "mvest.cases",
-        "mvest.valve",
-        "mvest.mechanics",
-        "mvest.model",
-        "mvest.observation_errors",
-        "mvest.registration",
-    ),
     "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
