@@ -19,7 +19,7 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Simulation, Step
-from mvest.mechanics.system import Factors, Parameter, System
+from mvest.mechanics.system import Factors, Loads, Parameter, System
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
@@ -99,7 +99,8 @@ class ClosureModel:
         mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
         the same reason as with ``continuation``.
     repeat : bool
-        Whether a continued or guided closure that fails is repeated from the open valve.
+        Whether a continued closure that fails is repeated with the guide, and one that fails with
+        the guide from the open valve.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -224,7 +225,9 @@ class ClosureModel:
             end, last = self.settings.protocol.end, steps[-1]
             if self._closed is not None and self._near(m):
                 simulation = run([last], self._closed.positions, end)
-            elif self.guide is not None:
+            if self.guide is not None and (
+                simulation is None or (self.repeat and not simulation.converged)
+            ):
                 start = self._guided(self.guide, m)
                 if start is not None:
                     rests = [Step(end + t) for t in accumulate(REST)]
@@ -237,23 +240,34 @@ class ClosureModel:
             self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
 
-    def held(self, m: FloatArray, state: HeldState) -> FloatArray | None:
-        """Observed vertices ``(n, 3)`` mm of the closed valve in equilibrium under other loads.
+    def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
+        """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.
 
-        The valve is closed with parameters ``m (p,)`` first, and goes from there to ``state``; None
-        if either equilibrium is not found.
+        The valve is closed with parameters ``m (p,)`` first, and goes from one state to the next;
+        None from the first one on for which no equilibrium is found.
 
         Raises
         ------
+        InputError
+            If a state's annulus or tips are not those of the valve.
         MaterialError
             If a modulus is inadmissible.
         """
         closure = self.close(m, sensitivities=False)
-        if not closure.simulation.converged:
-            return None
-        system = closure.system
-        assert system.hinge is not None
-        loading = held_loading(system, self.contact_valve, state)
+        system, simulation = closure.system, closure.simulation
+        found: list[FloatArray | None] = []
+        for state in states:
+            loading = held_loading(system, self.contact_valve, state)
+            if simulation.converged:
+                simulation = self._rest(system, loading, simulation.frames[-1])
+            converged = simulation.converged
+            found.append(self.observed(simulation.frames[-1]) if converged else None)
+        return found
+
+    def _rest(
+        self, system: System, loading: Callable[[float], Loads], start: FloatArray
+    ) -> Simulation:
+        """Equilibrium under constant loads from nodal positions ``start (n, 3)``."""
         end = self.settings.protocol.end
 
         def run(steps: Sequence[Step]) -> Simulation:
@@ -265,7 +279,7 @@ class ClosureModel:
                 newton=self.settings.newton,
                 final_only=True,
                 solver=self._solver,
-                initial_positions=closure.simulation.frames[-1],
+                initial_positions=start,
                 initial_time=end,
             )
 
@@ -274,7 +288,7 @@ class ClosureModel:
             # Damping by stiffness helps leaflets to slide over each other to where they are held.
             rests = [Step(end + t) for t in accumulate(REST)]
             simulation = run([*rests, Step(end + sum(REST) + 1.0, static=True)])
-        return self.observed(simulation.frames[-1]) if simulation.converged else None
+        return simulation
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
         """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""

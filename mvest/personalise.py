@@ -561,12 +561,12 @@ class _Chain:
         assert result.fitted is not None
         positions["generic"][self.closed.name] = closed0
         positions["fitted"][self.closed.name] = result.fitted[-1]
-        for frame in self.case.held_out:
-            state = self.held_state(frame)
-            for which, at in (("generic", m0), ("fitted", m)):
-                found = self.model.held(self.registered.mechanical(at), state)
-                if found is not None:
-                    positions[which][frame.name] = self.registered.seen(found, at)
+        held = [self.held_state(frame) for frame in self.case.held_out]
+        for which, at in (("generic", m0), ("fitted", m)) if held else ():
+            found = self.model.held(self.registered.mechanical(at), held)
+            for frame, points in zip(self.case.held_out, found, strict=True):
+                if points is not None:
+                    positions[which][frame.name] = self.registered.seen(points, at)
         turn, origin, target = self._alignment(closed0)
         for name, points in positions["generic"].items():
             positions["registered"][name] = (points - origin) @ turn.T + target

@@ -200,8 +200,8 @@ def simulate_patient(
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
     true = {CLOSED: displace(prediction.y.reshape(2, -1, 3)[1], registration, centre)}
-    for frame, state in _held(simulation, model.contact_valve).items():
-        found = model.held(at, state)
+    held = _held(simulation, model.contact_valve)
+    for frame, found in zip(held, model.held(at, tuple(held.values())), strict=True):
         if found is None:
             raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
         true[frame] = displace(found, registration, centre)

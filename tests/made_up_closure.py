@@ -6,6 +6,7 @@ It says nothing about valves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -145,11 +146,14 @@ class MadeUpClosure:
             np.concatenate([np.zeros_like(jacobian), jacobian]),
         )
 
-    def held(self, m: np.ndarray, state: HeldState) -> np.ndarray | None:
-        """The formula under another pressure; it is carried along with the annulus."""
-        self.states.append(state)
-        lift = (state.annulus - CLOSED_ANNULUS).mean(axis=0)
-        return shape(self._values(m), state.pressure_mmHg) + lift
+    def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray | None]:
+        """The formula under other pressures; it is carried along with the annulus."""
+        self.states += states
+        lifts = [(state.annulus - CLOSED_ANNULUS).mean(axis=0) for state in states]
+        return [
+            shape(self._values(m), state.pressure_mmHg) + lift
+            for state, lift in zip(states, lifts, strict=True)
+        ]
 
 
 CLOSED_ANNULUS = VALVE.motion.annulus[-1]

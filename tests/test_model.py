@@ -221,7 +221,7 @@ def test_a_valve_held_under_the_loads_of_the_closed_frame_stays_closed(closed):
     motion = model.contact_valve.motion
     model.restart(ClosedState(AT, simulation.frames[-1]))
     same = HeldState(CLOSING.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1])
-    held = model.held(AT, same)
+    (held,) = model.held(AT, [same])
     np.testing.assert_allclose(held, model.observed(simulation.frames[-1]), rtol=0, atol=1e-8)
 
 
@@ -231,7 +231,7 @@ def test_a_held_valve_is_one_that_was_closed_under_these_loads(closed, pressure,
     model, _ = closed
     motion = model.contact_valve.motion
     tips = motion.papillary_tips[-1] + [0.0, 0.0, lift]
-    held = model.held(AT, HeldState(pressure, motion.annulus[-1], tips))
+    (held,) = model.held(AT, [HeldState(pressure, motion.annulus[-1], tips)])
     moved = replace(motion, papillary_tips=np.stack([motion.papillary_tips[0], tips]))
     other = replace(
         model,
@@ -248,7 +248,7 @@ def test_held_loads_must_be_those_of_the_valve(closed):
     motion = model.contact_valve.motion
     model.restart(ClosedState(AT, simulation.frames[-1]))
     with pytest.raises(InputError, match="held annulus"):
-        model.held(AT, HeldState(80.0, motion.annulus[-1][:5], motion.papillary_tips[-1]))
+        model.held(AT, [HeldState(80.0, motion.annulus[-1][:5], motion.papillary_tips[-1])])
 
 
 def test_a_guide_has_the_model_s_parameters():

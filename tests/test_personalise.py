@@ -196,7 +196,7 @@ def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
 
 def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
     built = use(monkeypatch)
-    monkeypatch.setattr("tests.made_up_closure.MadeUpClosure.held", lambda *arguments: None)
+    monkeypatch.setattr("tests.made_up_closure.MadeUpClosure.held", lambda *arguments: [None])
     found = personalise(made_up_case(0.3), settings())
     assert built
     assert [d.frame for d in found.distances] == ["closed"]
