@@ -561,10 +561,10 @@ class _Chain:
         assert result.fitted is not None
         positions["generic"][self.closed.name] = closed0
         positions["fitted"][self.closed.name] = result.fitted[-1]
-        for frame in self.case.held_out:
-            state = self.held_state(frame)
-            for which, at in (("generic", m0), ("fitted", m)):
-                found = self.model.held(self.registered.mechanical(at), state)
+        # One valve after the other: the closed valve is gone on from, and not closed anew.
+        for which, at in (("generic", m0), ("fitted", m)):
+            for frame in self.case.held_out:
+                found = self.model.held(self.registered.mechanical(at), self.held_state(frame))
                 if found is not None:
                     positions[which][frame.name] = self.registered.seen(found, at)
         turn, origin, target = self._alignment(closed0)
