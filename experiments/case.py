@@ -175,7 +175,10 @@ def run_case(
 def estimate_case(
     config: Values, config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Read a case, personalise it, and write record, fields and report."""
+    """Read a case and personalise it: its record; fields and report are written."""
+    fields = folder / "fields.npz"
+    # Of an earlier run: there are none where nothing is found now.
+    fields.unlink(missing_ok=True)
     case = read_configured(config)
     for sentence in case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
@@ -187,7 +190,6 @@ def estimate_case(
     record = case_record(config, found, config_hash, started)
     files: list[Path] = []
     if found.distances:
-        fields = folder / "fields.npz"
         np.savez_compressed(fields, **fields_of(found))
         files.append(fields)
         if config["figures"]:

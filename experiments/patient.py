@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 from collections.abc import Mapping
@@ -170,11 +171,11 @@ def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[st
     except (OSError, ValueError) as error:
         raise InputError(f"{place.hidden} does not hold what a patient hides: {error}") from error
     values = hidden["values"]
-    revealed = dict(record)
-    groups = [record["unknowns"]] + [
-        record[key]["parameters"]
+    revealed = copy.deepcopy(record)
+    groups = [revealed["unknowns"]] + [
+        revealed[key]["parameters"]
         for key in ("without_nuisances", "as_in_the_paper")
-        if record[key] is not None
+        if revealed[key] is not None
     ]
     for rows in groups:
         for row in rows:
@@ -182,7 +183,7 @@ def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[st
             row["inside"] = (
                 None if row["low"] is None else bool(row["low"] <= row["truth"] <= row["high"])
             )
-    for modulus in record["moduli"]:
+    for modulus in revealed["moduli"]:
         truth = values[f"E_f.{modulus['region']}"]
         ratio = modulus["estimate"] / _estimate(record, f"E_f.{modulus['region']}")
         modulus["truth"] = ratio * truth

@@ -241,8 +241,8 @@ class FrameDistance:
         Whether the filter was shown it.
     generic, registered, personalised : (k,) mm
         With generic values of all unknowns; the same, displaced rigidly to lie closest to the
-        closed frame; and with the estimated unknowns. Of each corresponding vertex, or of each
-        point as seen from the predicted surface.
+        closed frame (as it is where vertices do not correspond); and with the estimated unknowns.
+        Of each corresponding vertex, or of each point as seen from the predicted surface.
     """
 
     frame: str
@@ -275,8 +275,8 @@ class Personalised:
     generic, registered, fitted : mapping of str to (n, 3) mm
         Frame -> predicted vertices; fitted as they are seen.
     narrower : mapping of str to (q,)
-        What if something were known: standard deviation of each estimated modulus relative to its
-        value, under ``now``, ``pressure`` (known exactly), ``half the error`` and so on.
+        What if something were known: standard deviation of the logarithm of each modulus, under
+        ``now``, ``pressure known``, ``half the error of the image`` and so on.
     confirmed_mm : float or None
         Largest distance of the fitted closed valve from the one closed anew.
     seconds : mapping of str to float
@@ -613,7 +613,7 @@ class _Chain:
         return surface_distance(frame.vertices, positions, self.case.surface.triangles)
 
     def narrower(self, result: StudyResult) -> Mapping[str, FloatArray]:
-        """Relative standard deviations of the moduli if something more were known.
+        """Standard deviations of the moduli's logarithms if something more were known.
 
         From the linear model at the estimate, all unknowns estimated.
         """

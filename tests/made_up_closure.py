@@ -39,9 +39,9 @@ TRUE = {
     "shift.x": 0.6,
     "shift.y": -0.4,
     "shift.z": 0.9,
-    "turn.x": 1.5,
-    "turn.y": -1.0,
-    "turn.z": 2.0,
+    "turn.x": 1.7,
+    "turn.y": -1.1,
+    "turn.z": 2.3,
 }
 PRIORS = {
     "E_f.anterior": (6.23, 3.1),

@@ -234,9 +234,10 @@ def write_patient_tables(results: Path) -> list[Path]:
     written = _write_table(
         results / "table2", second, _readable2(records), line, [NOTE, *_words2(second, records)]
     )
-    written += _write_table(
-        results / "table3", third, _readable3(third), line, [NOTE, *_words3(third)]
-    )
+    if not third.empty:
+        written += _write_table(
+            results / "table3", third, _readable3(third), line, [NOTE, *_words3(third)]
+        )
     fields = {
         records[k]["case"]["name"]: read_case_fields(results / PATIENTS / f"{name}.npz")
         for k, name in enumerate(kept)
@@ -303,6 +304,8 @@ def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
         column = table[f"{words} inside"]
         if column.notna().any():
             said.append(f"{words} for {int(column.sum())} of {int(column.notna().sum())}")
+    if known.empty:
+        return ["No estimation of these patients found moduli."]
     relative = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
     out = [
         "; ".join(said) + ".",
@@ -327,7 +330,9 @@ def _narrower(records: Sequence[Record]) -> list[str]:
 
 
 def _words3(table: pd.DataFrame) -> list[str]:
-    out = []
+    out: list[str] = []
+    if table.empty:
+        return out
     for seen, group in table.groupby("shown to the filter", sort=False):
         closer = group["closer [%]"]
         out.append(
@@ -383,7 +388,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
     bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.01, extend="max")
     bar.set_label("distance from the observed closed valve [mm]")
     figure.suptitle(
-        "Closed valves of five virtual patients (simulated), seen from the atrium", fontsize=11
+        "Closed valves of virtual patients (simulated), seen from the atrium", fontsize=11
     )
     return figure
 
@@ -476,6 +481,10 @@ def population_figure(table: pd.DataFrame) -> Figure:
             axes = grid[i, j]
             part = table[(table["estimation"] == kind) & (table["name"] == name)]
             part = part[part["inside"].notna()]
+            axes.set_title(f"{name.replace('E_f.', 'E_f ')}, {kind}", fontsize=10)
+            if part.empty:
+                axes.set_axis_off()
+                continue
             truth, found = part["truth"].astype(float), part["estimate"].astype(float)
             inside = part["inside"].astype(bool)
             for chosen, colour, words in (
@@ -500,7 +509,6 @@ def population_figure(table: pd.DataFrame) -> Figure:
                 axis.set_major_formatter(lambda v, _: f"{v:g}")
                 axis.set_minor_formatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "2357" else "")
                 axis.set_tick_params(which="minor", labelsize=8)
-            axes.set_title(f"{name.replace('E_f.', 'E_f ')}, {kind}", fontsize=10)
             axes.set_xlabel("hidden truth [MPa]")
             axes.set_ylabel("estimate, 95 % interval [MPa]")
             axes.legend(fontsize=8, loc="upper left", frameon=False)
@@ -529,6 +537,8 @@ def _interval(row: Mapping[str, Any]) -> str:
 
 
 def _amount(value: float, relative: bool) -> str:
+    if not np.isfinite(value):
+        return MISSING
     return f"{100 * value:.1f} %" if relative else f"{value:.2f}"
 
 

@@ -46,8 +46,8 @@ def clinical_measurements(
     Returns
     -------
     dict
-        Name with unit -> number; None where the shape defies a measurement. The first region is
-        the anterior one.
+        Name with unit -> number; what the shape defies is not in it, and nothing is where the
+        annulus has no plane. The first region is the anterior one.
     """
     # The middle of a leaflet's own annulus is nearest to that leaflet.
     first = np.unique(surface.triangles[surface.region == 0])
