@@ -274,10 +274,10 @@ def test_figure3_has_one_scale_for_all(fields_file, monkeypatch):
     far = copy.copy(fields)
     object.__setattr__(far, "distance_generic", 5 * fields.distance_generic)
     seen = []
-    true_colours = patients.face_colours
+    true_colours = patients.corner_colours
     monkeypatch.setattr(
         patients,
-        "face_colours",
+        "corner_colours",
         lambda scale, *rest: seen.append(scale) or true_colours(scale, *rest),
     )
     figure = figure3({"near": fields, "far": far})
