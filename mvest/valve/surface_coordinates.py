@@ -14,8 +14,8 @@ recovers both edge loops because the points of a loop lie on one circle.
 
 Across an edge between obtuse triangles a cotangent weight is negative, and the map may fold over.
 Positive weights never let it (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83);
-so where it folds over, small and negative weights are raised, and the coordinates are harmonic but
-for those few edges.
+so round the triangles that fold over, small and negative weights are raised until none does, and
+the coordinates are harmonic but for those few edges.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import scipy.sparse.linalg as spla
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy import vertex_normals
 
 __all__ = [
@@ -42,6 +42,8 @@ __all__ = [
 SMALLEST_WEIGHT = 0.05
 """To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
 0.58."""
+MOST_ROUNDS = 10
+"""How often they are raised, each time round the triangles that still fold over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,9 +200,14 @@ def surface_coordinates(
         )
     laplacian = cotangent_laplacian(vertices, triangles)
     coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
-    if len(coordinates.folded()):
-        raised = _raised(laplacian)
-        coordinates = _solve(vertices, triangles, annulus, free_edge, raised)
+    near = np.zeros(len(vertices), dtype=np.bool_)
+    for _ in range(MOST_ROUNDS):
+        folded = coordinates.folded()
+        if not folded.size:
+            return coordinates
+        near[triangles[folded]] = True
+        laplacian = _raised(laplacian, near)
+        coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
     folded = coordinates.folded()
     if folded.size:
         raise GeometryError(
@@ -228,10 +235,11 @@ def _solve(
     )
 
 
-def _raised(laplacian: sp.csr_matrix) -> sp.csr_matrix:
-    """The same with no weight below the smallest one."""
+def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
+    """The same with no weight below the smallest one at the vertices ``near (n,)``."""
     edges = sp.triu(laplacian, k=1).tocoo()
-    weight = np.maximum(-edges.data, SMALLEST_WEIGHT)
+    here = near[edges.row] | near[edges.col]
+    weight = np.where(here, np.maximum(-edges.data, SMALLEST_WEIGHT), -edges.data)
     off = sp.coo_matrix((-weight, (edges.row, edges.col)), shape=laplacian.shape)
     off = off + off.T
     return (off - sp.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()
@@ -298,7 +306,7 @@ def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArra
     # Triangle -> the edge through which it was entered, as it runs in it.
     entered = {owner[start]: start}
     queue = deque(entered)
-    crossed = []
+    crossed: list[tuple[int, int]] = []
     while queue and not crossed:
         triangle = queue.popleft()
         for i in range(3):
