@@ -158,10 +158,11 @@ def _drawn(case: ValveCase) -> Figure:
 
 
 def _told(frame: Frame) -> str:
-    same = "same vertices as the reference" if frame.corresponds else "without correspondence"
+    same = ", same vertices as the reference" if frame.corresponds else ", without correspondence"
     return (
         f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
-        f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices, {same}"
+        f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices"
+        f"{'' if frame.role is Role.REFERENCE else same}"
     )
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.estimation import (
     Filter,
     Gaussian,
@@ -365,7 +365,14 @@ def _solid(valve: Valve, band: Band | None, mesh: CaseMesh, store: Path | None) 
             raise InputError(
                 "a structured mesh needs a valve with two leaflets; expected mesh source tetwild"
             )
-        return structured_mesh(band, "hex18", mesh.columns, mesh.rows)
+        try:
+            return structured_mesh(band, "hex18", mesh.columns, mesh.rows)
+        except GeometryError as fault:
+            raise GeometryError(
+                f"structured mesh of {mesh.columns} x {mesh.rows} cells: {fault}; the reference "
+                "surface or the line between its leaflets is too jagged: smooth it, change the "
+                "number of cells, or take mesh source tetwild"
+            ) from fault
     settings = TetwildSettings(mesh.edge_length, 0.05 * mesh.edge_length)
     return tetrahedral_leaflets(valve.surface, settings, "tet10", store)
 

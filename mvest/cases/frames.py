@@ -20,6 +20,7 @@ from mvest.cases.checks import (
     ventricular_side,
 )
 from mvest.cases.csv_files import read_numbers, read_vertices
+from mvest.cases.ears import without_ears
 from mvest.cases.paths import CaseFolder
 from mvest.cases.rims import Rims, find_rims, match_annulus, two_loops
 from mvest.cases.schema import CaseFile, FrameEntry, wrong
@@ -47,12 +48,14 @@ class SeenFrame:
     """One entry of ``frames`` with its files read; lengths in mm, all else as in `Frame`.
 
     Loops are vertex numbers ``(k,)``, points ``(k, 3)`` mm, or None where they were not given.
+    ``ears`` are the triangles whose inner edge was turned (`mvest.cases.ears`).
     """
 
     entry: FrameEntry
     where: str
     vertices: FloatArray
     triangles: IntArray
+    ears: IntArray
     region: IntArray | None
     point_data: Mapping[str, NDArray[np.generic]]
     annulus: FloatArray | IntArray | None
@@ -79,11 +82,13 @@ def read_frame(folder: CaseFolder, document: CaseFile, number: int) -> SeenFrame
     scale = MM_PER[document.units.length]
     surface = _read_surface(folder, document, entry, where)
     tips = scale * np.array(entry.papillary_tips, dtype=np.float64)
+    triangles, ears = without_ears(surface.triangles)
     return SeenFrame(
         entry,
         where,
         scale * surface.vertices,
-        surface.triangles,
+        triangles,
+        ears,
         surface.region,
         surface.point_data,
         _read_curve(folder, entry.annulus, f"{where}.annulus", scale),
@@ -143,6 +148,7 @@ def check_reference(file: Path, seen: SeenFrame, derived: list[str]) -> Referenc
             )
     region = _required_region(file, seen)
     rims = _rims(file, seen)
+    _tell_ears(seen, derived)
     if seen.annulus is None or seen.free_edge is None:
         derived.append(
             "annulus and free edge: the two boundary loops of the reference surface"
@@ -157,6 +163,15 @@ def check_reference(file: Path, seen: SeenFrame, derived: list[str]) -> Referenc
     with at(file, surface):
         check_normals(seen.vertices, seen.triangles, rims.annulus, seen.tips)
     return ReferenceFrame(seen, region, rims, side)
+
+
+def _tell_ears(seen: SeenFrame, derived: list[str]) -> None:
+    if len(seen.ears):
+        derived.append(
+            f"surface of frame {seen.entry.name!r}: inner edge turned of triangles "
+            f"{seen.ears[:5].tolist()} ({len(seen.ears)} in all), which had all three corners on "
+            "one edge of the valve"
+        )
 
 
 def _required_region(file: Path, seen: SeenFrame) -> IntArray:
@@ -195,6 +210,7 @@ def place_frame(
         _check_alike(file, seen, reference)
     elif seen is not first:
         rims, region = _own_band(file, seen)
+        _tell_ears(seen, derived)
     annulus = _frame_annulus(file, reference, seen, rims, region, corresponds, derived)
     with at(file, f"{seen.where}.annulus"):
         check_annulus_size(annulus)

@@ -2,8 +2,9 @@
 
 Formats without labels (STL, PLY without a ``region`` property, OBJ without groups) carry the
 regions through the files' names: ``{anterior: a.stl, posterior: p.stl}``. Coincident vertices of
-such files, and of STL files as a whole, are merged and numbered in the order in which the triangles
-name them, so that two files with the same triangles in the same order correspond.
+such files, of STL files as a whole, and of OBJ files whose objects have vertices of their own, are
+merged and numbered in the order in which the triangles name them, so that two files with the same
+triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
         found = _read(files)
         region = _labels(files, found, regions)
         surface = RegionSurface(found.vertices, found.triangles, region, found.point_data)
-        if files.suffix.lower() == ".stl":
+        suffix = files.suffix.lower()
+        if suffix == ".stl" or (suffix == ".obj" and _apart(surface)):
             surface = _merged(surface)
     else:
         surface = _merged(_joined(files, list(regions.values())))
@@ -101,6 +103,14 @@ def _read(file: Path) -> SurfaceFile:
             if len(values) != rows:
                 raise InputError(f"{file}: data {name!r} has {len(values)} rows, expected {rows}")
     return found
+
+
+def _apart(surface: RegionSurface) -> bool:
+    """Whether there are several regions of which no two share a vertex."""
+    if surface.region is None or len(np.unique(surface.region)) < 2:
+        return False
+    corners = np.column_stack([surface.triangles.ravel(), np.repeat(surface.region, 3)])
+    return len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
 
 
 def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:

@@ -48,6 +48,8 @@ _READERS = {
 _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
 """Formats that are written without data."""
 REGION_PREFIX = "region."
+BINARY_PLY = " (properties of faces are read from text files only: write an ascii PLY, or VTP)"
+"""What meshio's reader of binary PLY files does not do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,8 +115,9 @@ def read_mesh(path: Path | str) -> meshio.Mesh:
         with np.errstate(over="ignore"):
             mesh = _READERS[source.suffix.lower()](str(source))
     except Exception as fault:  # meshio's readers fail in many ways on a damaged file
+        known = "" if source.suffix.lower() != ".ply" else BINARY_PLY
         raise InputError(
-            f"{source}: damaged or no {source.suffix[1:].upper()} file: {fault}"
+            f"{source}: damaged or no {source.suffix[1:].upper()} file: {fault}{known}"
         ) from fault
     if mesh.points.ndim != 2 or mesh.points.shape[1] != 3:
         raise GeometryError(f"{source}: points of shape {mesh.points.shape}, expected (n, 3)")

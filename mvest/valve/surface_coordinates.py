@@ -11,10 +11,16 @@ Both solve Laplace's equation with the cotangent weights of linear triangles (Pi
 1993, Exp. Math. 2:15). Together they map the band to a flat strip almost conformally once ``s`` is
 scaled by ``modulus``; ``exp`` of that strip is a plane annulus, in which a Delaunay triangulation
 recovers both edge loops because the points of a loop lie on one circle.
+
+Across an edge between obtuse triangles a cotangent weight is negative, and the map may fold over.
+Positive weights never let it (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83);
+so round the triangles that fold over, small and negative weights are raised until none does, and
+the coordinates are harmonic but for those few edges.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +29,7 @@ import scipy.sparse.linalg as spla
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy import vertex_normals
 
 __all__ = [
@@ -32,6 +38,12 @@ __all__ = [
     "cotangent_laplacian",
     "surface_coordinates",
 ]
+
+SMALLEST_WEIGHT = 0.05
+"""To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
+0.58."""
+MOST_ROUNDS = 10
+"""How often they are raised, each time round the triangles that still fold over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +76,11 @@ class SurfaceCoordinates:
         first = theta[:, :1]
         theta = first + _wrap(theta - first)
         return np.stack([theta, self.modulus * self.s[self.triangles]], axis=-1)
+
+    def folded(self) -> IntArray:
+        """Triangles ``(k,)`` that lie in the strip the other way round than most."""
+        area = _signed_area(self.strip_triangles())
+        return np.flatnonzero(area * np.sign(np.median(area)) <= 0)
 
     def locate(self, theta: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Triangle and barycentric weights of points given by their coordinates.
@@ -182,25 +199,50 @@ def surface_coordinates(
             "coordinate varies in it: flip its inner edge"
         )
     laplacian = cotangent_laplacian(vertices, triangles)
-    s = _dirichlet(laplacian, annulus, free_edge)
-    # s^T L s is the flux of s through the band, so 2 pi over it is the strip's length.
-    modulus = 2 * np.pi / float(s @ (laplacian @ s))
-    theta = _conjugate_angle(vertices, laplacian, vertices[annulus])
-    coordinates = SurfaceCoordinates(
-        triangles=np.asarray(triangles, dtype=np.int64),
-        theta=theta,
-        s=s,
-        modulus=modulus,
-        circumferential=_perpendicular_to_gradient(vertices, triangles, s),
-    )
-    area = _signed_area(coordinates.strip_triangles())
-    folded = np.flatnonzero(area * np.sign(np.median(area)) <= 0)
+    coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
+    near = np.zeros(len(vertices), dtype=np.bool_)
+    for _ in range(MOST_ROUNDS):
+        folded = coordinates.folded()
+        if not folded.size:
+            return coordinates
+        near[triangles[folded]] = True
+        laplacian = _raised(laplacian, near)
+        coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
+    folded = coordinates.folded()
     if folded.size:
         raise GeometryError(
             f"material coordinates fold over at {folded.size} triangles (first: "
             f"{folded[:5].tolist()}): the surface is too distorted or its triangles too obtuse"
         )
     return coordinates
+
+
+def _solve(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: IntArray,
+    free_edge: IntArray,
+    laplacian: sp.csr_matrix,
+) -> SurfaceCoordinates:
+    s = _dirichlet(laplacian, annulus, free_edge)
+    return SurfaceCoordinates(
+        triangles=np.asarray(triangles, dtype=np.int64),
+        theta=_conjugate_angle(vertices, triangles, laplacian, annulus, free_edge),
+        s=s,
+        # s^T L s is the flux of s through the band, so 2 pi over it is the strip's length.
+        modulus=2 * np.pi / float(s @ (laplacian @ s)),
+        circumferential=_perpendicular_to_gradient(vertices, triangles, s),
+    )
+
+
+def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
+    """The same with no weight below the smallest one at the vertices ``near (n,)``."""
+    edges = sp.triu(laplacian, k=1).tocoo()
+    here = near[edges.row] | near[edges.col]
+    weight = np.where(here, np.maximum(-edges.data, SMALLEST_WEIGHT), -edges.data)
+    off = sp.coo_matrix((-weight, (edges.row, edges.col)), shape=laplacian.shape)
+    off = off + off.T
+    return (off - sp.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()
 
 
 def _dirichlet(laplacian: sp.csr_matrix, zero: IntArray, one: IntArray) -> FloatArray:
@@ -215,33 +257,70 @@ def _dirichlet(laplacian: sp.csr_matrix, zero: IntArray, one: IntArray) -> Float
 
 
 def _conjugate_angle(
-    vertices: FloatArray, laplacian: sp.csr_matrix, annulus: FloatArray
+    vertices: FloatArray,
+    triangles: IntArray,
+    laplacian: sp.csr_matrix,
+    annulus: IntArray,
+    free_edge: IntArray,
 ) -> FloatArray:
-    """Harmonic angle with natural boundaries, started from the geometric angle about the axis.
+    """Harmonic angle with natural boundaries, that of vertex 0 being its angle about the axis.
 
-    The edge differences of the geometric angle are a closed form of period 2 pi; subtracting the
-    gradient that makes it divergence-free leaves the harmonic one.
+    A jump of 2 pi across a cut from edge to edge is a closed form of that period; subtracting the
+    gradient that makes it divergence-free leaves the harmonic one. The cut is one of the surface
+    and not of space: leaflets that have closed may lie across the axis.
     """
-    centre = annulus.mean(axis=0)
-    following = np.roll(annulus, -1, axis=0)
-    axis = np.cross(annulus - centre, following - centre).sum(axis=0)
-    axis /= np.linalg.norm(axis)
-    first = annulus[0] - centre
-    first = first - axis * (first @ axis)
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
-    relative = vertices - centre
-    phi = np.arctan2(relative @ second, relative @ first)
-
-    edges = sp.triu(laplacian, k=1).tocoo()
-    delta = _wrap(phi[edges.col] - phi[edges.row])
-    weight = -edges.data
+    row, column = _cut(triangles, annulus, free_edge).T
+    jump = 2 * np.pi * -np.asarray(laplacian[row, column]).ravel()
     divergence = np.zeros(len(vertices))
-    np.add.at(divergence, edges.row, weight * delta)
-    np.add.at(divergence, edges.col, -weight * delta)
+    np.add.at(divergence, row, jump)
+    np.add.at(divergence, column, -jump)
     correction = np.zeros(len(vertices))
     correction[1:] = spla.spsolve(laplacian[1:][:, 1:].tocsc(), divergence[1:])
-    return np.mod(phi + correction, 2 * np.pi)
+    return np.mod(_angle_of_first(vertices, annulus) + correction, 2 * np.pi)
+
+
+def _angle_of_first(vertices: FloatArray, annulus: IntArray) -> float:
+    """Angle of vertex 0 about the axis of the annulus, from the annulus' first vertex."""
+    loop = vertices[annulus]
+    centre = loop.mean(axis=0)
+    axis = np.cross(loop - centre, np.roll(loop, -1, axis=0) - centre).sum(axis=0)
+    axis /= np.linalg.norm(axis)
+    first = loop[0] - centre
+    first = first - axis * (first @ axis)
+    first /= np.linalg.norm(first)
+    relative = vertices[0] - centre
+    return float(np.arctan2(relative @ np.cross(axis, first), relative @ first))
+
+
+def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArray:
+    """Edges ``(k, 2)`` across which a chain of triangles leads from the annulus to the free edge.
+
+    Each runs the way that the annulus runs.
+    """
+    corners = triangles.tolist()
+    owner = {(t[i - 1], t[i]): n for n, t in enumerate(corners) for i in range(3)}
+    rim = set(free_edge.tolist())
+    start = (int(annulus[0]), int(annulus[1]))
+    along = start in owner
+    start = start if along else start[::-1]
+    # Triangle -> the edge through which it was entered, as it runs in it.
+    entered = {owner[start]: start}
+    queue = deque(entered)
+    crossed: list[tuple[int, int]] = []
+    while queue and not crossed:
+        triangle = queue.popleft()
+        for i in range(3):
+            a, b = corners[triangle][i - 1], corners[triangle][i]
+            neighbour = owner.get((b, a))
+            if neighbour is None and a in rim and b in rim:
+                crossed = [(b, a), entered[triangle]]
+                break
+            if neighbour is not None and neighbour not in entered:
+                entered[neighbour] = (b, a)
+                queue.append(neighbour)
+    while crossed[-1] != start:
+        crossed.append(entered[owner[crossed[-1][::-1]]])
+    return np.array(crossed if along else [edge[::-1] for edge in crossed])
 
 
 def _perpendicular_to_gradient(

@@ -124,9 +124,7 @@ def test_a_record_is_plain_and_knows_no_truth(made, tmp_path):
     assert [len(row) for row in back["iterates"]] == [2] * len(back["iterates"])
     assert len(back["identifiability"]["cramer_rao_std"]) == 2
     assert [row["name"] for row in back["unknowns"]] == list(found.names)
-    assert [len(row) for row in back["of_all_unknowns"]["iterates"]] == [11] * len(
-        back["iterates"]
-    )
+    assert [len(row) for row in back["of_all_unknowns"]["iterates"]] == [11] * len(back["iterates"])
     whole = of_all_unknowns(back)
     assert whole["parameters"] == back["unknowns"]
     assert len(whole["iterates"][0]) == 11

@@ -56,6 +56,35 @@ def test_coordinates_of_a_cylinder(cylinder):
     assert along.min() > np.cos(np.radians(0.51))
 
 
+def test_the_angle_of_a_band_across_its_own_axis(cylinder):
+    # Sheared by 2.5 radii, as a leaflet that has closed: the axis of the annulus pierces its wall.
+    vertices, triangles, annulus, free_edge = cylinder
+    sheared = vertices + np.outer(vertices[:, 2] / HEIGHT, [2.5 * RADIUS, 0.0, 0.0])
+    found = surface_coordinates(sheared, triangles, annulus, free_edge)
+    for rim in (annulus, free_edge):
+        step = np.angle(np.exp(1j * np.diff(found.theta[np.append(rim, rim[0])])))
+        assert (step > 0).all()
+        assert step.sum() == pytest.approx(2 * np.pi)
+
+
+def test_an_overhang_does_not_fold_the_coordinates(cylinder):
+    # One vertex in the middle lies two rows too far along the leaflet, half a mm above the wall:
+    # the weights of its slivers are so negative that the harmonic map folds one of them over.
+    vertices, triangles, annulus, free_edge = cylinder
+    n, rows = len(annulus), 24
+    one = 12 * n + 5
+    moved = np.array(vertices)
+    moved[one] *= [1.05, 1.05, 1.0]
+    moved[one, 2] += 2.0 * HEIGHT / rows
+    found = surface_coordinates(moved, triangles, annulus, free_edge)
+    assert not len(found.folded())
+    # Everywhere else they are where they were, to half a cell.
+    rest = np.arange(len(vertices)) != one
+    assert found.s[rest] == pytest.approx(vertices[rest, 2] / HEIGHT, abs=0.5 / rows)
+    turn = np.exp(1j * (found.theta - np.arctan2(vertices[:, 1], vertices[:, 0])))
+    assert np.abs(np.angle(turn / turn[0]))[rest].max() < 0.5 * 2 * np.pi / n
+
+
 def test_locate_inverts_the_coordinates(cylinder):
     vertices, triangles, *loops = cylinder
     found = surface_coordinates(vertices, triangles, *loops)
