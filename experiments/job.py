@@ -130,7 +130,8 @@ def compute(request: Request) -> dict[str, Any]:
 def _publish(request: Request, record: Mapping[str, Any]) -> None:
     """Let the results take over a run of an experiment as it is configured."""
     values = request.values
-    if not values["publish"] or values["sweep"] or record["status"] != "converged":
+    kept = record["status"] == "converged" or require_study(values).keeps_failures
+    if not values["publish"] or values["sweep"] or not kept:
         return
     results = Path(values["paths"]["results"])
     if request.publish_as is None:
@@ -160,12 +161,16 @@ class Study:
         (folder, record) -> table files written there.
     publish : callable
         (results folder, name, record, output folder) -> files written.
+    keeps_failures : bool
+        Whether the results also take over a run that found no estimate: where a share of runs is
+        counted, those must count that failed.
     """
 
     run: Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]]
     text: Callable[[Mapping[str, Any]], str]
     tables: Callable[[Path, Mapping[str, Any]], list[Path]]
     publish: Callable[[Path, str, Mapping[str, Any], Path], list[Path]]
+    keeps_failures: bool = False
 
 
 STUDIES: dict[str, Study] = {
@@ -206,6 +211,7 @@ STUDIES: dict[str, Study] = {
         lambda results, name, record, folder: publish_patient(
             results, name, record, folder / "fields.npz"
         ),
+        keeps_failures=True,
     ),
 }
 """Kinds of studies that a configuration can name."""

@@ -21,7 +21,7 @@ from mvest.registration import REGISTRATION, displace
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template
 
-COLUMNS, ROWS = 24, 7
+COLUMNS, ROWS = 32, 9
 TEMPLATE = Template()
 VALVE = TEMPLATE.valve(COLUMNS, ROWS)
 MESH = structured_mesh(TEMPLATE, "hex18", 8, 1)
@@ -117,6 +117,7 @@ class MadeUpClosure:
     fails_above: float = np.inf
     calls: list[np.ndarray] = field(default_factory=list)
     states: list[HeldState] = field(default_factory=list)
+    held_at: list[np.ndarray] = field(default_factory=list)
     valve = VALVE
     contact_valve = VALVE
     mesh = MESH
@@ -149,6 +150,7 @@ class MadeUpClosure:
     def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray | None]:
         """The formula under other pressures; it is carried along with the annulus."""
         self.states += states
+        self.held_at += [np.array(m)] * len(states)
         lifts = [(state.annulus - CLOSED_ANNULUS).mean(axis=0) for state in states]
         return [
             shape(self._values(m), state.pressure_mmHg) + lift

@@ -9,6 +9,7 @@ from mvest.cases.case import Role, Uncertainty
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.estimation.transform import to_filter
+from mvest.mechanics.settings import ClosureProtocol
 from mvest.personalise import (
     CaseMesh,
     PaperSettings,
@@ -20,7 +21,7 @@ from mvest.personalise import (
     build_model,
     personalise,
 )
-from mvest.registration import REGISTRATION
+from mvest.registration import REGISTRATION, RegisteredModel
 from mvest.surface_observation import UNKNOWN
 from mvest.valve.anatomy import LeafletSurface
 from tests.made_up_closure import (
@@ -185,9 +186,13 @@ def test_the_registered_valve_is_the_rigid_motion_of_least_squares(monkeypatch):
 def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
     built = use(monkeypatch)
     case = made_up_case(0.3)
-    personalise(case, settings())
+    late = case.held_out[0]
+    later = replace(late, name="later", time=0.5)
+    personalise(replace(case, frames=(*case.frames, later)), settings())
     states = built[0].states
-    assert len(states) == 2
+    assert len(states) == 4
+    # All of one valve and then all of the other: changing between them is to close anew.
+    assert [at[0] for at in built[0].held_at] == pytest.approx([6.23, 6.23, 5.1, 5.1], rel=0.1)
     for state in states:
         assert state.pressure_mmHg == 70.0
         np.testing.assert_array_equal(state.annulus, HELD_ANNULUS)
@@ -286,7 +291,7 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
     assert found.result.converged
     np.testing.assert_allclose(found.result.estimate[:2], true_of(found)[:2], rtol=0.02)
     assert abs(found.result.estimate[2]) < 0.01
-    assert [len(d.personalised) for d in found.distances] == [168, 168]
+    assert [len(d.personalised) for d in found.distances] == [288, 288]
     assert all(d.personalised.max() < 0.05 < d.generic.max() for d in found.distances)
     assert found.narrower["now"].shape == (2,)
     assert found.moduli_only.estimate is not None
@@ -298,10 +303,10 @@ def test_points_on_the_line_between_leaflets_are_of_either(monkeypatch):
     use(monkeypatch)
     chain = _Chain(made_up_case(0.3), settings(correspondence=False), None, None)
     (seen,) = chain.observation().seen
-    column = np.arange(len(seen.region)) % 24
-    np.testing.assert_array_equal(seen.region == UNKNOWN, (column == 0) | (column == 12))
-    assert set(seen.region[(column > 0) & (column < 12)]) == {0}
-    assert set(seen.region[column > 12]) == {1}
+    column = np.arange(len(seen.region)) % 32
+    np.testing.assert_array_equal(seen.region == UNKNOWN, (column == 0) | (column == 16))
+    assert set(seen.region[(column > 0) & (column < 16)]) == {0}
+    assert set(seen.region[column > 16]) == {1}
 
 
 def test_very_many_vertices_are_thinned_evenly():
@@ -402,7 +407,7 @@ def test_a_displacement_that_is_fixed_elsewhere_is_not_passed_over(name):
 def test_a_structured_mesh_is_of_two_leaflets():
     case = made_up_case()
     s = case.surface
-    region = np.where(np.arange(len(s.region)) % 24 < 6, 2, s.region)
+    region = np.where(np.arange(len(s.region)) % 32 < 8, 2, s.region)
     three = LeafletSurface(
         s.vertices, s.triangles, region, (*s.region_names, "septal"), s.fibre, s.thickness
     )
@@ -449,3 +454,41 @@ def test_a_further_frame_s_annulus_is_laid_on_the_samples_of_contact():
 def test_uncertainty_without_a_size_is_refused():
     with pytest.raises(InputError, match="expected > 0"):
         Uncertainty(0.0)
+
+
+# Coarser than that, and vertices of the surface would lie outside of the mesh.
+TWIN = replace(SMALL, guide_columns=16)
+
+
+@pytest.mark.slow
+def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
+    # The same mesh and no noise: what is left is the filter's tolerance and the prior's pull.
+    names = (*MODULI, "shift.z")
+    true = np.array([5.4, 3.8, 0.5])
+    given = [
+        Unknown("E_f.anterior", 6.0, 3.0),
+        Unknown("E_f.posterior", 4.2, 2.0),
+        Unknown("shift.z", 0.0, 1.0),
+    ]
+    protocol = ClosureProtocol(ramp=0.2, dt=0.04, growth=2.0, end=0.4)
+    wanted = PersonaliseSettings(tuple(given), replace(MECHANICS, protocol=protocol), TWIN, 1e-5)
+    case = made_up_case(std_mm=1e-3)
+    model = build_model(case, wanted)
+    twin = RegisteredModel(model, names)
+    found = twin(true)
+    assert found.converged
+    late = case.held_out[0]
+    held = _Chain(case, wanted, None, None).held_state(replace(late, pressure_mmHg=95.0))
+    seen = {
+        "closed": found.y.reshape(2, -1, 3)[1],
+        "late": twin.seen(model.held(true[:2], [held])[0], true),
+    }
+    frames = [replace(f, vertices=seen.get(f.name, f.vertices)) for f in case.frames]
+    frames[2] = replace(frames[2], pressure_mmHg=95.0)
+    result = personalise(replace(case, frames=tuple(frames)), wanted)
+    assert result.result.converged
+    np.testing.assert_allclose(result.result.estimate, true, rtol=1e-4)
+    assert [d.frame for d in result.distances] == ["closed", "late"]
+    for distance in result.distances:
+        assert distance.personalised.max() < 1e-3
+        assert distance.generic.mean() > 0.1

@@ -209,7 +209,7 @@ def test_files_of_a_case_are_written_and_read(config, monkeypatch, tmp_path, unm
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
     assert fields.truth is None
-    assert fields.sensitivity.shape == (168, 3, 11)
+    assert fields.sensitivity.shape == (288, 3, 11)
     distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
     np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)
     assert np.mean(distance[0]) == pytest.approx(
@@ -281,9 +281,9 @@ def test_a_check_draws_the_case_and_computes_nothing(run, folder, tmp_path, monk
     )
     status, out, err = run(*OWN, f"case={folder}", "check=true")
     assert status == 0, err
-    assert "made_up: 168 vertices" in out
+    assert "made_up: 288 vertices" in out
     assert "leaflets anterior, posterior" in out
-    assert "frame late (held_out) at 0.4 s, 70 mmHg, 168 vertices, same vertices" in out
+    assert "frame late (held_out) at 0.4 s, 70 mmHg, 288 vertices, same vertices" in out
     assert "In order; drawn in" in out
     written = {path.name for path in (tmp_path / "outputs").rglob("*") if path.is_file()}
     assert {name for name in written if not name.startswith(".")} == {"case.png", "case.pdf"}
