@@ -177,6 +177,12 @@ def seam(gap):
     return change
 
 
+def torn(x, t, r):
+    """Each leaflet with vertices of its own, those of the seams twice."""
+    used, t = np.unique(np.where(r[:, None] == 1, t + len(x), t), return_inverse=True)
+    return np.vstack([x, x])[used], t.reshape(-1, 3), r
+
+
 def short_data(folder, document):
     """A file whose labels are fewer than its triangles."""
     text = (folder / "open.vtp").read_text()
@@ -280,6 +286,9 @@ CASES = {
         surfaces(lambda x, t, r: (
             np.vstack([x, x + 60.0]), np.vstack([t, t + len(x)]), np.append(r, r)
         )), G, OPEN, r"2 pieces that do not touch \(192, 192 vertices\)",
+    ),
+    "double vertices along the seams": (
+        surfaces(torn), G, OPEN, "2 pieces that do not touch .* sharing the vertices of their seam"
     ),
     "handle": (
         surface(handle, "closed"), G, CLOSED, "Euler number -2, expected 0: .* has 1 handle"
