@@ -331,7 +331,8 @@ def build_model(
     if given != needed:
         raise InputError(
             f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
-            f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}"
+            f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}, or "
+            "leaflets named as the unknowns are"
         )
     free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
     fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}

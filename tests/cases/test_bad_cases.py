@@ -190,6 +190,24 @@ def labels_as_text(content):
     return change
 
 
+def torn(x, t, r):
+    """Each leaflet with vertices of its own, those of the seams twice."""
+    used, t = np.unique(np.where(r[:, None] == 1, t + len(x), t), return_inverse=True)
+    return np.vstack([x, x])[used], t.reshape(-1, 3), r
+
+
+def short_data(folder, document):
+    """A file whose labels are fewer than its triangles."""
+    text = (folder / "open.vtp").read_text()
+    short = text.replace('Name="region"', 'Name="region" format="ascii"', 1)
+    start = short.index(">", short.index('Name="region"')) + 1
+    end = short.index("</DataArray>", start)
+    short = short[:start].replace(' format="binary"', "", 0) + "0 1 1" + short[end:]
+    head = short.index("<DataArray")
+    tag = short[head:start].replace(' format="ascii"', "").replace("binary", "ascii")
+    (folder / "open.vtp").write_text(short[:head] + tag + short[start:])
+
+
 def turned(some):
     def edit(x, t, r):
         t[some] = t[some][:, ::-1]
@@ -281,6 +299,9 @@ CASES = {
         surfaces(lambda x, t, r: (
             np.vstack([x, x + 60.0]), np.vstack([t, t + len(x)]), np.append(r, r)
         )), G, OPEN, r"2 pieces that do not touch \(192, 192 vertices\)",
+    ),
+    "double vertices along the seams": (
+        surfaces(torn), G, OPEN, "2 pieces that do not touch .* sharing the vertices of their seam"
     ),
     "handle": (
         surface(handle, "closed"), G, CLOSED, "Euler number -2, expected 0: .* has 1 handle"

@@ -163,6 +163,11 @@ def test_text_of_the_record_is_escaped(hostile_page, html) -> None:
     assert "alert(1)" in Page(hostile_page).text
 
 
+def test_the_closing_anew_answers_whether_there_is_another_closed_state(html) -> None:
+    # And not whether one closed frame determines the moduli, which the run does not ask.
+    assert "Is the closed state the only one?</strong> Closed anew from the open valve" in html
+
+
 @pytest.fixture(scope="module")
 def bare_page(case, tmp_path_factory):
     """Of an almost empty record, and fields of a run that gave up before it predicted anything."""
@@ -181,7 +186,7 @@ def test_what_is_missing_is_said(bare_page) -> None:
     assert [name for name in page.ids if name in SECTIONS] == list(SECTIONS)
     for sentence in (
         "No stiffness was estimated: no equilibrium.",
-        "The run did not check beforehand",
+        "The run did not check whether the fitted closed state",
         "The record names nothing that was derived",
         "The record lists no moduli.",
         "The record lists no parameters.",
