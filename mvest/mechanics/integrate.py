@@ -337,7 +337,12 @@ class _Stepper:
             if converged or float(np.abs(d).max()) <= newton.smallest_move:
                 # The factor of the converged state is kept for the sensitivities.
                 return _Solved(x, current, residuals, pairs)
-            x, current = self._line_search(x, d, current, pairs, evaluate)
+            try:
+                x, current = self._line_search(x, d, current, pairs, evaluate)
+            except MemoryError as error:
+                # Collision detection needs room for all that a step sweeps over: the iterates have
+                # run away.
+                raise _StepError(Reason.NO_CONVERGENCE) from error
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
                 assert current.blocks is not None
