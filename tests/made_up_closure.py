@@ -218,5 +218,5 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
         built.append(MadeUpClosure(free, fixed, **changes))
         return built[-1]
 
-    monkeypatch.setattr("mvest.personalise.build_model", build)
+    monkeypatch.setattr("mvest.personalise.chain.build_model", build)
     return built

@@ -16,11 +16,10 @@ from mvest.personalise import (
     PersonaliseSettings,
     Treatment,
     Unknown,
-    _Chain,
-    _thinned,
     build_model,
     personalise,
 )
+from mvest.personalise.chain import _Chain, _thinned
 from mvest.registration import REGISTRATION, RegisteredModel
 from mvest.surface_observation import UNKNOWN
 from mvest.valve.anatomy import LeafletSurface

@@ -1,25 +1,16 @@
-"""From a case to its moduli: the generic valve, the personalised one, and what is known of both.
-
-The chain of one case. The model is built from the reference frame, its chordae and the tracked
-boundary. What is not known besides the moduli (pressure, rest lengths and stiffness of the chordae,
-a rigid displacement between the tracked boundary and the leaflets) is estimated with a prior, or
-considered, or left fixed, as each unknown says. Frames that are held out are predicted, never
-shown.
-"""
+"""The chain of one case: observation, generic valve, estimation, held-out frames, intervals."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.errors import GeometryError, InputError
 from mvest.estimation import (
     Filter,
     Gaussian,
@@ -32,11 +23,12 @@ from mvest.estimation import (
     observation_noise,
 )
 from mvest.estimation.transform import to_filter
-from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.model import ClosureModel
 from mvest.observation import Observation
 from mvest.observation_errors import SpatialCorrelation
+from mvest.personalise.model import build_model
+from mvest.personalise.result import FrameDistance, Personalised
+from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.registration import REGISTRATION, RegisteredModel
 from mvest.study import Case, Observed, SharedStart, StudyResult, estimate
 from mvest.surface_observation import (
@@ -47,27 +39,9 @@ from mvest.surface_observation import (
     surface_distance,
 )
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy import Valve
 from mvest.valve.band import Band
-from mvest.valve.mesh import SolidMesh
-from mvest.valve.structured import structured_mesh
-from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
-from mvest.valve.tetrahedralize import TetwildSettings
 
-__all__ = [
-    "CaseMesh",
-    "FrameDistance",
-    "PaperSettings",
-    "PersonaliseSettings",
-    "Personalised",
-    "Treatment",
-    "Unknown",
-    "build_model",
-    "personalise",
-]
-
-FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
-"""Unknowns of the whole valve that act on its closure."""
+__all__ = ["personalise"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
@@ -77,305 +51,6 @@ MOST_VERTICES = 2000
 nothing new, and their correlation is factorised."""
 
 OnStep = Callable[[float, int], None]
-
-
-class Treatment(Enum):
-    """What becomes of an unknown: estimated, considered (its doubt counts), or fixed."""
-
-    ESTIMATED = "estimated"
-    CONSIDERED = "considered"
-    FIXED = "fixed"
-
-
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """One quantity that is not known of a case.
-
-    Attributes
-    ----------
-    name : str
-        ``E_f.REGION`` (MPa), ``pressure_scale``, ``chord_stiffness``, ``chord_rest_length``
-        (factors), ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
-    mean, std : float
-        Prior in the same unit.
-    treatment : Treatment
-    """
-
-    name: str
-    mean: float
-    std: float
-    treatment: Treatment = Treatment.ESTIMATED
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
-            raise InputError(
-                f"prior of {self.name}: mean {self.mean} and std {self.std}, expected finite "
-                f"numbers and std > 0"
-            )
-        if self.is_positive and self.mean <= 0:
-            raise InputError(f"prior of {self.name}: mean {self.mean}, expected > 0")
-
-    @property
-    def is_modulus(self) -> bool:
-        """Whether it is what is asked for, and not a nuisance."""
-        return self.name.startswith("E_f.")
-
-    @property
-    def is_positive(self) -> bool:
-        """Whether it is estimated by its logarithm."""
-        return self.name not in REGISTRATION
-
-
-@dataclass(frozen=True, slots=True)
-class CaseMesh:
-    """What a case is computed on.
-
-    Attributes
-    ----------
-    source : str
-        ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
-        unstructured mesh of the thickened leaflets.
-    columns, rows : int
-        Cells of a structured mesh.
-    guide_columns, guide_rows : int
-        Cells of the coarser mesh on which the first closure is followed.
-    edge_length : float
-        mm, of an unstructured mesh.
-    contact_columns, contact_rows : int
-        Samples of contact.
-    """
-
-    source: str = "structured"
-    columns: int = 40
-    rows: int = 5
-    guide_columns: int = 24
-    guide_rows: int = 3
-    edge_length: float = 2.5
-    contact_columns: int = 144
-    contact_rows: int = 32
-
-    def __post_init__(self) -> None:
-        if self.source not in ("structured", "tetwild"):
-            raise InputError(f"mesh source {self.source!r}, expected structured or tetwild")
-
-
-@dataclass(frozen=True, slots=True)
-class PaperSettings:
-    """The paper's filter, which knows of no nuisance: all in MPa² and mm².
-
-    Attributes
-    ----------
-    P0, Q, R : float
-        Variances of the prior and of the process, and of a coordinate as seen.
-    max_iterations : int
-    """
-
-    P0: float = 0.01
-    Q: float = 0.01
-    R: float = 0.01
-    max_iterations: int = 12
-
-
-@dataclass(frozen=True, slots=True)
-class PersonaliseSettings:
-    """How a case is personalised.
-
-    Attributes
-    ----------
-    unknowns : tuple of Unknown
-        The means of the moduli are the generic ones.
-    mechanics : MechanicsSettings
-        The pressure of its protocol is replaced by that of the closed frame.
-    mesh : CaseMesh
-    tolerance : float
-        Of the filter, relative.
-    max_iterations : int
-    reach : float
-        See :class:`mvest.model.ClosureModel`.
-    paper : PaperSettings or None
-        Whether the moduli are also estimated as the paper does it.
-    moduli_only : bool
-        Whether they are also estimated with all nuisances fixed, but otherwise as here.
-    confirm : bool
-        Whether the fitted valve is closed anew from the open one.
-    correspondence : bool
-        Whether corresponding vertices are used as such; otherwise only where the surface is.
-    """
-
-    unknowns: tuple[Unknown, ...]
-    mechanics: MechanicsSettings
-    mesh: CaseMesh = field(default_factory=CaseMesh)
-    tolerance: float = 2e-3
-    max_iterations: int = 15
-    reach: float = 0.5
-    paper: PaperSettings | None = None
-    moduli_only: bool = False
-    confirm: bool = False
-    correspondence: bool = True
-
-    def __post_init__(self) -> None:
-        names = [unknown.name for unknown in self.unknowns]
-        if len(set(names)) != len(names):
-            raise InputError(f"unknowns {', '.join(names)} are not all different")
-        for u in self.unknowns:
-            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
-                raise InputError(
-                    f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
-                    "estimated or considered"
-                )
-        if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
-            raise InputError(
-                f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
-                "E_f.REGION that is estimated"
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameDistance:
-    """How far a frame as seen is from the closed valve of the model.
-
-    Attributes
-    ----------
-    frame : str
-    seen : bool
-        Whether the filter was shown it.
-    generic, registered, personalised : (k,) mm
-        With generic values of all unknowns; the same, displaced rigidly to lie closest to the
-        closed frame (as it is where vertices do not correspond); and with the estimated unknowns.
-        Of each corresponding vertex, or of each point as seen from the predicted surface.
-    """
-
-    frame: str
-    seen: bool
-    generic: FloatArray
-    registered: FloatArray
-    personalised: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Personalised:
-    """All that is found out about a case.
-
-    Attributes
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    mesh : SolidMesh
-    names : tuple of str, (p,)
-        Unknowns that are estimated or considered.
-    prior : Gaussian
-        Of these.
-    result : StudyResult
-    moduli_only : StudyResult or None
-        With all nuisances fixed.
-    paper : StudyResult or None
-        As the paper does it.
-    distances : tuple of FrameDistance
-        Empty if there is no estimate.
-    generic, registered, fitted : mapping of str to (n, 3) mm
-        Frame -> predicted vertices; fitted as they are seen.
-    narrower : mapping of str to (q,)
-        What if something were known: standard deviation of the logarithm of each modulus, under
-        ``now``, ``pressure known``, ``half the error of the image`` and so on.
-    confirmed_mm : float or None
-        Largest distance of the fitted closed valve from the one closed anew.
-    seconds : mapping of str to float
-        Wall-clock time of each part.
-    """
-
-    case: ValveCase
-    settings: PersonaliseSettings
-    mesh: SolidMesh
-    names: tuple[str, ...]
-    prior: Gaussian
-    result: StudyResult
-    moduli_only: StudyResult | None
-    paper: StudyResult | None
-    distances: tuple[FrameDistance, ...]
-    generic: Mapping[str, FloatArray]
-    registered: Mapping[str, FloatArray]
-    fitted: Mapping[str, FloatArray]
-    narrower: Mapping[str, FloatArray]
-    confirmed_mm: float | None
-    seconds: Mapping[str, float]
-
-
-def build_model(
-    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
-) -> ClosureModel:
-    """The closure of a case as a function of its unknowns, those of the registration excluded.
-
-    Parameters
-    ----------
-    case : ValveCase
-    settings : PersonaliseSettings
-    store : Path, optional
-        Where an unstructured mesh is kept.
-
-    Raises
-    ------
-    InputError
-        If an unknown is not one of the case's, or a modulus is missing.
-    GeometryError, MeshingError
-        If the leaflets cannot be meshed.
-    """
-    mechanical = [u for u in settings.unknowns if u.name not in REGISTRATION]
-    strange = [u.name for u in mechanical if not u.is_modulus and u.name not in FACTORS]
-    if strange:
-        raise InputError(
-            f"unknowns {', '.join(strange)}; expected E_f.REGION, {', '.join(FACTORS)} or some of "
-            f"{', '.join(REGISTRATION)}"
-        )
-    needed = {f"E_f.{region}" for region in case.surface.region_names}
-    given = {u.name for u in mechanical if u.is_modulus}
-    if given != needed:
-        raise InputError(
-            f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
-            f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}, or "
-            "leaflets named as the unknowns are"
-        )
-    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
-    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
-    protocol = replace(
-        settings.mechanics.protocol, pressure_mmHg=case.frame(Role.CLOSED).pressure_mmHg
-    )
-    mechanics = replace(settings.mechanics, protocol=protocol)
-    valve, mesh = case.valve, settings.mesh
-    band = Band(valve) if len(case.surface.region_names) == 2 else None
-    contact = valve if band is None else band.sampled(mesh.contact_columns, mesh.contact_rows)
-    solid = _solid(valve, band, mesh, store)
-    model = ClosureModel(
-        valve,
-        contact,
-        solid,
-        mechanics,
-        free,
-        fixed,
-        continuation=True,
-        reach=settings.reach,
-    )
-    if band is not None:
-        coarse = structured_mesh(band, "hex18", mesh.guide_columns, mesh.guide_rows)
-        model.guide = replace(model, mesh=coarse)
-    return model
-
-
-def _solid(valve: Valve, band: Band | None, mesh: CaseMesh, store: Path | None) -> SolidMesh:
-    if mesh.source == "structured":
-        if band is None:
-            raise InputError(
-                "a structured mesh needs a valve with two leaflets; expected mesh source tetwild"
-            )
-        try:
-            return structured_mesh(band, "hex18", mesh.columns, mesh.rows)
-        except GeometryError as fault:
-            raise GeometryError(
-                f"structured mesh of {mesh.columns} x {mesh.rows} cells: {fault}; the reference "
-                "surface or the line between its leaflets is too jagged: smooth it, change the "
-                "number of cells, or take mesh source tetwild"
-            ) from fault
-    settings = TetwildSettings(mesh.edge_length, 0.05 * mesh.edge_length)
-    return tetrahedral_leaflets(valve.surface, settings, "tet10", store)
 
 
 def personalise(

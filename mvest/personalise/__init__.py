@@ -1,0 +1,31 @@
+"""From a case to its moduli: the generic valve, the personalised one, and what is known of both.
+
+The chain of one case. The model is built from the reference frame, its chordae and the tracked
+boundary. What is not known besides the moduli (pressure, rest lengths and stiffness of the chordae,
+a rigid displacement between the tracked boundary and the leaflets) is estimated with a prior, or
+considered, or left fixed, as each unknown says. Frames that are held out are predicted, never
+shown.
+"""
+
+from mvest.personalise.chain import personalise
+from mvest.personalise.model import build_model
+from mvest.personalise.result import FrameDistance, Personalised
+from mvest.personalise.settings import (
+    CaseMesh,
+    PaperSettings,
+    PersonaliseSettings,
+    Treatment,
+    Unknown,
+)
+
+__all__ = [
+    "CaseMesh",
+    "FrameDistance",
+    "PaperSettings",
+    "PersonaliseSettings",
+    "Personalised",
+    "Treatment",
+    "Unknown",
+    "build_model",
+    "personalise",
+]

@@ -1,0 +1,98 @@
+"""The closure of a case as a function of its unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from mvest.cases.case import Role, ValveCase
+from mvest.errors import GeometryError, InputError
+from mvest.model import ClosureModel
+from mvest.personalise.settings import FACTORS, CaseMesh, PersonaliseSettings, Treatment
+from mvest.registration import REGISTRATION
+from mvest.valve.anatomy import Valve
+from mvest.valve.band import Band
+from mvest.valve.mesh import SolidMesh
+from mvest.valve.structured import structured_mesh
+from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
+from mvest.valve.tetrahedralize import TetwildSettings
+
+__all__ = ["build_model"]
+
+
+def build_model(
+    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
+) -> ClosureModel:
+    """The closure of a case as a function of its unknowns, those of the registration excluded.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    store : Path, optional
+        Where an unstructured mesh is kept.
+
+    Raises
+    ------
+    InputError
+        If an unknown is not one of the case's, or a modulus is missing.
+    GeometryError, MeshingError
+        If the leaflets cannot be meshed.
+    """
+    mechanical = [u for u in settings.unknowns if u.name not in REGISTRATION]
+    strange = [u.name for u in mechanical if not u.is_modulus and u.name not in FACTORS]
+    if strange:
+        raise InputError(
+            f"unknowns {', '.join(strange)}; expected E_f.REGION, {', '.join(FACTORS)} or some of "
+            f"{', '.join(REGISTRATION)}"
+        )
+    needed = {f"E_f.{region}" for region in case.surface.region_names}
+    given = {u.name for u in mechanical if u.is_modulus}
+    if given != needed:
+        raise InputError(
+            f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
+            f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}, or "
+            "leaflets named as the unknowns are"
+        )
+    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
+    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
+    protocol = replace(
+        settings.mechanics.protocol, pressure_mmHg=case.frame(Role.CLOSED).pressure_mmHg
+    )
+    mechanics = replace(settings.mechanics, protocol=protocol)
+    valve, mesh = case.valve, settings.mesh
+    band = Band(valve) if len(case.surface.region_names) == 2 else None
+    contact = valve if band is None else band.sampled(mesh.contact_columns, mesh.contact_rows)
+    solid = _solid(valve, band, mesh, store)
+    model = ClosureModel(
+        valve,
+        contact,
+        solid,
+        mechanics,
+        free,
+        fixed,
+        continuation=True,
+        reach=settings.reach,
+    )
+    if band is not None:
+        coarse = structured_mesh(band, "hex18", mesh.guide_columns, mesh.guide_rows)
+        model.guide = replace(model, mesh=coarse)
+    return model
+
+
+def _solid(valve: Valve, band: Band | None, mesh: CaseMesh, store: Path | None) -> SolidMesh:
+    if mesh.source == "structured":
+        if band is None:
+            raise InputError(
+                "a structured mesh needs a valve with two leaflets; expected mesh source tetwild"
+            )
+        try:
+            return structured_mesh(band, "hex18", mesh.columns, mesh.rows)
+        except GeometryError as fault:
+            raise GeometryError(
+                f"structured mesh of {mesh.columns} x {mesh.rows} cells: {fault}; the reference "
+                "surface or the line between its leaflets is too jagged: smooth it, change the "
+                "number of cells, or take mesh source tetwild"
+            ) from fault
+    settings = TetwildSettings(mesh.edge_length, 0.05 * mesh.edge_length)
+    return tetrahedral_leaflets(valve.surface, settings, "tet10", store)

@@ -1,0 +1,85 @@
+"""What is found out about a case."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from mvest.cases.case import ValveCase
+from mvest.estimation import Gaussian
+from mvest.personalise.settings import PersonaliseSettings
+from mvest.study import StudyResult
+from mvest.typing import FloatArray
+from mvest.valve.mesh import SolidMesh
+
+__all__ = ["FrameDistance", "Personalised"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameDistance:
+    """How far a frame as seen is from the closed valve of the model.
+
+    Attributes
+    ----------
+    frame : str
+    seen : bool
+        Whether the filter was shown it.
+    generic, registered, personalised : (k,) mm
+        With generic values of all unknowns; the same, displaced rigidly to lie closest to the
+        closed frame (as it is where vertices do not correspond); and with the estimated unknowns.
+        Of each corresponding vertex, or of each point as seen from the predicted surface.
+    """
+
+    frame: str
+    seen: bool
+    generic: FloatArray
+    registered: FloatArray
+    personalised: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Personalised:
+    """All that is found out about a case.
+
+    Attributes
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    mesh : SolidMesh
+    names : tuple of str, (p,)
+        Unknowns that are estimated or considered.
+    prior : Gaussian
+        Of these.
+    result : StudyResult
+    moduli_only : StudyResult or None
+        With all nuisances fixed.
+    paper : StudyResult or None
+        As the paper does it.
+    distances : tuple of FrameDistance
+        Empty if there is no estimate.
+    generic, registered, fitted : mapping of str to (n, 3) mm
+        Frame -> predicted vertices; fitted as they are seen.
+    narrower : mapping of str to (q,)
+        What if something were known: standard deviation of the logarithm of each modulus, under
+        ``now``, ``pressure known``, ``half the error of the image`` and so on.
+    confirmed_mm : float or None
+        Largest distance of the fitted closed valve from the one closed anew.
+    seconds : mapping of str to float
+        Wall-clock time of each part.
+    """
+
+    case: ValveCase
+    settings: PersonaliseSettings
+    mesh: SolidMesh
+    names: tuple[str, ...]
+    prior: Gaussian
+    result: StudyResult
+    moduli_only: StudyResult | None
+    paper: StudyResult | None
+    distances: tuple[FrameDistance, ...]
+    generic: Mapping[str, FloatArray]
+    registered: Mapping[str, FloatArray]
+    fitted: Mapping[str, FloatArray]
+    narrower: Mapping[str, FloatArray]
+    confirmed_mm: float | None
+    seconds: Mapping[str, float]

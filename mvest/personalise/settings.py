@@ -1,0 +1,168 @@
+"""How a case is personalised: what is unknown of it, and what it is computed on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.registration import REGISTRATION
+
+__all__ = ["FACTORS", "CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
+
+FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
+"""Unknowns of the whole valve that act on its closure."""
+
+
+class Treatment(Enum):
+    """What becomes of an unknown: estimated, considered (its doubt counts), or fixed."""
+
+    ESTIMATED = "estimated"
+    CONSIDERED = "considered"
+    FIXED = "fixed"
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One quantity that is not known of a case.
+
+    Attributes
+    ----------
+    name : str
+        ``E_f.REGION`` (MPa), ``pressure_scale``, ``chord_stiffness``, ``chord_rest_length``
+        (factors), ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
+    mean, std : float
+        Prior in the same unit.
+    treatment : Treatment
+    """
+
+    name: str
+    mean: float
+    std: float
+    treatment: Treatment = Treatment.ESTIMATED
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
+            raise InputError(
+                f"prior of {self.name}: mean {self.mean} and std {self.std}, expected finite "
+                f"numbers and std > 0"
+            )
+        if self.is_positive and self.mean <= 0:
+            raise InputError(f"prior of {self.name}: mean {self.mean}, expected > 0")
+
+    @property
+    def is_modulus(self) -> bool:
+        """Whether it is what is asked for, and not a nuisance."""
+        return self.name.startswith("E_f.")
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether it is estimated by its logarithm."""
+        return self.name not in REGISTRATION
+
+
+@dataclass(frozen=True, slots=True)
+class CaseMesh:
+    """What a case is computed on.
+
+    Attributes
+    ----------
+    source : str
+        ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
+        unstructured mesh of the thickened leaflets.
+    columns, rows : int
+        Cells of a structured mesh.
+    guide_columns, guide_rows : int
+        Cells of the coarser mesh on which the first closure is followed.
+    edge_length : float
+        mm, of an unstructured mesh.
+    contact_columns, contact_rows : int
+        Samples of contact.
+    """
+
+    source: str = "structured"
+    columns: int = 40
+    rows: int = 5
+    guide_columns: int = 24
+    guide_rows: int = 3
+    edge_length: float = 2.5
+    contact_columns: int = 144
+    contact_rows: int = 32
+
+    def __post_init__(self) -> None:
+        if self.source not in ("structured", "tetwild"):
+            raise InputError(f"mesh source {self.source!r}, expected structured or tetwild")
+
+
+@dataclass(frozen=True, slots=True)
+class PaperSettings:
+    """The paper's filter, which knows of no nuisance: all in MPa² and mm².
+
+    Attributes
+    ----------
+    P0, Q, R : float
+        Variances of the prior and of the process, and of a coordinate as seen.
+    max_iterations : int
+    """
+
+    P0: float = 0.01
+    Q: float = 0.01
+    R: float = 0.01
+    max_iterations: int = 12
+
+
+@dataclass(frozen=True, slots=True)
+class PersonaliseSettings:
+    """How a case is personalised.
+
+    Attributes
+    ----------
+    unknowns : tuple of Unknown
+        The means of the moduli are the generic ones.
+    mechanics : MechanicsSettings
+        The pressure of its protocol is replaced by that of the closed frame.
+    mesh : CaseMesh
+    tolerance : float
+        Of the filter, relative.
+    max_iterations : int
+    reach : float
+        See :class:`mvest.model.ClosureModel`.
+    paper : PaperSettings or None
+        Whether the moduli are also estimated as the paper does it.
+    moduli_only : bool
+        Whether they are also estimated with all nuisances fixed, but otherwise as here.
+    confirm : bool
+        Whether the fitted valve is closed anew from the open one.
+    correspondence : bool
+        Whether corresponding vertices are used as such; otherwise only where the surface is.
+    """
+
+    unknowns: tuple[Unknown, ...]
+    mechanics: MechanicsSettings
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    tolerance: float = 2e-3
+    max_iterations: int = 15
+    reach: float = 0.5
+    paper: PaperSettings | None = None
+    moduli_only: bool = False
+    confirm: bool = False
+    correspondence: bool = True
+
+    def __post_init__(self) -> None:
+        names = [unknown.name for unknown in self.unknowns]
+        if len(set(names)) != len(names):
+            raise InputError(f"unknowns {', '.join(names)} are not all different")
+        for u in self.unknowns:
+            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
+                raise InputError(
+                    f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
+                    "estimated or considered"
+                )
+        if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
+            raise InputError(
+                f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
+                "E_f.REGION that is estimated"
+            )
