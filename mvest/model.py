@@ -99,8 +99,9 @@ class ClosureModel:
         mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
         the same reason as with ``continuation``.
     repeat : bool
-        Whether a continued closure that fails is repeated with the guide, and one that fails with
-        the guide from the open valve.
+        Whether a continued or guided closure that fails is repeated from the open valve, which
+        takes long and seldom finds what the others did not. A continued one that fails is repeated
+        with the guide in any case.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -225,9 +226,7 @@ class ClosureModel:
             end, last = self.settings.protocol.end, steps[-1]
             if self._closed is not None and self._near(m):
                 simulation = run([last], self._closed.positions, end)
-            if self.guide is not None and (
-                simulation is None or (self.repeat and not simulation.converged)
-            ):
+            if self.guide is not None and (simulation is None or not simulation.converged):
                 start = self._guided(self.guide, m)
                 if start is not None:
                     rests = [Step(end + t) for t in accumulate(REST)]

@@ -112,6 +112,7 @@ class MadeUpClosure:
     names: tuple[str, ...]
     fixed: dict[str, float] = field(default_factory=dict)
     continuation: bool = True
+    repeat: bool = False
     guide: None = None
     on_step: Any = None
     fails_above: float = np.inf

@@ -42,6 +42,10 @@ from mvest.typing import FloatArray
 __all__ = ["simulate"]
 
 
+RUNAWAY = 3.0
+"""Times its own size that a body may be displaced by the iterations of one step, which have run
+away beyond it: nothing comes of them, and detecting collisions there needs any amount of memory."""
+
 SETTLINGS = 2
 """How often a body may be let rest before an equilibrium that is not found at once."""
 SETTLING_STEPS = 3
@@ -183,6 +187,7 @@ class _Stepper:
         solver: LinearSolver,
     ) -> None:
         self.system = system
+        self._far = RUNAWAY * float(np.ptp(system.solid.mesh.nodes, axis=0).max())
         self.loading = loading
         self.damping = damping
         self.newton = newton
@@ -337,12 +342,9 @@ class _Stepper:
             if converged or float(np.abs(d).max()) <= newton.smallest_move:
                 # The factor of the converged state is kept for the sensitivities.
                 return _Solved(x, current, residuals, pairs)
-            try:
-                x, current = self._line_search(x, d, current, pairs, evaluate)
-            except MemoryError as error:
-                # Collision detection needs room for all that a step sweeps over: the iterates have
-                # run away.
-                raise _StepError(Reason.NO_CONVERGENCE) from error
+            x, current = self._line_search(x, d, current, pairs, evaluate)
+            if float(np.abs(x - state.x).max()) > self._far:
+                raise _StepError(Reason.NO_CONVERGENCE)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
                 assert current.blocks is not None

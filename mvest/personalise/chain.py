@@ -337,7 +337,7 @@ class _Chain:
         """Largest distance (mm) of the fitted closed valve from one closed from the open state."""
         assert result.estimate is not None
         assert result.fitted is not None
-        anew = replace(self.model, continuation=False, guide=None)
+        anew = replace(self.model, continuation=False, guide=None, repeat=True)
         found = RegisteredModel(anew, self.names)(result.estimate)
         if not found.converged:
             return None

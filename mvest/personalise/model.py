@@ -73,6 +73,7 @@ def build_model(
         fixed,
         continuation=True,
         reach=settings.reach,
+        repeat=False,
     )
     if band is not None:
         coarse = structured_mesh(band, "hex18", mesh.guide_columns, mesh.guide_rows)
