@@ -87,7 +87,7 @@ def settings_of(config: Values) -> PersonaliseSettings:
         build(CaseMesh, personal["mesh"]),
         personal["tolerance"],
         personal["max_iterations"],
-        personal["reach"],
+        personal["largest_change"],
         None if paper is None else build(PaperSettings, paper),
         personal["moduli_only"],
         personal["confirm"],

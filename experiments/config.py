@@ -139,7 +139,7 @@ class PersonalConfig:
     mesh: CaseMeshConfig = field(default_factory=CaseMeshConfig)  # type: ignore[valid-type]
     tolerance: float = 2e-3
     max_iterations: int = 15
-    reach: float = 0.5  # largest change of a logarithm over which a closure is continued
+    largest_change: float = 0.2  # of a parameter's logarithm from one equilibrium to the next
     paper: PaperSettingsConfig | None = None  # type: ignore[valid-type]
     moduli_only: bool = False  # estimate also with all nuisances fixed
     confirm: bool = False  # close the fitted valve anew from the open one

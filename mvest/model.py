@@ -99,9 +99,12 @@ class ClosureModel:
         mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
         the same reason as with ``continuation``.
     repeat : bool
-        Whether a continued or guided closure that fails is repeated from the open valve, which
-        takes long and seldom finds what the others did not. A continued one that fails is repeated
-        with the guide in any case.
+        Whether a continued closure that fails is repeated with the guide, and one that fails with
+        the guide from the open valve, which takes long and seldom finds what the others did not.
+    largest_change : float
+        Of the logarithm of any parameter from one continued equilibrium to the next: one farther
+        away is reached through others between. Newton's method does not find an equilibrium that
+        lies millimetres away.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -116,6 +119,7 @@ class ClosureModel:
     reach: float = np.inf
     guide: ClosureModel | None = None
     repeat: bool = True
+    largest_change: float = np.inf
     on_step: Callable[[float, int], None] | None = None
 
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
@@ -126,6 +130,8 @@ class ClosureModel:
     def __post_init__(self) -> None:
         if not self.reach >= 0:
             raise InputError(f"reach of a continuation = {self.reach}, expected >= 0")
+        if not self.largest_change > 0:
+            raise InputError(f"largest_change = {self.largest_change}, expected > 0")
         if self.guide is not None and self.guide.names != self.names:
             raise InputError(
                 f"the guide's parameters are {', '.join(self.guide.names)}, expected those of the "
@@ -168,6 +174,17 @@ class ClosureModel:
             return False
         return bool(np.max(np.abs(np.log(m / self._closed.at))) <= self.reach)
 
+    def _way_to(self, m: FloatArray) -> list[FloatArray]:
+        """Parameters between the last closed state and ``m``, where that is continued from."""
+        if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
+            return []
+        if np.any(m <= 0) or np.any(self._closed.at <= 0):
+            return []
+        start = self._closed.at
+        change = np.log(m / start)
+        n = int(np.ceil(float(np.abs(change).max()) / self.largest_change))
+        return [start * np.exp(change * k / n) for k in range(1, n)]
+
     def close(
         self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
     ) -> ClosureResult:
@@ -187,6 +204,11 @@ class ClosureModel:
         MaterialError
             If a modulus is inadmissible.
         """
+        if not every_frame:
+            for between in self._way_to(m):
+                result = self.close(between, sensitivities=False)
+                if not result.simulation.converged:
+                    return result
         values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
         moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
         factors = Factors(
@@ -226,7 +248,9 @@ class ClosureModel:
             end, last = self.settings.protocol.end, steps[-1]
             if self._closed is not None and self._near(m):
                 simulation = run([last], self._closed.positions, end)
-            if self.guide is not None and (simulation is None or not simulation.converged):
+            if self.guide is not None and (
+                simulation is None or (self.repeat and not simulation.converged)
+            ):
                 start = self._guided(self.guide, m)
                 if start is not None:
                     rests = [Step(end + t) for t in accumulate(REST)]

@@ -633,3 +633,26 @@ def test_fixed_values_are_used_and_estimated_ones_go_before_them():
     )
     usual = model_of(OPEN, **TINY).close(AT).simulation
     assert np.abs(usual.frames[-1] - both.frames[-1]).max() > 0.1
+
+
+def test_a_far_continuation_goes_through_equilibria_between(closed):
+    # In one step Newton's method would be asked for an equilibrium 0.11 away in the logarithm.
+    model, simulation = closed
+    far = AT * np.array([0.9, 1.1])
+    walking = replace(model, largest_change=0.05)
+    walking.restart(ClosedState(AT, simulation.frames[-1]))
+    between = walking._way_to(far)
+    assert len(between) == 2
+    whole = np.log(far / AT)
+    for k, m in enumerate(between, 1):
+        np.testing.assert_allclose(np.log(m / AT), whole * k / 3, atol=1e-12)
+    reached = walking.close(far).simulation
+    direct = continued(replace(model), simulation.frames[-1], far, sensitivities=True)
+    np.testing.assert_allclose(reached.frames[-1], direct.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(reached.sensitivities[-1], direct.sensitivities[-1], atol=1e-6)
+    assert not walking._way_to(far * 1.04)
+
+
+def test_a_largest_change_is_positive():
+    with pytest.raises(InputError, match="largest_change = 0"):
+        model_of(CLOSING, **TINY, largest_change=0.0)

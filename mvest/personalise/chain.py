@@ -76,11 +76,27 @@ def personalise(
     chain = _Chain(case, settings, store, on_step)
     started = time.perf_counter()
     # Not the prior's mean, which may differ from where filters start by its last bit.
-    generic = chain.shared(chain.shared.start)
+    start = chain.shared.start
+    generic = chain.shared(start)
     seconds = {"generic": time.perf_counter() - started}
+
+    def timed(part: str, began: float) -> None:
+        seconds[part] = seconds.get(part, 0.0) + time.perf_counter() - began
+
+    # Held-out frames are gone to from the closed valve that was found last.
+    began = time.perf_counter()
+    before = chain.closed_frames(start, generic.y) if generic.converged else {}
+    timed("held_out", began)
     result = chain.estimate(chain.filter, chain.observation())
     seconds["estimate"] = result.seconds
-    moduli_only = paper = None
+    frames = _Frames({}, {}, {}, ())
+    narrower: Mapping[str, FloatArray] = {}
+    if before and result.estimate is not None and result.fitted is not None:
+        began = time.perf_counter()
+        frames = chain.compared(before, chain.closed_frames(result.estimate, result.fitted))
+        timed("held_out", began)
+        narrower = chain.narrower(result)
+    moduli_only = paper = confirmed = None
     if settings.moduli_only:
         moduli_only = chain.estimate_moduli(
             IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations),
@@ -91,18 +107,10 @@ def personalise(
     if settings.paper is not None:
         paper = chain.estimate_as_paper(settings.paper)
         seconds["paper"] = paper.seconds
-    frames = _Frames({}, {}, {}, ())
-    narrower: Mapping[str, FloatArray] = {}
-    confirmed = None
-    if generic.converged and result.estimate is not None:
+    if settings.confirm and frames.distances:
         began = time.perf_counter()
-        frames = chain.frames(generic, result)
-        narrower = chain.narrower(result)
-        seconds["held_out"] = time.perf_counter() - began
-        if settings.confirm:
-            began = time.perf_counter()
-            confirmed = chain.confirm(result)
-            seconds["confirm"] = time.perf_counter() - began
+        confirmed = chain.confirm(result)
+        timed("confirm", began)
     return Personalised(
         case,
         settings,
@@ -231,46 +239,44 @@ class _Chain:
         filter_ = PaperFilter(paper.Q, max_iterations=paper.max_iterations)
         return self.estimate_moduli(filter_, observation, log=False, variance=paper.P0)
 
-    def frames(self, generic: Prediction, result: StudyResult) -> _Frames:
-        """All frames of the closed valve as they are predicted, and how far they are."""
-        assert result.estimate is not None
-        m0, m = self.prior.mean, result.estimate
-        closed0 = generic.y.reshape(2, -1, 3)[1]
-        positions: dict[str, dict[str, FloatArray]] = {
-            "generic": {},
-            "registered": {},
-            "fitted": {},
-        }
-        assert result.fitted is not None
-        positions["generic"][self.closed.name] = closed0
-        positions["fitted"][self.closed.name] = result.fitted[-1]
-        held = [self.held_state(frame) for frame in self.case.held_out]
-        for which, at in (("generic", m0), ("fitted", m)) if held else ():
-            found = self.model.held(self.registered.mechanical(at), held)
-            for frame, points in zip(self.case.held_out, found, strict=True):
+    def closed_frames(self, m: FloatArray, closed: FloatArray) -> dict[str, FloatArray]:
+        """All frames of the closed valve as they are predicted to be seen, ``(n, 3)`` mm each.
+
+        Parameters
+        ----------
+        m : (p,)
+        closed : array
+            Predicted frames at ``m``, stacked, the closed one last.
+        """
+        n = len(self.case.surface.vertices)
+        found = {self.closed.name: closed.reshape(-1, n, 3)[-1]}
+        states = [self.held_state(frame) for frame in self.case.held_out]
+        if states:
+            held = self.model.held(self.registered.mechanical(m), states)
+            for frame, points in zip(self.case.held_out, held, strict=True):
                 if points is not None:
-                    positions[which][frame.name] = self.registered.seen(points, at)
-        turn, origin, target = self._alignment(closed0)
-        for name, points in positions["generic"].items():
-            positions["registered"][name] = (points - origin) @ turn.T + target
+                    found[frame.name] = self.registered.seen(points, m)
+        return found
+
+    def compared(
+        self, generic: Mapping[str, FloatArray], fitted: Mapping[str, FloatArray]
+    ) -> _Frames:
+        """How far the frames that both valves have are from where they were seen."""
+        turn, origin, target = self._alignment(generic[self.closed.name])
+        registered = {name: (points - origin) @ turn.T + target for name, points in generic.items()}
         distances = [
             FrameDistance(
                 frame.name,
                 frame.role is Role.CLOSED,
                 *(
-                    self._distance(frame, positions[which][frame.name])
-                    for which in ("generic", "registered", "fitted")
+                    self._distance(frame, positions[frame.name])
+                    for positions in (generic, registered, fitted)
                 ),
             )
             for frame in self.case.frames
-            if all(frame.name in found for found in positions.values())
+            if frame.name in generic and frame.name in fitted
         ]
-        return _Frames(
-            positions["generic"],
-            positions["registered"],
-            positions["fitted"],
-            tuple(distances),
-        )
+        return _Frames(generic, registered, fitted, tuple(distances))
 
     def held_state(self, frame: Frame) -> HeldState:
         """The loads of a further frame, on the contact valve's annulus."""

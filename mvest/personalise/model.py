@@ -72,8 +72,8 @@ def build_model(
         free,
         fixed,
         continuation=True,
-        reach=settings.reach,
         repeat=False,
+        largest_change=settings.largest_change,
     )
     if band is not None:
         coarse = structured_mesh(band, "hex18", mesh.guide_columns, mesh.guide_rows)

@@ -128,8 +128,9 @@ class PersonaliseSettings:
     tolerance : float
         Of the filter, relative.
     max_iterations : int
-    reach : float
-        See :class:`mvest.model.ClosureModel`.
+    largest_change : float
+        Of a parameter's logarithm from one equilibrium to the next, see
+        :class:`mvest.model.ClosureModel`.
     paper : PaperSettings or None
         Whether the moduli are also estimated as the paper does it.
     moduli_only : bool
@@ -145,7 +146,7 @@ class PersonaliseSettings:
     mesh: CaseMesh = field(default_factory=CaseMesh)
     tolerance: float = 2e-3
     max_iterations: int = 15
-    reach: float = 0.5
+    largest_change: float = 0.2
     paper: PaperSettings | None = None
     moduli_only: bool = False
     confirm: bool = False

@@ -88,7 +88,8 @@ def test_settings_are_those_of_the_configuration(config):
     given = plain(
         composed(
             *OWN, "personal=considered", "personal.tolerance=0.03", "personal.max_iterations=4",
-            "personal.reach=0.2", "personal.correspondence=false", "personal.confirm=false",
+            "personal.largest_change=0.3", "personal.correspondence=false",
+            "personal.confirm=false",
             "personal.moduli_only=false",
         )
     )  # fmt: skip
@@ -97,7 +98,7 @@ def test_settings_are_those_of_the_configuration(config):
     treated = {u.name: u.treatment for u in settings.unknowns}
     assert treated["E_f.posterior"] is Treatment.ESTIMATED
     assert treated["turn.x"] is Treatment.CONSIDERED
-    assert (settings.tolerance, settings.max_iterations, settings.reach) == (0.03, 4, 0.2)
+    assert (settings.tolerance, settings.max_iterations, settings.largest_change) == (0.03, 4, 0.3)
     assert (settings.correspondence, settings.confirm, settings.moduli_only) == (False,) * 3
     assert settings.paper.R == 0.25
 
