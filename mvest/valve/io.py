@@ -7,6 +7,7 @@ appears under its name only once it is complete.
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
@@ -39,11 +40,20 @@ Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
+
+
+def _read_ply(name: str) -> meshio.Mesh:
+    """Read PLY with meshio, which would wait forever for the end of a header that is cut off."""
+    if not re.search(rb"^[ \t]*end_header[ \t\r]*$", Path(name).read_bytes(), re.MULTILINE):
+        raise ValueError("no end_header")
+    return meshio.ply.read(name)
+
+
 _READERS = {
     ".vtu": meshio.vtu.read,
     ".stl": meshio.stl.read,
     ".obj": meshio.obj.read,
-    ".ply": meshio.ply.read,
+    ".ply": _read_ply,
 }
 _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
 """Formats that are written without data."""

@@ -207,6 +207,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("missing.stl", None, InputError, "no such file"),
         ("mesh.off", "", InputError, r"extension '\.off', expected .*\.stl, \.obj, \.ply"),
         ("mesh.ply", "nonsense", InputError, "damaged or no PLY"),
+        ("mesh.ply", PLY[:70], InputError, "no end_header"),
         ("mesh.ply", PLY + "3 0 1 9\n", GeometryError, "do not exist"),
         ("mesh", "", InputError, "extension ''"),
         ("mesh.vtu", "nonsense", InputError, "damaged or no VTU"),
