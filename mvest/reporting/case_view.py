@@ -173,7 +173,7 @@ def _mesh(points: FloatArray, triangles: IntArray, values: FloatArray | None = N
     """A mesh of the triangles whose corners were all seen, of the vertices that they use."""
     known = np.isfinite(points[triangles]).all(axis=(1, 2))
     used, corner = np.unique(triangles[known], return_inverse=True)
-    i, j, k = corner.reshape(-1, 3).T.astype(np.int32)
+    i, j, k = corner.reshape(-1, 3).T.astype(np.min_scalar_type(len(used)))
     x, y, z = small(points[used]).T
     mesh = go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, flatshading=False)
     if values is not None:
