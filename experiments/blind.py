@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.case import estimate_case
+from experiments.case import run_case
 from experiments.config import register
 from experiments.progress import announce_compilation
 from mvest.errors import InputError, MvestError
@@ -111,7 +111,7 @@ def main() -> int:
     # The case says what it is; nothing here does.
     values = request["values"] | {"seed": None, "parameters": [], "row": None}
     try:
-        record, _ = estimate_case(values, request["config_hash"], folder, time.time())
+        record, _ = run_case(values, request["config_hash"], folder, time.time())
         write_json(folder / ESTIMATE, record)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -24,6 +24,7 @@ from mvest.estimation import (
 )
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.system import FACTORS
 from mvest.model import ClosureModel
 from mvest.observation_errors import (
     AnnulusOffset,
@@ -46,9 +47,6 @@ __all__ = ["Twin", "build_mesh", "build_twin", "mechanics_of", "template_of"]
 
 Values = Mapping[str, Any]
 OnStep = Callable[[float, int], None]
-
-FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
-"""Parameters of the whole valve that can be estimated besides the moduli."""
 
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""

@@ -43,7 +43,6 @@ from mvest.valve.proximity import surface_edges
 __all__ = [
     "case_record",
     "check_case",
-    "estimate_case",
     "of_all_unknowns",
     "read_configured",
     "run_case",
@@ -167,13 +166,6 @@ def _told(frame: Frame) -> str:
 
 
 def run_case(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Personalise a user's case: the record, and the files written to ``folder``."""
-    return estimate_case(config, config_hash, folder, started)
-
-
-def estimate_case(
     config: Values, config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
     """Read a case and personalise it: its record; fields and report are written."""

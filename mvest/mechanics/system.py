@@ -28,7 +28,10 @@ from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
+__all__ = ["FACTORS", "Evaluation", "Factors", "Loads", "Parameter", "System"]
+
+FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
+"""Parameters of the whole valve, besides the moduli of its regions."""
 
 CONTACT_MARGIN = 0.12
 """A pair of elements enters the sparsity pattern this share of its reach before it touches."""

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from mvest.cases.case import Role, ValveCase
 from mvest.errors import GeometryError, InputError
+from mvest.mechanics.system import FACTORS
 from mvest.model import ClosureModel
-from mvest.personalise.settings import FACTORS, CaseMesh, PersonaliseSettings, Treatment
+from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment
 from mvest.registration import REGISTRATION
 from mvest.valve.anatomy import Valve
 from mvest.valve.band import Band

@@ -11,10 +11,7 @@ from mvest.errors import InputError
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.registration import REGISTRATION
 
-__all__ = ["FACTORS", "CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
-
-FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
-"""Unknowns of the whole valve that act on its closure."""
+__all__ = ["CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
 
 
 class Treatment(Enum):

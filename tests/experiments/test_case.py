@@ -9,10 +9,10 @@ from hydra.core.global_hydra import GlobalHydra
 
 from experiments.case import (
     case_record,
-    estimate_case,
     fields_of,
     of_all_unknowns,
     read_configured,
+    run_case,
     settings_of,
 )
 from experiments.config import hash_of
@@ -203,7 +203,7 @@ def test_files_of_a_case_are_written_and_read(config, monkeypatch, tmp_path, unm
         composed(*OWN, *overrides, f"case={config['case']}", f"paths.outputs={tmp_path}")
     )
     (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
-    record, files = estimate_case(config, "hash", tmp_path, 0.0)
+    record, files = run_case(config, "hash", tmp_path, 0.0)
     assert record["status"] == "converged"
     assert files == [tmp_path / "fields.npz"]
     fields = read_case_fields(files[0])
@@ -223,7 +223,7 @@ def test_nothing_of_an_earlier_run_is_left_where_nothing_is_found(
 ):
     use(monkeypatch, fails_above=4.0)
     (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
-    _, files = estimate_case(config, "hash", tmp_path, 0.0)
+    _, files = run_case(config, "hash", tmp_path, 0.0)
     assert files == []
     assert not (tmp_path / "fields.npz").exists()
 

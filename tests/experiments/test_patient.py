@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from experiments import patient
 from experiments.blind import SECRET
-from experiments.case import estimate_case
+from experiments.case import run_case
 from experiments.patient import make_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
@@ -66,7 +66,7 @@ def in_process(monkeypatch):
     def blindly(values, config_hash, folder, case, sealed):
         told = {k: v for k, v in values.items() if k not in SECRET}
         told |= {"case": str(case), "seed": None, "parameters": [], "row": None}
-        record, _ = estimate_case(told, config_hash, folder, 0.0)
+        record, _ = run_case(told, config_hash, folder, 0.0)
         write_json(folder / "estimate.json", record)
         seen.append((folder, sealed))
         return json.loads((folder / "estimate.json").read_text())
