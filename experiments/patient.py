@@ -15,7 +15,7 @@ from filelock import FileLock
 
 from experiments.blind import estimate_blindly
 from experiments.build import mechanics_of, template_of
-from experiments.case import of_all_unknowns
+from experiments.case_record import of_all_unknowns
 from experiments.mirror import build
 from experiments.truth import truth_key
 from mvest.cases.writer import write_case

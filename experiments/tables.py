@@ -11,7 +11,8 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
-from mvest.reporting.patients import write_patient_tables, write_population_tables
+from mvest.reporting.patient_tables import write_patient_tables
+from mvest.reporting.population import write_population_tables
 from mvest.reporting.publish import RECORDS, regenerate
 from mvest.reporting.report import write_report
 from mvest.reporting.sweeps import read_sweeps, write_sweep

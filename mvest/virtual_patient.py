@@ -232,6 +232,8 @@ def _model(
             names,
             continuation=True,
             guide=guide,
+            # A valve that does not follow its guide has more than one way to close.
+            repeat=False,
         )
     assert guide is not None
     return guide

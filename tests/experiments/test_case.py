@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.case import (
-    case_record,
-    fields_of,
-    of_all_unknowns,
-    read_configured,
-    run_case,
-    settings_of,
-)
+from experiments.case import read_configured, run_case, settings_of
+from experiments.case_record import case_record, fields_of, of_all_unknowns
 from experiments.config import hash_of
 from experiments.run import main
 from mvest.cases.writer import write_case
@@ -73,7 +67,7 @@ def made(folder):
 @pytest.fixture
 def unmeasured(monkeypatch):
     """Measuring a shape takes a second, and is tested elsewhere."""
-    monkeypatch.setattr("experiments.case.clinical_measurements", lambda *arguments: {})
+    monkeypatch.setattr("experiments.case_record.clinical_measurements", lambda *arguments: {})
 
 
 def test_settings_are_those_of_the_configuration(config):

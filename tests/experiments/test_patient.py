@@ -60,7 +60,7 @@ def simulated(monkeypatch):
 def in_process(monkeypatch):
     """Let the estimating process be this one, and the closure a formula."""
     use(monkeypatch)
-    monkeypatch.setattr("experiments.case.clinical_measurements", lambda *arguments: {})
+    monkeypatch.setattr("experiments.case_record.clinical_measurements", lambda *arguments: {})
     seen = []
 
     def blindly(values, config_hash, folder, case, sealed):

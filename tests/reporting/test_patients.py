@@ -10,20 +10,25 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.provenance import write_json
-from mvest.reporting import patients
+from mvest.reporting import patient_tables
 from mvest.reporting.case_fields import read_case_fields
-from mvest.reporting.patients import (
-    _clopper_pearson,
-    case_text,
+from mvest.reporting.patient_tables import (
     figure3,
-    population_figure,
-    population_frame,
-    publish_patient,
     read_kept,
     table2,
     table3,
-    write_case_tables,
     write_patient_tables,
+)
+from mvest.reporting.patients import (
+    KEPT_ARRAYS,
+    case_text,
+    publish_patient,
+    write_case_tables,
+)
+from mvest.reporting.population import (
+    _clopper_pearson,
+    population_figure,
+    population_frame,
     write_population_tables,
 )
 from tests.reporting.made_up_case import arrays
@@ -250,7 +255,7 @@ def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file)
     kept = json.loads((tmp_path / "patients" / "patients-normal-small.json").read_text())
     assert kept["unknowns"] == made_up()["unknowns"]
     with np.load(tmp_path / "patients" / "patients-normal-small.npz") as stored:
-        assert set(stored.files) <= set(patients.KEPT_ARRAYS)
+        assert set(stored.files) <= set(KEPT_ARRAYS)
         assert "sensitivity" not in stored.files
         assert "truth" not in stored.files
     first = {path: path.read_bytes() for path in written}
@@ -274,9 +279,9 @@ def test_figure3_has_one_scale_for_all(fields_file, monkeypatch):
     far = copy.copy(fields)
     object.__setattr__(far, "distance_generic", 5 * fields.distance_generic)
     seen = []
-    true_colours = patients.corner_colours
+    true_colours = patient_tables.corner_colours
     monkeypatch.setattr(
-        patients,
+        patient_tables,
         "corner_colours",
         lambda scale, *rest: seen.append(scale) or true_colours(scale, *rest),
     )
