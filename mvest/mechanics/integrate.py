@@ -26,7 +26,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.assembly import add_forces
-from mvest.mechanics.contact import ContactPairs
+from mvest.mechanics.contact import Contact, ContactPairs
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,
@@ -42,7 +42,7 @@ from mvest.typing import FloatArray
 __all__ = ["simulate"]
 
 
-RUNAWAY = 3.0
+RUNAWAY = 1.5
 """Times its own size that a body may be displaced by the iterations of one step, which have run
 away beyond it: nothing comes of them, and detecting collisions there needs any amount of memory."""
 
@@ -303,7 +303,7 @@ class _Stepper:
             factor = min(1.0, newton.largest_move / max(float(np.abs(move).max()), 1e-300))
             if system.contact is not None and pairs is not None:
                 y, dy = system.contact.points(x), system.contact.points(factor * move)
-                factor *= system.contact.largest_step(pairs, y, dy)
+                factor *= _largest_step(system.contact, pairs, y, dy)
             x += factor * move
         if fixed.size:
             x[fixed] = loads.fixed
@@ -375,7 +375,7 @@ class _Stepper:
         factor = min(1.0, self.newton.largest_move / max(float(np.abs(d).max()), 1e-300))
         if contact is not None and pairs is not None:
             y, dy = contact.points(x), contact.points(d)
-            factor *= contact.largest_step(pairs, y, factor * dy)
+            factor *= _largest_step(contact, pairs, y, factor * dy)
         if self.newton.single_solve:
             return x + factor * d, evaluate(x + factor * d, True)
         norm = float(np.linalg.norm(current.residual))
@@ -437,3 +437,12 @@ class _Stepper:
                 for k in range(len(self.parameters))
             ]
         )
+
+
+def _largest_step(contact: Contact, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> float:
+    """Share of the displacement ``dy`` that is free of collisions; a failed step where none is."""
+    try:
+        return contact.largest_step(pairs, y, dy)
+    except MemoryError as error:
+        # What iterates that have run away sweep over is more than there is room for.
+        raise _StepError(Reason.NO_CONVERGENCE) from error
