@@ -184,11 +184,19 @@ def _readable2(records: Sequence[Record]) -> list[dict[str, str]]:
             row[f"{short} truth"] = number(found["truth"])
             row[f"{short} estimate, 95 %"] = interval_words(found)
             for words, other in others.items():
-                row[f"{short} {words}"] = (
-                    MISSING if other is None else interval_words(_moduli(other["parameters"])[k])
-                )
+                row[f"{short} {words}"] = _other_words(other, k)
         rows.append(row)
     return rows
+
+
+def _other_words(other: Mapping[str, Any] | None, k: int) -> str:
+    """What another estimation says of modulus k."""
+    if other is None:
+        return MISSING
+    row = _moduli(other["parameters"])[k]
+    if row["estimate"] is None:
+        return "none found"
+    return interval_words(row) + ("" if other["status"] == "converged" else ", not converged")
 
 
 def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
@@ -266,6 +274,23 @@ def distance_words(table: pd.DataFrame) -> list[str]:
             f"closer than the generic valve laid rigidly on the closed frame in "
             f"{int((group['personalised mean [mm]'] < group['registered mean [mm]']).sum())}."
         )
+    held = table[~table["shown to the filter"].astype(bool)]
+    if len(held):
+        columns = [f"{which} mean [mm]" for which in WHICH]
+        mean = held.groupby("patient", sort=False)[columns].mean()
+        own = mean["personalised mean [mm]"]
+        patients = int((own < mean["generic mean [mm]"]).sum())
+        nearer = int((own < mean["registered mean [mm]"]).sum())
+        out.append(
+            f"On the mean of the frames that it was not shown: closer than generic for "
+            f"{patients} of {len(mean)} patients, than the rigidly laid one for {nearer}."
+        )
+    columns = [f"{which} to the truth [mm]" for which in WHICH]
+    if table[columns].notna().all(axis=None):
+        told = ", ".join(
+            f"{table[c].mean():.2f} mm {w}" for c, w in zip(columns, WHICH, strict=True)
+        )
+        out.append(f"Mean distance to where the valve truly was, all frames: {told}.")
     return out
 
 
