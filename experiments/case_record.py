@@ -73,6 +73,13 @@ def case_record(
             "sha256": case.sha256,
             "regions": list(case.surface.region_names),
         },
+        "model": {
+            "element": found.mesh.element_type,
+            "cells": [found.settings.mesh.columns, found.settings.mesh.rows, 1],
+            "source": found.settings.mesh.source,
+            "filter": "iterated",
+            "noise_mm": case.uncertainty.std_mm,
+        },
         "data": {"citation": case.source, "sha256": case.sha256},
         "unknowns": unknowns,
         "moduli": _moduli(found, unknowns),
