@@ -14,7 +14,7 @@ from mvest.estimation import (
     Prediction,
     observation_noise,
 )
-from mvest.model import TissueSettings
+from mvest.mechanics.settings import TissueSettings
 from mvest.study import Case, estimate
 from mvest.surface_observation import (
     MAX_CORRELATED_POINTS,

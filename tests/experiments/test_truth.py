@@ -193,7 +193,7 @@ def test_the_key_ignores_comments_docstrings_and_layout(library):
         ("mechanics/law.py", " - ", " + "),
         ("valve/template.py", "bulge: float = 0.04", "bulge: float = 0.05"),
         ("units.py", "133.322387415", "133.3"),
-        ("model.py", "patch_radius: float = 2.0", "patch_radius: float = 2.5"),
+        ("mechanics/settings.py", "patch_radius: float = 2.0", "patch_radius: float = 2.5"),
         ("elements.py", "0.445948490915965", "0.445948490915966"),
     ],
 )

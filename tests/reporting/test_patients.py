@@ -87,8 +87,12 @@ def made_up(name="normal_small", **changes):
         "unknowns": [
             *moduli(5.8, 2.1), row("pressure_scale", 1.02, 0.05), row("shift.x", 0.1, 0.2)
         ],
-        "without_nuisances": {"reason": "converged", "parameters": moduli(5.7, 3.1)},
-        "as_in_the_paper": {"reason": "no rounds left", "parameters": moduli(9.0, 4.0)},
+        "without_nuisances": {
+            "status": "converged", "reason": "converged", "parameters": moduli(5.7, 3.1)
+        },
+        "as_in_the_paper": {
+            "status": "failed", "reason": "no rounds left", "parameters": moduli(9.0, 4.0)
+        },
         "distances": [
             distance("closed", True, 2.0, 1.5, 0.5), distance("late", False, 1.0, 0.4, 0.8)
         ],
@@ -120,8 +124,8 @@ def failed(name="prolapse"):
         status="failed",
         reason="the model failed",
         unknowns=[*nothing, row("pressure_scale", None, 0), row("shift.x", None, 0)],
-        without_nuisances={"reason": "the model failed", "parameters": nothing},
-        as_in_the_paper={"reason": "the model failed", "parameters": nothing},
+        without_nuisances={"status": "failed", "reason": "the model failed", "parameters": nothing},
+        as_in_the_paper={"status": "failed", "reason": "the model failed", "parameters": nothing},
         distances=[],
         narrow=[],
     )
