@@ -20,7 +20,6 @@ from typing import Any
 
 from experiments.case import run_case
 from experiments.config import register
-from experiments.progress import announce_compilation
 from mvest.errors import InputError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
 
@@ -107,7 +106,6 @@ def main() -> int:
     folder = Path(request["folder"])
     seal(Path(request["sealed"]))
     register()
-    announce_compilation()
     # The case says what it is; nothing here does.
     values = request["values"] | {"seed": None, "parameters": [], "row": None}
     try:

@@ -25,7 +25,6 @@ from experiments.folder import (
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.patient import run_patient
-from experiments.progress import announce_compilation
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
@@ -109,7 +108,6 @@ def compute(request: Request) -> dict[str, Any]:
     started = time.time()
     values, folder = request.values, request.folder
     study = require_study(values)
-    announce_compilation()
     record, _ = study.run(values, request.config_hash, folder, started)
     record["factors"] = values["factors"]
 

@@ -52,6 +52,7 @@ class SolveBar:
         self._bar = tqdm(total=steps * solves, desc=title, unit="step", disable=None, leave=False)
 
     def __enter__(self) -> SolveBar:
+        announce_compilation()
         return self
 
     def __exit__(

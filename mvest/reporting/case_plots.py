@@ -145,7 +145,10 @@ def iterations_figure(record: Record) -> Figure:
             mean, width = columns[k].get("prior_mean") or 0.0, columns[k].get("prior_std") or 1.0
             axes.plot(rounds, (iterates[:, k] - mean) / width, color=COLOURS[at % len(COLOURS)],
                       marker=MARKERS[at % len(MARKERS)], markersize=4,
+                      linestyle="-" if at < len(COLOURS) else ":",
                       label=str(columns[k]["label"]))  # fmt: skip
+        # Room for the names of all beside the lines.
+        axes.set_xlim(right=max(len(rounds) - 1, 1) * (1.9 if len(nuisances) > 4 else 1.05))
         axes.axhline(0.0, color="0.6", linewidth=0.8)
         axes.set_ylabel("SD from the prior mean")
         axes.set_title("nuisances", fontsize=9)
@@ -162,7 +165,7 @@ def iterations_figure(record: Record) -> Figure:
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=7.5)
+            axes.legend(frameon=False, fontsize=6.5, loc="best")
     return figure
 
 

@@ -5,6 +5,7 @@ What a record does not have becomes a sentence that says so; nothing is put in i
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -253,14 +254,21 @@ def share_rows(record: Record) -> Rows:
     ]
 
 
+def _over_expected(innovation: Mapping[str, Any]) -> str:
+    """Root mean square of the standardised innovation, about 1 if all is as assumed."""
+    size, nis = innovation.get("size"), innovation.get("nis")
+    return number(math.sqrt(nis / size)) if size and nis is not None else MISSING
+
+
 def innovation_words(record: Record) -> list[str]:
     """What the innovation says, in sentences."""
     found = record.get("innovation") or {}
     words = []
     if found.get("rms") is not None:
         words.append(
-            f"Root mean square of the {_large(found.get('size'))} standardised innovations: "
-            f"{number(found['rms'])}; 1 is expected where model and noise are as assumed."
+            f"Root mean square of the {_large(found.get('size'))} innovations: "
+            f"{number(found['rms'])} mm; over what is expected of each where model and noise are "
+            f"as assumed: {_over_expected(found)}."
         )
     band = found.get("nis_band")
     if found.get("nis") is not None and band:
