@@ -26,6 +26,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.system import FACTORS
 from mvest.model import ClosureModel
+from mvest.observation import require_frames
 from mvest.observation_errors import (
     AnnulusOffset,
     CoaptationDropout,
@@ -110,6 +111,13 @@ def build_twin(config: Values) -> Twin:
         observation_noise(np.atleast_1d(variance), np.size(variance))
     except InputError as error:
         raise ConfigurationError(f"filter.R = {config['filter']['R']}: {error}") from error
+    frames = tuple(config["observation"]["frames"])
+    require_frames(frames)
+    if np.size(variance) not in (1, len(frames)):
+        raise ConfigurationError(
+            f"filter.R = {config['filter']['R']}: R has shape ({np.size(variance)},); expected one "
+            f"variance, or one for each of the {len(frames)} observed frames"
+        )
     values = np.array(truth["values"], dtype=float)
     _one_each("truth.values", values, parameters)
     _require_tissue(settings, parameters, values, prior.mean)
@@ -179,7 +187,7 @@ def build_twin(config: Values) -> Twin:
         valve,
         variance,
         correlation,
-        tuple(observation["frames"]),
+        frames,
         errors,
     )
 
