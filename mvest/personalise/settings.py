@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.estimation import IteratedFilter
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.registration import REGISTRATION
 
@@ -150,6 +151,7 @@ class PersonaliseSettings:
     correspondence: bool = True
 
     def __post_init__(self) -> None:
+        IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none
         names = [unknown.name for unknown in self.unknowns]
         if len(set(names)) != len(names):
             raise InputError(f"unknowns {', '.join(names)} are not all different")
