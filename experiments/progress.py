@@ -6,6 +6,7 @@ import math
 import sys
 import threading
 import time
+from functools import cache
 from types import TracebackType
 
 from tqdm import tqdm
@@ -23,8 +24,9 @@ SAY = 30.0
 """Seconds between two lines about a sweep where no terminal shows its bar."""
 
 
+@cache
 def announce_compilation() -> None:
-    """Say that the first run after an installation takes longer, and why."""
+    """Say once that the first run after an installation takes longer, and why."""
     if not kernels_are_compiled():
         print("compiling on first use; this takes about a minute once", file=sys.stderr)
 

@@ -1,0 +1,12 @@
+"""What every test of the application needs."""
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch):
+    """Whatever was compiled before: on a fresh installation a note precedes what is tested here.
+
+    That it is given is tested in processes of their own (``test_first_use.py``).
+    """
+    monkeypatch.setattr("experiments.progress.kernels_are_compiled", lambda: True)
