@@ -1,0 +1,96 @@
+"""How leaflets are sampled in material coordinates: the same vertices in every frame and valve.
+
+``phi`` in degrees runs once around the valve, 0 and 180 on the lines between the leaflets, the
+first leaflet in between; ``s`` runs from the annulus (0) to the free edge (1). Vertex ``j * columns
++ i`` is column i, row j: the first row is the annulus, the last one the free edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["ValveLayout"]
+
+
+@dataclass(frozen=True)
+class ValveLayout:
+    """A band of two leaflets in columns and rows.
+
+    Attributes
+    ----------
+    columns : int
+        Vertices around the valve, a multiple of 4, at least 8: so the lines between the leaflets and
+        the middles of both are columns.
+    rows : int
+        Vertices from annulus to free edge, at least 3.
+    region_names : tuple of str
+        Of the leaflet over phi in (0, 180), and of the other one.
+    """
+
+    columns: int = 64
+    rows: int = 15
+    region_names: tuple[str, str] = ("anterior", "posterior")
+
+    def __post_init__(self) -> None:
+        if self.columns < 8 or self.columns % 4 or self.rows < 3:
+            raise InputError(
+                f"layout of {self.columns} x {self.rows} vertices, expected a multiple of 4 >= 8, "
+                "and >= 3"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of vertices n."""
+        return self.columns * self.rows
+
+    @cached_property
+    def phi(self) -> FloatArray:
+        """``(n,)`` degrees."""
+        return np.tile(360.0 * np.arange(self.columns) / self.columns, self.rows)
+
+    @cached_property
+    def s(self) -> FloatArray:
+        """``(n,)`` from 0 to 1."""
+        return np.repeat(np.arange(self.rows) / (self.rows - 1), self.columns)
+
+    @cached_property
+    def triangles(self) -> IntArray:
+        """``(m, 3)``, normals to the ventricle where phi runs as in the template."""
+        i, j = (v.ravel() for v in np.meshgrid(np.arange(self.columns), np.arange(self.rows - 1)))
+        a = j * self.columns + i
+        b = j * self.columns + (i + 1) % self.columns
+        c, d = b + self.columns, a + self.columns
+        return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+
+    @cached_property
+    def region(self) -> IntArray:
+        """``(m,)`` leaflet of each triangle."""
+        i = np.tile(np.arange(self.columns), self.rows - 1)
+        return np.tile((2 * i >= self.columns).astype(np.int64), 2)
+
+    @property
+    def annulus(self) -> IntArray:
+        """``(columns,)`` vertices in loop order, beginning at phi = 0."""
+        return np.arange(self.columns)
+
+    @property
+    def free_edge(self) -> IntArray:
+        """``(columns,)`` vertices in loop order, beginning at phi = 0."""
+        return np.arange(self.columns) + (self.rows - 1) * self.columns
+
+    def column(self, phi: float) -> int:
+        """The column at an angle in degrees, for one that the layout has."""
+        exact = phi / 360.0 * self.columns
+        if abs(exact - round(exact)) > 1e-9:
+            raise InputError(f"no column of {self.columns} lies at {phi:g} degrees")
+        return round(exact) % self.columns
+
+    def vertex(self, phi: float, row: int) -> int:
+        """Number of the vertex at an angle and a row (negative: from the free edge)."""
+        return (row % self.rows) * self.columns + self.column(phi)

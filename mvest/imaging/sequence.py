@@ -1,0 +1,72 @@
+"""What the image step returns: one valve in every frame, with how sure it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.typing import FloatArray
+
+__all__ = ["ValveSequence"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ValveSequence:
+    """A valve in every frame of a sequence; all positions LPS in mm.
+
+    Attributes
+    ----------
+    layout : ValveLayout
+        Vertex i is the same point of the tissue in all frames.
+    times : (T,) s
+        Increasing.
+    vertices : (T, n, 3)
+        Midsurface of the leaflets.
+    tips : (T, 2, 3)
+        Papillary tips, the first that at phi = 0.
+    frame_confidence : (T,)
+        0 (no valve) to 1.
+    vertex_confidence : (T, n)
+        0 (not seen) to 1.
+    std_mm : (n,)
+        Standard deviation of each coordinate of each vertex; NaN where it was never measured.
+    correlation_length_mm : float
+        Over which errors of neighbouring vertices are alike along the leaflets.
+    """
+
+    layout: ValveLayout
+    times: FloatArray
+    vertices: FloatArray
+    tips: FloatArray
+    frame_confidence: FloatArray
+    vertex_confidence: FloatArray
+    std_mm: FloatArray
+    correlation_length_mm: float
+
+    def __post_init__(self) -> None:
+        t, n = len(self.times), self.layout.size
+        for name, shape in (
+            ("vertices", (t, n, 3)),
+            ("tips", (t, 2, 3)),
+            ("frame_confidence", (t,)),
+            ("vertex_confidence", (t, n)),
+            ("std_mm", (n,)),
+        ):
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise InputError(f"valve sequence {name}: shape {found}, expected {shape}")
+        if t < 1 or np.any(np.diff(self.times) <= 0):
+            raise InputError(f"valve sequence times {self.times} s, expected increasing ones")
+
+    @property
+    def annulus(self) -> FloatArray:
+        """``(T, columns, 3)`` mm."""
+        return self.vertices[:, self.layout.annulus]
+
+    @property
+    def free_edge(self) -> FloatArray:
+        """``(T, columns, 3)`` mm."""
+        return self.vertices[:, self.layout.free_edge]

@@ -1,0 +1,71 @@
+"""A volume over time, as the image step wants it, whatever file it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import InputError
+from mvest.typing import FloatArray
+
+__all__ = ["Modality", "VolumeSequence"]
+
+
+class Modality(Enum):
+    """What the voxels are: ultrasound echo (log-compressed), CT in HU, or MR signal."""
+
+    ULTRASOUND = "ultrasound"
+    CT = "ct"
+    MR = "mr"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VolumeSequence:
+    """Frames of one region in space. World coordinates are LPS (x to the left, y to the back, z up).
+
+    Attributes
+    ----------
+    frames : (T, I, J, K) uint8, int16 or float32
+    spacing : (3,) mm
+        Between voxels along i, j and k.
+    direction : (3, 3)
+        Its columns are the unit vectors of i, j and k in world coordinates; orthonormal.
+    origin : (3,) mm
+        World position of the centre of voxel (0, 0, 0).
+    times : (T,) s
+        Increasing, from any zero.
+    modality : Modality
+    source : str
+        Name of the file, or what simulated it.
+    sha256 : str
+        Of the file; empty if there is none.
+    """
+
+    frames: NDArray[np.generic]
+    spacing: FloatArray
+    direction: FloatArray
+    origin: FloatArray
+    times: FloatArray
+    modality: Modality = Modality.ULTRASOUND
+    source: str = ""
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        if self.frames.ndim != 4:
+            raise InputError(f"frames: shape {self.frames.shape}, expected (T, I, J, K)")
+        if np.shape(self.times) != (len(self.frames),):
+            raise InputError(
+                f"times: shape {np.shape(self.times)}, expected one for each of "
+                f"{len(self.frames)} frames"
+            )
+
+    def world(self, index: FloatArray) -> FloatArray:
+        """World positions ``(..., 3)`` mm of (fractional) voxel indices ``(..., 3)``."""
+        return np.asarray(self.origin + (index * self.spacing) @ self.direction.T)
+
+    def index(self, world: FloatArray) -> FloatArray:
+        """Fractional voxel indices ``(..., 3)`` of world positions ``(..., 3)`` mm."""
+        return np.asarray((world - self.origin) @ self.direction / self.spacing)
