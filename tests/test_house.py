@@ -85,7 +85,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.study",
         "mvest.surface_observation",
     ),
-    "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
+    "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
+    "mvest.reporting": (
+        *LEAVES,
+        "mvest.provenance",
+        "mvest.valve",
+        "mvest.imaging",
+        "mvest.estimation",
+    ),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
 NEVER_IN_EXPERIMENTS = ("tests",)

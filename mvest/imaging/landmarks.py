@@ -32,7 +32,8 @@ LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *_TIPS)
 def landmark_vertices(layout: ValveLayout) -> dict[str, int]:
     """Vertex of every landmark that lies on the leaflets (all but the tips), in fixed order.
 
-    ``commissure_0`` and ``commissure_180`` are where the lines between the leaflets meet the annulus.
+    ``commissure_0`` and ``commissure_180`` are where the lines between the leaflets meet the
+    annulus.
 
     Raises
     ------
