@@ -72,6 +72,15 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.registration",
     ),
+    "mvest.simulated_motion": (
+        *LEAVES,
+        "mvest.provenance",
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.imaging",
+        "mvest.model",
+        "mvest.virtual_patient",
+    ),
     "mvest.personalise": (
         *LEAVES,
         "mvest.cases",
