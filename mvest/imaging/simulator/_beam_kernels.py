@@ -52,7 +52,11 @@ def add_losses(
 def _at(values: Float32Array, a: float, e: float, d: float) -> float:
     """Linear interpolation, constant outside."""
     n0, n1, n2 = values.shape
-    a, e, d = min(max(a, 0.0), n0 - 1.001), min(max(e, 0.0), n1 - 1.001), min(max(d, 0.0), n2 - 1.001)
+    a, e, d = (
+        min(max(a, 0.0), n0 - 1.001),
+        min(max(e, 0.0), n1 - 1.001),
+        min(max(d, 0.0), n2 - 1.001),
+    )
     i, j, k = int(a), int(e), int(d)
     x, y, z = a - i, e - j, d - k
     low = (1 - y) * ((1 - z) * values[i, j, k] + z * values[i, j, k + 1])

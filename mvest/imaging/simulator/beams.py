@@ -167,7 +167,9 @@ class Losses:
         # mm to cm, there and back; of the own cell half.
         path = (0.2 * step[2]) * (np.cumsum(loss, axis=2) - 0.5 * loss)
         p, q = (np.linspace(0, n - 1, m) for n, m in zip(contact.shape, count[:2], strict=True))
-        i, j = (np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True))
+        i, j = (
+            np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True)
+        )
         x, y = (p - i)[:, None], (q - j)[None]
         gain = (1 - x) * (1 - y) * contact[i][:, j] + (1 - x) * y * contact[i][:, j + 1]
         gain += x * (1 - y) * contact[i + 1][:, j] + x * y * contact[i + 1][:, j + 1]
@@ -215,8 +217,8 @@ def render_window(
     signal = _noise(rng, shape)
     level = _blood(a, distance) / np.prod([np.linalg.norm(x.kernel) for x in (az, el, along)])
     add_noise(signal, level, start, step, losses.decibel, losses.start, losses.step)
-    gain_per_mm = 0.2 * a.frequency_mhz * (
-        a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz
+    gain_per_mm = (
+        0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
     )
     energy = az.energy * el.energy * along.energy
     deposit(
@@ -240,8 +242,8 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32Array:
 
 def _blood(a: Acquisition, distance: FloatArray) -> FloatArray:
     """Amplitude of noise from blood and reverberations over distance, after compensation."""
-    gain = 0.2 * a.frequency_mhz * (
-        a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz
+    gain = (
+        0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
     )
     blood = 10 ** ((a.blood_db + gain * distance) / 20)
     haze = 10 ** (a.haze_db / 20) * np.exp(-np.maximum(distance - a.depth_mm[0], 0) / a.haze_mm)

@@ -118,9 +118,7 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     share = _step(u / 0.5)[..., None]
     reach = (1 - 0.7 * _step((u - 0.5) / 0.5))[..., None]
     ventricle = (
-        inner
-        + (1 - share) * _shift(annulus)[:, None]
-        + share * reach * tip_shift[:, None, None]
+        inner + (1 - share) * _shift(annulus)[:, None] + share * reach * tip_shift[:, None, None]
     )
     wall = rng.uniform(8, 11) * (1 + 0.06 * _waves(rng, ROWS, len(angle), 1.0))
     wall *= 0.45 + 0.55 * _step(u / 0.12)

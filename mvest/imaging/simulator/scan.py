@@ -95,8 +95,6 @@ def _convert(
                 low = (one - v) * ((one - w) * levels[p, q, r] + w * levels[p, q, r + 1])
                 low += v * ((one - w) * levels[p, q + 1, r] + w * levels[p, q + 1, r + 1])
                 high = (one - v) * ((one - w) * levels[p + 1, q, r] + w * levels[p + 1, q, r + 1])
-                high += v * (
-                    (one - w) * levels[p + 1, q + 1, r] + w * levels[p + 1, q + 1, r + 1]
-                )
+                high += v * ((one - w) * levels[p + 1, q + 1, r] + w * levels[p + 1, q + 1, r + 1])
                 out[i, j, k] = np.uint8((one - u) * low + u * high + np.float32(0.5))
     return out

@@ -169,9 +169,7 @@ def _parts(
     return parts
 
 
-def _chord(
-    valve: MovingValve, leaflets: FloatArray, phi: float, s: float, tip: int
-) -> FloatArray:
+def _chord(valve: MovingValve, leaflets: FloatArray, phi: float, s: float, tip: int) -> FloatArray:
     """From a papillary tip to the insertion ``(T, 2, 3)``."""
     rows, columns = leaflets.shape[1:3]
     c, r = phi / 360.0 * columns, s * (rows - 1)

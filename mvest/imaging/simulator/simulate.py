@@ -117,14 +117,18 @@ def _chosen(valve: MovingValve, frames: Sequence[int] | None) -> list[int]:
 def _displacements(
     acquisition: Acquisition, probe: Probe, rng: np.random.Generator
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Turn (3, 3), centre (3,) and shift (3,) of the scene in each beat, in the probe's axes."""
+    """Turn (3, 3), centre (3,) and shift (3,) of the scene in each beat, in the probe's axes.
+
+    The mean shift is zero: the truth is the mean of the beats.
+    """
     about = probe.to_probe(np.zeros(3))
     turn = Rotation.from_rotvec(
         np.deg2rad(acquisition.beat_turn_deg) * rng.standard_normal((acquisition.beats, 3))
     ).as_matrix()
     shift = acquisition.beat_shift_mm * rng.standard_normal((acquisition.beats, 3))
+    shift -= shift.mean(axis=0)
     if acquisition.beats == 1:
-        turn, shift = np.eye(3)[None], np.zeros((1, 3))
+        turn = np.eye(3)[None]
     return [(turn[b], about, shift[b]) for b in range(acquisition.beats)]
 
 
