@@ -30,7 +30,6 @@ from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import (
     Acquisition,
-    Spread,
     draw_acquisition,
     draw_probe,
     simulate_volume,
@@ -136,7 +135,7 @@ class RenderedFrame:
 
 
 def render_frame(
-    valve: MovingValve, which: int, base: Acquisition, spread: Spread, seed: np.random.SeedSequence
+    valve: MovingValve, which: int, base: Acquisition, spread: str, seed: np.random.SeedSequence
 ) -> RenderedFrame:
     """Simulate the volume of one frame of a valve, probe and rendering drawn at random."""
     rng = np.random.default_rng(seed)
@@ -152,7 +151,7 @@ def _job(
 ) -> Samples:
     render, sample = seed.spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
-    seen = render_frame(valve, which, settings.acquisition, Spread.TRAINING, render)
+    seen = render_frame(valve, which, settings.acquisition, "training", render)
     true = TrueValve.of(seen.vertices, seen.tips, shape)
     return draw_samples(
         seen.frame, true, shape, settings.samples, np.random.default_rng(sample.spawn(1)[0])
