@@ -80,7 +80,8 @@ class Boosters:
         """Outputs ``(P, outputs)`` for features ``(P, F)``."""
         if not len(x):
             return np.zeros((0, self.outputs))
-        return np.stack([b.predict(x, num_threads=1) for b in self._boosters], axis=1)
+        found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
+        return np.stack(found, axis=1)
 
 
 def train_boosters(

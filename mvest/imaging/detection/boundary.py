@@ -49,11 +49,11 @@ def leaflet_axes(vertices: FloatArray, layout: ValveLayout) -> FloatArray:
     """``(n, 3, 3)``: at every vertex around the valve, along the leaflet, and its normal."""
     grid = vertices.reshape(layout.rows, layout.columns, 3)
     around = np.roll(grid, -1, 1) - np.roll(grid, 1, 1)
-    along = np.gradient(grid, axis=0)
+    along: FloatArray = np.asarray(np.gradient(grid, axis=0))
     normal = np.cross(along, around)
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
     around = around / np.maximum(np.linalg.norm(around, axis=2, keepdims=True), 1e-9)
-    along = np.cross(around, normal)
+    along = np.asarray(np.cross(around, normal))
     return np.stack([around, along, normal], axis=3).reshape(-1, 3, 3)
 
 
@@ -70,7 +70,7 @@ def _gap(
 ) -> FloatArray:
     """``(P,)`` mm along the normals from points to the true leaflet near their vertices."""
     shape = (layout.rows, layout.columns, 3)
-    grid = true.vertices.reshape(shape)
+    grid: FloatArray = true.vertices.reshape(shape)
     true_normals = leaflet_axes(true.vertices, layout)[:, :, 2].reshape(shape)
     row, column = which // layout.columns, which % layout.columns
     di, dj = np.meshgrid(

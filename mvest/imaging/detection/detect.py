@@ -37,8 +37,8 @@ class FitSettings:
     reach_mm : tuple of float
         How far along normals the leaflets are looked for in each round.
     alike : float
-        Neighbouring vertices see much the same: what is seen counts as if there were this many times
-        fewer of them.
+        Neighbouring vertices see much the same: what is seen counts as if there were this many
+        times fewer of them.
     stiffness, hold : float
         Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
     """
@@ -164,7 +164,7 @@ def _seen(
     reach: float,
     alike: float,
 ) -> tuple[Pulls, FloatArray]:
-    """Pulls of leaflets, annulus and free edge on a shape ``(n, 3)`` mm, and each vertex' confidence."""
+    """Pulls of leaflets and rims on a shape ``(n, 3)`` mm, and each vertex' confidence ``(n,)``."""
     layout = model.shape.layout
     normals, offset, std, confidence = model.boundary(frame, vertices, layout, reach)
     root = np.sqrt(alike)

@@ -1,9 +1,9 @@
 """A shape that agrees with what was seen: the most probable one, then what the model cannot show.
 
-Everything seen is a pull: a vertex is to move by so much along a direction, give or take a standard
-deviation. Pose and coefficients follow from a linear least-squares problem with the shape model's prior
-(maximum a posteriori), repeated with weights that make little of what disagrees; a smooth displacement
-of the vertices then takes up the rest.
+Everything seen is a pull: a vertex is to move by so much along a direction, give or take a
+standard deviation. Pose and coefficients follow from a linear least-squares problem with the shape
+model's prior (maximum a posteriori), repeated with weights that make little of what disagrees; a
+smooth displacement of the vertices then takes up the rest.
 """
 
 from __future__ import annotations
@@ -131,7 +131,8 @@ def relax(
         shape=(len(row), 3 * n),
     )
     matrix = sparse.kron(bend, sparse.identity(3)) + design.T @ sparse.diags_array(weight) @ design
-    by = splu(sparse.csc_array(matrix)).solve(design.T @ (weight * pulls.offset))
+    right = np.asarray(design.T @ (weight * pulls.offset), dtype=np.float64)
+    by = splu(sparse.csc_array(matrix)).solve(right)
     return vertices + by.reshape(n, 3)
 
 

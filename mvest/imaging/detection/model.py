@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from mvest.errors import InputError, cannot_write
 from mvest.imaging.detection.boosting import Boosters
@@ -214,7 +215,7 @@ def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
 
 
-def _bytes(text: str) -> np.ndarray:  # type: ignore[type-arg]
+def _bytes(text: str) -> NDArray[np.uint8]:
     return np.frombuffer(text.encode(), dtype=np.uint8)
 
 

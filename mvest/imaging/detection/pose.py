@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.layout import ValveLayout
-from mvest.typing import FloatArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["Poses", "pose_of", "rotation_grid"]
 
@@ -35,8 +35,8 @@ class Poses:
     def __len__(self) -> int:
         return len(self.centre)
 
-    def __getitem__(self, which: object) -> Poses:
-        return Poses(self.centre[which], self.rotation[which], self.log_scale[which])  # type: ignore[index]
+    def __getitem__(self, which: slice | IntArray | BoolArray | list[int]) -> Poses:
+        return Poses(self.centre[which], self.rotation[which], self.log_scale[which])
 
     @property
     def axes(self) -> FloatArray:
@@ -44,7 +44,7 @@ class Poses:
         return np.asarray(self.rotation * np.exp(self.log_scale)[:, None, None])
 
     def world(self, points: FloatArray) -> FloatArray:
-        """World positions ``(P, m, 3)`` of points ``(m, 3)`` or ``(P, m, 3)`` of the mean valve's size."""
+        """World positions ``(P, m, 3)`` mm of points ``(m, 3)`` or ``(P, m, 3)`` in own axes."""
         return np.asarray(self.centre[:, None] + points @ np.swapaxes(self.axes, 1, 2))
 
     def local(self, points: FloatArray) -> FloatArray:
@@ -53,7 +53,7 @@ class Poses:
         return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
 
     def moved(self, by: FloatArray) -> Poses:
-        """Poses changed by ``(P, 7)``: shift (mm) and turn (rotation vector) in own axes, log scale."""
+        """Changed by ``(P, 7)``: shift (mm) and turn (rotation vector) in own axes, log scale."""
         turn = Rotation.from_rotvec(by[:, 3:6]).as_matrix()
         return Poses(
             self.centre + np.einsum("pij,pj->pi", self.rotation, by[:, :3]),

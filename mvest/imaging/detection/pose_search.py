@@ -1,8 +1,8 @@
 """How a valve lies: orientations are rated at every place, and the best ones refined step by step.
 
-Search in position first and in position, orientation and size then is the marginal space learning of
-Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008); the refinement is a cascade of regressions from
-what is seen at a hypothesis to its error.
+Search in position first and in position, orientation and size then is the marginal space learning
+of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008); the refinement is a cascade of regressions
+from what is seen at a hypothesis to its error.
 """
 
 from __future__ import annotations
@@ -74,6 +74,7 @@ def rating_samples(
     likely places gives.
     """
     grid = rotation_grid(ORIENTATIONS)
+    kinds: tuple[Misses, ...]
     if fine:
         kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
         parts = [missed_poses(true.pose, m, count // 4, rng) for m in kinds]

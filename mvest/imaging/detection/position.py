@@ -86,7 +86,7 @@ class PositionDetector:
     boosters: Boosters
 
     def __call__(self, frame: StandardFrame, count: int) -> tuple[FloatArray, FloatArray]:
-        """The best ``count`` places ``(count, 3)`` mm, apart from one another, and their ratings."""
+        """The best places ``(count, 3)`` mm that are apart from one another, and their ratings."""
         places = _places(frame)
         if not len(places):
             return np.zeros((0, 3)), np.zeros(0)

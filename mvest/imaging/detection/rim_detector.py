@@ -1,7 +1,7 @@
 """The annulus hinge and the free edge, column by column.
 
-A rim lies where a leaflet ends: along the leaflet as well as across it there is something to see, so
-candidates vote in the plane perpendicular to the rim.
+A rim lies where a leaflet ends: along the leaflet as well as across it there is something to see,
+so candidates vote in the plane perpendicular to the rim.
 """
 
 from __future__ import annotations

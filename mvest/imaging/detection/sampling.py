@@ -1,8 +1,8 @@
 """Features: ranks at places that turn and scale with a hypothesis, and their differences.
 
-Sampling at places that follow a hypothesised position, orientation and scale instead of rotating the
-volume is what Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008) call steerable features; means over
-cubes and their differences are those of Haar.
+Sampling at places that follow a hypothesised position, orientation and scale instead of rotating
+the volume is what Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008) call steerable features;
+means over cubes and their differences are those of Haar.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The valve in all frames of a volume: one trajectory through the hypotheses of every frame.
 
-Each frame has several hypotheses; the trajectory that is likely in every frame and moves no faster than a
-valve does is found by dynamic programming. What was fitted then is smoothed in time as far as each vertex
-was unsure, with a penalty on acceleration; a truncated Fourier series would flatten the closure itself.
+Each frame has several hypotheses; the trajectory that is likely in every frame and moves no faster
+than a valve does is found by dynamic programming. What was fitted then is smoothed in time as far
+as each vertex was unsure, with a penalty on acceleration; a truncated Fourier series would flatten
+the closure itself.
 """
 
 from __future__ import annotations
@@ -102,9 +103,9 @@ def detect_valve(
     confidence = np.array([valve.confidence for valve in found])
     if confidence.max() < told.least_confidence:
         raise NoValveError(
-            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence of "
-            f"{confidence.max():.2f}, expected at least {told.least_confidence:g} (a mitral valve "
-            "whole within the field of view, or landmarks placed by hand)"
+            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
+            f"of {confidence.max():.2f}, expected at least {told.least_confidence:g} (a mitral "
+            "valve whole within the field of view, or landmarks placed by hand)"
         )
     sure = np.stack([valve.vertex_confidence for valve in found])
     smooth = smooth_in_time(
@@ -249,18 +250,14 @@ def smooth_in_time(
     s : (n,)
         0 at the annulus, 1 at the free edge.
     smoothing_s : (float, float, float)
-        Times for annulus, free edge (in between: a geometric mean by s) and tips.
+        Times for annulus, free edge (in between: linear in s) and tips.
 
     Returns
     -------
     vertices, tips
     """
     annulus, edge, tip = (max(float(t), 0.0) for t in smoothing_s)
-    length = np.where(
-        np.minimum(annulus, edge) > 0,
-        np.exp((1 - s) * np.log(annulus + 1e-12) + s * np.log(edge + 1e-12)),
-        (1 - s) * annulus + s * edge,
-    )
+    length = (1 - s) * annulus + s * edge
     smooth = _whittaker(times, vertices, vertex_weight, length)
     weight = np.repeat(frame_weight[:, None], tips.shape[1], 1)
     return smooth, _whittaker(times, tips, weight, np.full(tips.shape[1], tip))
@@ -271,8 +268,8 @@ def _whittaker(
 ) -> FloatArray:
     """Penalised least squares on second divided differences, for each column ``(T, m, 3)``.
 
-    Minimises sum_t w (z - y)^2 dt + length^4 int z''^2 dt (Whittaker, Proc. Edinburgh Math. Soc. 41:63, 1923), so
-    that what varies over much less than ``length`` (s) goes.
+    Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt (Whittaker, Proc. Edinburgh Math. Soc.
+    41:63, 1923), so that what varies over much less than ``length`` (s) goes.
     """
     count = len(times)
     if count < 3 or not np.any(length > 0):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import joblib
 import numpy as np
@@ -47,7 +47,10 @@ __all__ = [
     "train_model",
 ]
 
-Samples = dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
+Setting: TypeAlias = Literal["training", "shifted"]
+"""Within the ranges that detectors are trained in, or outside of them."""
+
+Samples: TypeAlias = dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
 
 
@@ -135,7 +138,7 @@ class RenderedFrame:
 
 
 def render_frame(
-    valve: MovingValve, which: int, base: Acquisition, spread: str, seed: np.random.SeedSequence
+    valve: MovingValve, which: int, base: Acquisition, spread: Setting, seed: np.random.SeedSequence
 ) -> RenderedFrame:
     """Simulate the volume of one frame of a valve, probe and rendering drawn at random."""
     rng = np.random.default_rng(seed)
