@@ -79,6 +79,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.mechanics",
         "mvest.imaging",
         "mvest.model",
+        "mvest.registration",
         "mvest.virtual_patient",
     ),
     "mvest.personalise": (
