@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvest.imaging.reading.data import beside, from_gzip, plainly, read_exactly
 from mvest.imaging.reading.nrrd_header import NrrdHeader
 from mvest.imaging.reading.stated import fault
 
-__all__ = ["beside", "read_data", "read_exactly", "voxel_type"]
+__all__ = ["read_data", "voxel_type"]
 
 TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -29,9 +27,6 @@ TYPES = {
 }
 """Types of the format by all their names, 8-byte integers and blocks aside."""
 
-CHUNK = 2**24
-"""Bytes decompressed at a time."""
-
 
 def voxel_type(header: NrrdHeader) -> np.dtype[np.generic]:
     """The type of a voxel, with its order of bytes."""
@@ -45,50 +40,6 @@ def voxel_type(header: NrrdHeader) -> np.dtype[np.generic]:
     if order not in ("little", "big"):
         raise fault(header.path, "endian", repr(order), "little or big")
     return dtype.newbyteorder("<" if order == "little" else ">")
-
-
-def beside(path: Path, field: str, name: str) -> Path:
-    """The data file that a header names; it must lie in the header's own folder.
-
-    Raises
-    ------
-    InputError
-        A name that leads elsewhere, or no such file.
-    """
-    plain = name.removeprefix("./")
-    data = path.parent / plain
-    inside = "/" not in plain and "\\" not in plain and plain not in ("", ".", "..")
-    if not inside or data.resolve().parent != path.parent.resolve():
-        raise fault(path, field, repr(name), "the name of a file in the same folder")
-    if not data.is_file():
-        raise fault(path, field, f"{name!r} does not exist", "a file in the same folder")
-    return data
-
-
-def read_exactly(path: Path, field: str, stream: BinaryIO, size: int) -> NDArray[np.uint8]:
-    """Read `size` bytes from a stream that must hold them and no more.
-
-    Raises
-    ------
-    InputError
-        Truncated or damaged data, or more than there should be.
-    """
-    result = np.empty(size, dtype=np.uint8)
-    view = result.data
-    done = 0
-    expected = f"the {size} bytes that the header says"
-    try:
-        while done < size:
-            count = stream.readinto(view[done : done + CHUNK])  # type: ignore[attr-defined]
-            if not count:
-                raise fault(path, field, f"{done} bytes", expected)
-            done += count
-        more = stream.read(1)
-    except (EOFError, OSError, zlib.error) as error:
-        raise fault(path, field, f"{done} bytes, then {error}", expected) from error
-    if more:
-        raise fault(path, field, f"more than {size} bytes", expected)
-    return result
 
 
 def read_data(
@@ -116,13 +67,7 @@ def read_data(
             file.seek(start)
         else:
             file.seek(skip, 1)
-        if encoding == "raw":
-            found = source.stat().st_size - file.tell()
-            if found != size:
-                raise fault(path, field, f"{found} bytes", f"the {size} bytes that sizes say")
-            flat = read_exactly(path, field, file, size)
-        else:
-            with gzip.GzipFile(fileobj=file) as stream:
-                flat = read_exactly(path, field, stream, size)  # type: ignore[arg-type]
+        chunks = plainly(file) if encoding == "raw" else from_gzip(file)
+        flat = read_exactly(path, field, chunks, size)
     files = (path,) if name is None else (path, source)
     return flat.view(dtype).reshape(sizes, order="F"), files

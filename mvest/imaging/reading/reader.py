@@ -7,7 +7,10 @@ from pathlib import Path
 
 from mvest.errors import InputError
 from mvest.imaging.reading.checks import checked_sequence
+from mvest.imaging.reading.metaimage import is_metaimage, read_metaimage
+from mvest.imaging.reading.nifti import is_nifti, read_nifti
 from mvest.imaging.reading.nrrd_file import read_nrrd
+from mvest.imaging.reading.philips import is_dicom, read_philips
 from mvest.imaging.reading.stated import fault
 from mvest.imaging.volume import Modality, VolumeSequence
 
@@ -52,7 +55,12 @@ def read_volume(
     """
     source = Path(path)
     if source.is_dir():
-        raise fault(source, "path", "a folder", f"one file: {READABLE}")
+        raise fault(
+            source,
+            "path",
+            "a folder",
+            f"one file: {READABLE}; convert a DICOM series with 3D Slicer, to .nrrd or .seq.nrrd",
+        )
     if not source.is_file():
         raise InputError(f"{source}: no such file")
     try:
@@ -60,6 +68,12 @@ def read_volume(
             head = file.read(1024)
         if head.startswith(b"NRRD"):
             stated, files = read_nrrd(source)
+        elif is_nifti(source):
+            stated, files = read_nifti(source)
+        elif is_dicom(head):
+            stated, files = read_philips(source)
+        elif is_metaimage(head):
+            stated, files = read_metaimage(source)
         else:
             raise fault(source, "content", f"{head[:8]!r}", READABLE)
         sha256 = _sha256(files)
