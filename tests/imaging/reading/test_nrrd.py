@@ -395,9 +395,7 @@ def test_damaged_compression_is_refused(tmp_path: Path) -> None:
 def test_a_header_without_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.nrrd"
     path.write_bytes(b"NRRD0005\n" + b"# more\n" * 200_000)
-    with pytest.raises(
-        InputError, match=r"header: no end in 1048576 bytes"
-    ):
+    with pytest.raises(InputError, match=r"header: no end in 1048576 bytes"):
         read(path)
 
 

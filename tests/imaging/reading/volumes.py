@@ -19,9 +19,9 @@ ROTATION = Rotation.from_euler("xyz", [20, -35, 70], degrees=True).as_matrix()
 MIRRORED = ROTATION * [1.0, 1.0, -1.0]
 
 
-def frames(dtype: str = "uint8") -> NDArray[np.generic]:
-    """Different numbers in all frames, whatever axes are swapped."""
-    return np.random.default_rng(7).integers(0, 200, SHAPE).astype(dtype)
+def frames(dtype: str = "uint8", shape: tuple[int, ...] = SHAPE) -> NDArray[np.generic]:
+    """Random numbers below 200, which are others wherever axes are swapped."""
+    return np.random.default_rng(7).integers(0, 200, shape).astype(dtype)
 
 
 def sequence(dtype: str = "uint8", direction: NDArray[np.float64] = ROTATION) -> VolumeSequence:
