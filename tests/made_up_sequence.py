@@ -48,7 +48,7 @@ def sequence(closures=(1.0, 1.0, 0.4, 0.0), layout=None, confidence=0.9):
         layout,
         0.04 * np.arange(count),
         x,
-        np.stack([tips + [0, 0, 0.8 * c] for c in closures]) @ turn.T + place,
+        np.stack([tips + np.array([0, 0, 0.8 * c]) for c in closures]) @ turn.T + place,
         np.full(count, confidence),
         np.tile(1 - 0.4 * layout.s, (count, 1)),
         edge,

@@ -79,6 +79,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.mechanics",
         "mvest.imaging",
         "mvest.model",
+        "mvest.registration",
         "mvest.virtual_patient",
     ),
     "mvest.personalise": (
@@ -316,11 +317,7 @@ def test_what_is_imported_is_declared(project: dict) -> None:
     required = import_names(project["dependencies"])
     extras = project["optional-dependencies"]
     optional = import_names(
-        [
-            text
-            for name in ("viz", "imaging", "cluster", "postgres", "browser")
-            for text in extras[name]
-        ]
+        [text for name in ("viz", "cluster", "postgres", "browser") for text in extras[name]]
     )
     messages = [
         message

@@ -6,6 +6,11 @@ Closures of :mod:`mvest.model`, on anatomies around given ones, as
 
 from mvest.simulated_motion.closing import MotionSettings, close_in_motion
 from mvest.simulated_motion.files import load_population, save_population
+from mvest.simulated_motion.patient import (
+    IMAGED,
+    ImagedPatient,
+    simulate_imaged_patient,
+)
 from mvest.simulated_motion.population import (
     Population,
     PopulationSettings,
@@ -15,6 +20,8 @@ from mvest.simulated_motion.population import (
 from mvest.simulated_motion.refusal import MotionLimits, Refusal, RefusedError
 
 __all__ = [
+    "IMAGED",
+    "ImagedPatient",
     "MotionLimits",
     "MotionSettings",
     "Population",
@@ -26,4 +33,5 @@ __all__ = [
     "load_population",
     "population_hash",
     "save_population",
+    "simulate_imaged_patient",
 ]

@@ -26,7 +26,15 @@ from mvest.valve.anatomy import Valve
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template
 
-__all__ = ["MotionSettings", "close_in_motion", "frames_along", "with_tip_motion"]
+__all__ = [
+    "ClosingFrames",
+    "MotionSettings",
+    "close_in_motion",
+    "closing_frames",
+    "frames_along",
+    "moving_valve",
+    "with_tip_motion",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +97,27 @@ class MotionSettings:
             raise InputError(f"tolerance of a motion = {self.tolerance}, expected > 0")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosingFrames:
+    """The frames of a closure, the open and the closed one among them.
+
+    Attributes
+    ----------
+    vertices : (f, n, 3) mm
+        Of the layout.
+    tips : (f, 2, 3) mm
+    model : ClosureModel
+        Which has been closed with ``at``.
+    at : (p,)
+        Its parameters.
+    """
+
+    vertices: FloatArray
+    tips: FloatArray
+    model: ClosureModel
+    at: FloatArray
+
+
 def close_in_motion(
     name: str,
     template: Template,
@@ -121,10 +150,43 @@ def close_in_motion(
         If a value is inadmissible.
     """
     shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
-    layout = ValveLayout(settings.columns, settings.rows)
-    seen = with_tip_motion(template.valve(layout.columns, layout.rows), shift)
-    contact = with_tip_motion(
-        template.valve(settings.contact_columns, settings.contact_rows), shift
+    closing = closing_frames(name, template, values, settings, mechanics, shift)
+    model = closing.model
+    states = _held(settings, model.contact_valve, mechanics.protocol.pressure_mmHg)
+    held = []
+    for state, found in zip(states, model.held(closing.at, states), strict=True):
+        if found is None:
+            raise RefusedError(
+                name, Refusal.NOT_HELD, f"no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+            )
+        held.append(found)
+    valve = moving_valve(
+        name,
+        template,
+        model.valve.surface.thickness,
+        settings,
+        np.stack([*closing.vertices, *held]),
+        np.stack([*closing.tips, *(state.papillary_tips for state in states)]),
+    )
+    check_motion(valve, settings.frames - 1, settings.limits)
+    return valve
+
+
+def closing_frames(
+    name: str,
+    template: Template,
+    values: Mapping[str, float],
+    settings: MotionSettings,
+    mechanics: MechanicsSettings,
+    tip_motion: FloatArray,
+) -> ClosingFrames:
+    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked."""
+    seen, contact = (
+        with_tip_motion(template.valve(columns, rows), tip_motion)
+        for columns, rows in (
+            (settings.columns, settings.rows),
+            (settings.contact_columns, settings.contact_rows),
+        )
     )
     mesh = structured_mesh(template, settings.element, settings.mesh_columns, settings.mesh_rows)
     ramp = mechanics.protocol.ramp
@@ -143,35 +205,34 @@ def close_in_motion(
     if not simulation.converged:
         raise RefusedError(name, Refusal.NOT_CLOSED, simulation.reason.value)
     positions = np.stack([model.observed(frame) for frame in simulation.frames])
-    phases = np.array([protocol.phase(time) for time in simulation.times])
-    chosen = frames_along(positions[:, layout.free_edge], settings.frames)
-    motion = seen.motion
-    tips = motion.papillary_tips[0] + phases[chosen, None, None] * np.diff(
-        motion.papillary_tips, axis=0
-    )
-    states = _held(settings, contact, protocol.pressure_mmHg)
-    vertices = [*positions[chosen]]
-    for state, found in zip(states, model.held(at, states), strict=True):
-        if found is None:
-            raise RefusedError(
-                name, Refusal.NOT_HELD, f"no equilibrium under {state.pressure_mmHg:.0f} mmHg"
-            )
-        vertices.append(found)
+    chosen = frames_along(positions[:, seen.free_edge], settings.frames)
+    phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
+    start, end = seen.motion.papillary_tips
+    return ClosingFrames(positions[chosen], start + phase[:, None, None] * (end - start), model, at)
+
+
+def moving_valve(
+    name: str,
+    template: Template,
+    thickness: FloatArray,
+    settings: MotionSettings,
+    vertices: FloatArray,
+    tips: FloatArray,
+) -> MovingValve:
+    """A template's valve with frames ``vertices (T, n, 3)`` and ``tips (T, 2, 3)``, T > 1."""
     count = len(vertices)
     phi, s, _, tip = template.chord_places()
-    valve = MovingValve(
+    return MovingValve(
         name,
-        layout,
+        ValveLayout(settings.columns, settings.rows),
         settings.duration * np.arange(count) / (count - 1),
-        np.stack(vertices),
-        np.concatenate([tips, *(state.papillary_tips[None] for state in states)]),
-        seen.surface.thickness,
+        vertices,
+        tips,
+        thickness,
         np.mod(phi, 360.0),
         s,
         tip,
     )
-    check_motion(valve, settings.frames - 1, settings.limits)
-    return valve
 
 
 def with_tip_motion(valve: Valve, shift: FloatArray) -> Valve:

@@ -1,7 +1,7 @@
 """How a simulated echo volume is acquired: every setting of the rendering, with its unit.
 
-Levels in dB are of amplitude, relative to the root mean square of fully developed speckle of an echo
-strength of 0 dB, seen face on and without attenuation.
+Levels in dB are of amplitude, relative to the root mean square of fully developed speckle of an
+echo strength of 0 dB, seen face on and without attenuation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from mvest.errors import InputError
 __all__ = ["SMALL", "SPEED_OF_SOUND", "Acquisition"]
 
 SPEED_OF_SOUND = 1540.0
-"""m/s, the mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
+"""m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,14 @@ class Acquisition:
     dynamic_range_db, gain_db : float
         Grey levels 0 to 255 show ``-dynamic_range_db - gain_db`` to ``-gain_db``.
     attenuation_db_per_cm_mhz, blood_attenuation_db_per_cm_mhz : float
-        One way, of tissue (0.5) and blood (0.15 to 0.2) (Duck, Physical Properties of Tissue, 1990).
+        One way, of tissue (0.5) and blood (0.15 to 0.2) (Duck, Physical Properties of Tissue,
+        1990).
     compensation_db_per_cm_mhz : float
         One way, what the time gain compensation makes good; it also amplifies electronic noise.
     shadow_db_per_cm : float
         One way, added in dense tissue (parts of the annulus), so that it casts shadows.
     angle_exponent, angle_floor_db : float
-        The amplitude of walls and leaflets falls off as ``floor + (1 - floor) |n . beam|^exponent``.
+        Walls and leaflets send the share ``floor + (1 - floor) |n . beam|^exponent`` of their echo.
     dropout : float
         Share of the leaflets in patches that send hardly any echo, 0 to 0.6.
     dropout_db : float
@@ -87,25 +88,25 @@ class Acquisition:
     gain_db: float = 0.0
     attenuation_db_per_cm_mhz: float = 0.5
     blood_attenuation_db_per_cm_mhz: float = 0.15
-    compensation_db_per_cm_mhz: float = 0.2
+    compensation_db_per_cm_mhz: float = 0.17
     shadow_db_per_cm: float = 20.0
     angle_exponent: float = 1.5
-    angle_floor_db: float = -16.0
+    angle_floor_db: float = -22.0
     dropout: float = 0.1
     dropout_db: float = -20.0
-    blood_db: float = -46.0
-    electronics_db: float = -56.0
+    blood_db: float = -49.0
+    electronics_db: float = -63.0
     haze_db: float = -22.0
     haze_mm: float = 7.0
     contact_db: float = 2.0
     wall_db: float = -17.0
     leaflet_db: float = -3.0
     annulus_db: float = -3.0
-    chord_db: float = -6.0
-    papillary_db: float = -15.0
+    chord_db: float = -9.0
+    papillary_db: float = -18.0
     vessel_db: float = -10.0
     beats: int = 4
-    beat_shift_mm: float = 0.5
+    beat_shift_mm: float = 0.4
     beat_turn_deg: float = 0.5
     scatterers_per_cell: float = 10.0
     voxel_mm: float = 0.7

@@ -1,15 +1,16 @@
 """Echoes in the coordinates of the beams: distance, azimuth and elevation.
 
-A direction is (tan a, tan e, 1) along azimuth, elevation and beam. The signal is complex baseband: a
-scatterer at distance r adds its amplitude times ``exp(2 i k r)``, blurred by the point spread function,
-which is separable in distance and the two angles (linear image formation, as in Gao et al., IEEE Trans.
-Ultrason. Ferroelectr. Freq. Control 56, 2009).
+A direction is (tan a, tan e, 1) along azimuth, elevation and beam. The signal is complex baseband:
+a scatterer at distance r adds its amplitude times ``exp(2 i k r)``, blurred by the point spread
+function, which is separable in distance and the two angles (linear image formation, as in Gao et
+al., IEEE Trans. Ultrason. Ferroelectr. Freq. Control 56, 2009).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def _axis(low: float, high: float, width: float, lobe_db: float, per_width: floa
     margin = math.ceil(reach / step)
 
     def shape(x: FloatArray, spread: float) -> FloatArray:
-        total = np.exp(-0.5 * (x / spread) ** 2)
+        total = np.exp(-0.5 * (x / spread) ** 2, dtype=np.float64)
         if level >= 1e-6:
             for place, share, sign in LOBES:
                 for side in (-1, 1):
@@ -125,7 +126,7 @@ class BeamGrid:
     def windows(self) -> list[tuple[int, int]]:
         """First and past the last azimuth of each beat."""
         edges = np.linspace(0, self.azimuth.count, self.acquisition.beats + 1).round().astype(int)
-        return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [(a, b) for a, b in pairwise(edges.tolist())]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

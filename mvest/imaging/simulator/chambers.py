@@ -1,8 +1,8 @@
 """The heart around a valve, made up: ventricle, atrium, aortic root, papillary muscles.
 
 Everything begins at the annulus and moves with it; shapes and sizes are drawn, and are a choice
-within what is usual in adults (ventricle 40 to 55 mm wide with walls of 8 to 11 mm, aortic root 22 to
-28 mm). Positions are mm in the valve's own axes.
+within what is usual in adults (ventricle 40 to 55 mm wide with walls of 8 to 11 mm, aortic root 22
+to 28 mm). Positions are mm in the valve's own axes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from mvest.imaging.moving_valve import MovingValve
 from mvest.typing import FloatArray
 
-__all__ = ["Heart", "make_heart"]
+__all__ = ["Heart", "make_heart", "waves"]
 
 ROWS = 33
 
@@ -31,6 +31,8 @@ class Heart:
     muscles : tuple of (T, m, 3)
         From each papillary tip to the ventricle's wall.
     muscle_radius : (m,)
+    outflow : (C,)
+        Share of the outflow tract in the ventricle's base, 0 (at the back) to 1.
     """
 
     ventricle: FloatArray
@@ -41,6 +43,7 @@ class Heart:
     aorta_thickness: FloatArray
     muscles: tuple[FloatArray, ...]
     muscle_radius: FloatArray
+    outflow: FloatArray
 
 
 def _step(x: FloatArray) -> FloatArray:
@@ -48,16 +51,29 @@ def _step(x: FloatArray) -> FloatArray:
     return np.asarray(x * x * (3 - 2 * x))
 
 
-def _waves(rng: np.random.Generator, rows: int, columns: int, size: float) -> FloatArray:
-    """A smooth random field ``(rows, columns)`` of standard deviation ``size``, closed around."""
+def waves(
+    rng: np.random.Generator, rows: int, columns: int, fineness: int = 1, fall: float = 1.0
+) -> FloatArray:
+    """A smooth random field ``(rows, columns)`` of mean 0 and standard deviation 1, closed around.
+
+    Parameters
+    ----------
+    rng : numpy Generator
+    rows, columns : int
+    fineness : int
+        Waves around are up to 4 times, and along up to 3 times this.
+    fall : float
+        Power with which amplitudes fall off with the number of waves.
+    """
     phi = 2 * np.pi * np.arange(columns) / columns
     u = np.linspace(0, np.pi, rows)[:, None]
     total = np.zeros((rows, columns))
-    for m in range(5):
-        for n in range(4):
-            a, b = rng.standard_normal(2) / (1 + m + n)
+    for m in range(4 * fineness + 1):
+        for n in range(0 if m else 1, 3 * fineness + 1):
+            a, b = rng.standard_normal(2) / (1 + m + n) ** fall
             total += np.cos(n * u) * (a * np.cos(m * phi) + b * np.sin(m * phi))
-    return np.asarray(size * total / max(float(total.std()), 1e-9))
+    total -= total.mean()
+    return np.asarray(total / max(float(total.std()), 1e-9))
 
 
 def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -> Heart:
@@ -99,9 +115,10 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
 
     # Ventricle: from the annulus, in front from the far side of the outflow tract, to its apex.
     tips = valve.tips.reshape(-1, 3)
-    half = np.array([rng.uniform(20, 26), rng.uniform(21, 26)])
+    back, front = ring[:, 1].min() - rng.uniform(3, 9), (centre + radius * forward)[1]
+    half = np.array([rng.uniform(21, 27), 0.5 * (front - back)])
     half[0] = max(half[0], np.abs(tips[:, 0] - middle[0]).max() + 5.0)
-    axis = np.array([middle[0], middle[1] + rng.uniform(4, 8), rng.uniform(-8, -4)])
+    axis = np.array([middle[0], 0.5 * (front + back), middle[2] + rng.uniform(-6, -2)])
     length = max(rng.uniform(62, 80), float(-tips[:, 2].min()) + 30.0)
     psi = 0.49 * np.pi * u
     radial = np.cos(psi) ** rng.uniform(0.5, 0.75)
@@ -109,10 +126,10 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     body[..., 0] = axis[0] + half[0] * radial * np.cos(angle)
     body[..., 1] = axis[1] + half[1] * radial * np.sin(angle)
     body[..., 2] = axis[2] - length * np.sin(psi)
-    body += (_step(u / 0.2) * _waves(rng, ROWS, len(angle), 1.2))[..., None] * outward
+    body += (_step(u / 0.2) * _rough(rng, len(angle)))[..., None] * outward
     outflow = np.exp(-((np.abs(phi - 90.0) / rng.uniform(50, 60)) ** 4))[:, None]
     base = ring + 1.0 * outward + outflow * (2 * radius + 1.0) * forward
-    fade = (1 - _step(u / 0.4))[..., None]
+    fade = (1 - _step(u / 0.22))[..., None]
     inner = body + fade * (base - body[:1])
     tip_shift = (valve.tips - valve.tips[:1]).mean(axis=1)
     share = _step(u / 0.5)[..., None]
@@ -120,7 +137,7 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
     ventricle = (
         inner + (1 - share) * _shift(annulus)[:, None] + share * reach * tip_shift[:, None, None]
     )
-    wall = rng.uniform(8, 11) * (1 + 0.06 * _waves(rng, ROWS, len(angle), 1.0))
+    wall = rng.uniform(8, 11) * (1 + 0.06 * waves(rng, ROWS, len(angle)))
     wall *= 0.45 + 0.55 * _step(u / 0.12)
     wall *= 1 - 0.35 * _step((u - 0.75) / 0.25)
 
@@ -134,7 +151,14 @@ def make_heart(valve: MovingValve, apex: FloatArray, rng: np.random.Generator) -
         np.full((len(along), len(around)), rng.uniform(1.6, 2.2)),
         muscles,
         fat,
+        outflow[:, 0],
     )
+
+
+def _rough(rng: np.random.Generator, columns: int) -> FloatArray:
+    """Offset ``(ROWS, columns)`` mm of the ventricle's inner surface: form, and trabeculae."""
+    fine = waves(rng, ROWS, columns, 4, 0.3)
+    return np.asarray(1.2 * waves(rng, ROWS, columns) + rng.uniform(0.2, 0.6) * fine)
 
 
 def _shift(annulus: FloatArray) -> FloatArray:
@@ -168,7 +192,7 @@ def _atrium(
     """Inner surface ``(T, R, C, 3)`` of a dome from the annulus towards the probe."""
     u = np.linspace(0, 1, ROWS)[:, None]
     ring = annulus[0]
-    centre = ring.mean(axis=0) + [0.0, rng.uniform(-6, -1), rng.uniform(16, 22)]
+    centre = ring.mean(axis=0) + np.array([0.0, rng.uniform(-6, -1), rng.uniform(16, 22)])
     axes = np.array([rng.uniform(20, 27), rng.uniform(17, 22), rng.uniform(20, 26)])
     start = ring - centre
     low = np.arcsin(start[:, 2] / np.linalg.norm(start, axis=1))
@@ -177,7 +201,7 @@ def _atrium(
         [np.cos(psi) * np.cos(angle), np.cos(psi) * np.sin(angle), np.sin(psi)], axis=-1
     )
     reach = 1 / np.linalg.norm(direction / axes, axis=-1)
-    reach += _waves(rng, ROWS, len(angle), 1.3)
+    reach += 1.3 * waves(rng, ROWS, len(angle))
     body = reach[..., None] * direction
     # The side towards the probe reaches to the probe, nearly.
     sight = apex - centre

@@ -19,7 +19,7 @@ Float32Array = NDArray[np.float32]
 
 
 def compress(envelope: Float32Array, acquisition: Acquisition) -> Float32Array:
-    """Grey levels 0 to 255 of an envelope: ``255 (1 + (20 log10 envelope + gain) / range)``, cut."""
+    """Grey levels of an envelope: ``255 (1 + (20 log10 envelope + gain) / range)`` in [0, 255]."""
     a = acquisition
     level = np.log10(np.maximum(envelope, np.float32(1e-20)))
     level *= np.float32(255 * 20 / a.dynamic_range_db)

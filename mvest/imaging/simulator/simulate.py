@@ -52,10 +52,11 @@ def simulate_volume(
     chosen = _chosen(valve, frames)
     if seed < 0:
         raise InputError(f"simulated volume, seed = {seed}, expected >= 0")
-    if probe.to_probe(np.zeros(3))[2] <= acquisition.depth_mm[0]:
+    depth = probe.to_probe(np.zeros(3))[2]
+    if depth <= acquisition.depth_mm[0]:
         raise InputError(
-            f"simulated volume, probe: the valve lies {probe.to_probe(np.zeros(3))[2]:.1f} mm along "
-            f"the beam, expected more than the nearest depth {acquisition.depth_mm[0]:g} mm"
+            f"simulated volume, probe: the valve lies {depth:.1f} mm along the beam, "
+            f"expected more than the nearest depth {acquisition.depth_mm[0]:g} mm"
         )
     rng = np.random.default_rng([seed, 0])
     scene = make_scene(valve, acquisition, probe, rng)

@@ -125,8 +125,8 @@ SHIFTED = Spread(
         _range("beat_turn_deg", "times", (1.6, 2.5)),
     ),
 )
-"""What detectors never saw: apart from echo strengths and compensation, every range is disjoint from
-that of training, and mostly on the worse side."""
+"""What detectors never saw: apart from echo strengths and compensation, every range is disjoint
+from that of training, and mostly on the worse side."""
 
 
 def draw_acquisition(

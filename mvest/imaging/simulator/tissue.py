@@ -13,7 +13,7 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["Cord", "Material", "Part", "Sheet"]
+__all__ = ["Cord", "Material", "Part", "Sheet", "normals"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +72,11 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.maximum(length, 1e-9))
 
 
+def normals(points: FloatArray) -> FloatArray:
+    """Unit normals (row direction x column direction) of grids ``(..., R, C, 3)``, columns closed."""
+    return _unit(np.cross(_differences(points, -3, False), _differences(points, -2, True)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
     """A layer over a grid of moving points, closed along its columns.
@@ -86,6 +91,8 @@ class Sheet:
         Where the layer lies along the normal (row direction x column direction), over thickness.
     relative : (R, C)
         Amplitude relative to the material's.
+    fade : float
+        The amplitude falls by ``exp(-fade)`` from the grid to one thickness away.
     """
 
     material: Material
@@ -93,6 +100,7 @@ class Sheet:
     thickness: FloatArray
     span: tuple[float, float]
     relative: FloatArray
+    fade: float = 0.0
 
     @property
     def _cells(self) -> FloatArray:
@@ -123,12 +131,13 @@ class Sheet:
     def place(self, frame: int, seeds: FloatArray, apex: FloatArray) -> tuple[FloatArray, ...]:
         """Positions ``(n, 3)`` and ``|normal . line of sight|`` ``(n,)``."""
         p = self.points[frame]
-        normal = _unit(np.cross(_differences(p, 0, False), _differences(p, 1, True)))
-        return _on_sheet(p, normal, self.thickness, seeds, apex)
+        return _on_sheet(p, normals(p), self.thickness, seeds, apex)
 
     def strength(self, seeds: FloatArray) -> FloatArray:
         """Amplitude ``(n,)`` relative to the material's."""
-        return np.asarray(_bilinear(self.relative, seeds))
+        return np.asarray(
+            _bilinear(self.relative, seeds) * np.exp(-self.fade * np.abs(seeds[:, 2]))
+        )
 
     def density_of_shadow(self, seeds: FloatArray) -> FloatArray:
         """``(n,)`` zeros: sheets hold no dense tissue."""
@@ -186,11 +195,13 @@ class Cord:
         """Positions ``(n, 3)`` and the sine between cord and line of sight ``(n,)``."""
         p = self.line[frame]
         tangent = _unit(_differences(p, 0, self.closed))
-        # One reference direction for the whole cord, the axis it is least parallel to.
-        axis = np.eye(3)[np.argmin(np.abs(tangent).max(axis=0))]
+        # One reference direction for the whole cord and all frames.
+        first = _unit(_differences(self.line[0], 0, self.closed))
+        axis = np.eye(3)[np.argmin(np.abs(first).max(axis=0))]
         u = _unit(np.cross(tangent, axis))
         v = np.cross(tangent, u)
-        return _on_cord(*map(self._ends, (p, tangent, u, v, self.radius)), seeds, apex)
+        p, tangent, u, v = (self._ends(x) for x in (p, tangent, u, v))
+        return _on_cord(p, tangent, u, v, self._ends(self.radius), seeds, apex)
 
     def strength(self, seeds: FloatArray) -> FloatArray:
         """Amplitude ``(n,)`` relative to the material's: 1."""
