@@ -134,8 +134,7 @@ GRIDS = [
 
 
 @pytest.mark.parametrize(("spacing", "shape"), GRIDS)
-@pytest.mark.parametrize("direction", [np.eye(3), ROTATION, MIRRORED], ids=["along", "oblique",
-                                                                          "left-handed"])  # fmt: skip
+@pytest.mark.parametrize("direction", [np.eye(3), ROTATION, MIRRORED])
 def test_a_bright_ball_is_at_its_place_in_every_level(spacing, shape, direction):
     # Half a voxel of some level, of the old or the new grid, or transposed axes, are seen here.
     frame = standard_frame(cube(spacing, direction, shape, 2.5), 0)

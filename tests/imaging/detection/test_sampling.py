@@ -31,8 +31,9 @@ def frame_of(level0, direction=ROTATION, levels=3):
     )
 
 
-def ramp(direction, slope=np.array([1.3, 1.1, 0.9]), base=30.0):
+def ramp(direction, base=30.0):
     """Rises along all axes of the voxels; also what it is at world points."""
+    slope = np.array([1.3, 1.1, 0.9])
     index = np.stack(np.meshgrid(*(np.arange(k) for k in SHAPE), indexing="ij"), -1)
 
     def value(world):
