@@ -106,11 +106,11 @@ def test_a_point_is_as_wide_as_set():
 
 def test_echoes_interfere_with_the_phase_of_the_way_there_and_back():
     # A quarter of the wavelength (0.308 mm at 5 MHz) apart they cancel, half of it apart they add.
-    _, one = render(QUIET, echoes([[0.0, 0.0, 50.0]]))
-    _, out = render(QUIET, echoes([[0.0, 0.0, 50.0], [0.0, 0.0, 50.077]]))
-    _, together = render(QUIET, echoes([[0.0, 0.0, 50.0], [0.0, 0.0, 50.154]]))
-    assert out.max() < 0.25 * one.max()
-    assert together.max() == pytest.approx(2 * one.max(), rel=0.05)
+    def peak(*depths):
+        return render(QUIET, echoes([[0.0, 0.0, z] for z in depths]))[1].max()
+
+    assert peak(50.0, 50.077) < 0.25 * peak(50.0)
+    assert peak(50.0, 50.154) == pytest.approx(peak(50.0) + peak(50.154), rel=0.05)
 
 
 def test_side_lobes_have_the_level_set():
