@@ -20,6 +20,7 @@ from mvest.valve.io import region_arrays, write_surface, write_whole
 
 __all__ = [
     "OPEN_SHARE",
+    "closed_frame",
     "contact_distance",
     "measure_meaning",
     "measure_sequence",
@@ -141,6 +142,20 @@ def _leaflets(layout: ValveLayout, thickness_mm: float) -> _Leaflets:
 
 def _finite(value: Any) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
+
+
+def closed_frame(rows: Sequence[Row]) -> int | None:
+    """Frame in which the leaflets touch over the largest area, of the measures of all frames.
+
+    Where they touch in none the one with the smallest orifice; None if no frame has either. The
+    orifice alone would take leaflets for closed that only overlap in the line of sight.
+    """
+    known = [row for row in rows if row["coaptation_area_mm2"] is not None]
+    known = [row for row in known if row["orifice_mm2"] is not None]
+    if not known:
+        return None
+    best = min(known, key=lambda row: (-(row["coaptation_area_mm2"] or 0.0), row["orifice_mm2"]))
+    return int(best["frame"] or 0)
 
 
 def measure_meaning(name: str) -> tuple[str, str]:

@@ -9,6 +9,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaged_valve import (
+    closed_frame,
     contact_distance,
     measure_meaning,
     measure_sequence,
@@ -117,3 +118,15 @@ def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
     np.testing.assert_allclose(second.point_data["std_mm"], valve.std_mm)
     np.testing.assert_array_equal(second.cell_data["region"], SMALL.region)
     assert "region.posterior" in second.cell_data
+
+
+def test_the_closed_frame_is_where_most_touches(rows):
+    assert closed_frame(rows) == 0
+
+    def row(frame, touching, orifice):
+        return {"frame": frame, "coaptation_area_mm2": touching, "orifice_mm2": orifice}
+
+    nothing = row(0, None, None)
+    assert closed_frame([nothing, row(1, 5.0, 2.0), row(2, 9.0, 8.0)]) == 2
+    assert closed_frame([nothing, row(1, 0.0, 20.0), row(2, 0.0, 8.0)]) == 2
+    assert closed_frame([nothing]) is None
