@@ -1,4 +1,4 @@
-"""What users of valve software expect of a valve from images: measures and surfaces per frame."""
+"""Measures of a valve from images in every frame, and the tables that hold them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.clinical import clinical_meaning, clinical_measurements, clinical_names
-from mvest.valve.io import region_arrays, write_surface, write_whole
+from mvest.valve.io import write_whole
 
 __all__ = [
     "OPEN_SHARE",
@@ -25,7 +25,6 @@ __all__ = [
     "measure_meaning",
     "measure_sequence",
     "write_measures",
-    "write_surfaces",
 ]
 
 Row: TypeAlias = dict[str, float | None]
@@ -207,30 +206,3 @@ def _cell(value: float | None) -> str:
 
 def _write_text(file: Path, text: str) -> None:
     file.write_text(text, encoding="utf-8")
-
-
-def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -> Path:
-    """Write the valve of every frame for ParaView and 3D Slicer; returns the index.
-
-    ``NAME_0000.vtp``, ... hold the midsurface in LPS mm with ``confidence`` and ``std_mm`` (NaN
-    where it was never measured) at its points and ``region`` in its triangles;
-    ``NAME.vtp.series`` lists them with their times in s, as ParaView's readers expect it (ParaView
-    user's guide, "file series"). It is written last.
-
-    Raises
-    ------
-    InputError
-        A point that is no finite number, or a file that cannot be written.
-    """
-    layout = sequence.layout
-    cells = region_arrays(layout.region, layout.region_names)
-    files = []
-    for t, time in enumerate(sequence.times):
-        points = {"confidence": sequence.vertex_confidence[t], "std_mm": sequence.std_mm}
-        file = folder / f"{name}_{t:04d}.vtp"
-        write_surface(file, sequence.vertices[t], layout.triangles, points, cells)
-        files.append({"name": file.name, "time": float(time)})
-    text = json.dumps({"file-series-version": "1.0", "files": files}, indent=1)
-    index = folder / f"{name}.vtp.series"
-    write_whole(index, lambda file: _write_text(file, text + "\n"))
-    return index
