@@ -17,6 +17,7 @@ from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.reporting.imaging_planes import (
     COLUMNS,
+    STEP_MM,
     SlicePlane,
     leaflet_contours,
     near,
@@ -189,12 +190,9 @@ def _extents(
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
         if not planes:
             low, high = np.full(2, -20.0), np.full(2, 20.0)
-        found[name] = (
-            float(low[0] - MARGIN_MM),
-            float(high[0] + MARGIN_MM),
-            float(low[1] - MARGIN_MM),
-            float(high[1] + MARGIN_MM),
-        )
+        low = np.floor((low - MARGIN_MM) / STEP_MM) * STEP_MM
+        high = np.ceil((high + MARGIN_MM) / STEP_MM) * STEP_MM
+        found[name] = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     return found
 
 

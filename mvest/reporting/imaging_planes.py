@@ -18,12 +18,22 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.proximity import plane_section
 
-__all__ = ["COLUMNS", "SlicePlane", "leaflet_contours", "near", "resample", "valve_planes"]
+__all__ = [
+    "COLUMNS",
+    "STEP_MM",
+    "SlicePlane",
+    "leaflet_contours",
+    "near",
+    "resample",
+    "valve_planes",
+]
 
 COLUMNS = ("commissural", "anteroposterior", "at the annulus", "at the free edge")
 """Planes of `valve_planes`, in their order: two along the valve's axis and two across."""
 
 ABOVE_EDGE_MM = 1.0
+STEP_MM = 0.4
+"""Between pixels, if not told otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +126,7 @@ def resample(
     frame: int,
     plane: SlicePlane,
     extent: tuple[float, float, float, float],
-    step: float = 0.4,
+    step: float = STEP_MM,
 ) -> FloatArray:
     """A slice of one frame, between voxels by trilinear interpolation.
 
@@ -125,7 +135,7 @@ def resample(
     volume, frame
     plane : SlicePlane
     extent : (left, right, bottom, top)
-        mm in the plane.
+        mm in the plane, multiples of the step apart.
     step : float
         mm between pixels.
 
@@ -135,8 +145,9 @@ def resample(
         From the bottom up; NaN outside the volume.
     """
     left, end, bottom, top = extent
+    columns, rows = round((end - left) / step), round((top - bottom) / step)
     right, up = np.meshgrid(
-        np.arange(left + 0.5 * step, end, step), np.arange(bottom + 0.5 * step, top, step)
+        left + (np.arange(columns) + 0.5) * step, bottom + (np.arange(rows) + 0.5) * step
     )
     index = volume.index(plane.points(right, up))
     return np.asarray(
