@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mvest.errors import InputError
 from mvest.imaging.detection.fit import Pulls, fit_shape, relax
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.model import DetectionModel
@@ -111,9 +112,18 @@ def fit_frame(
         Where papillary tips are looked for.
     fixed : mapping, optional
         Landmarks placed by hand: number -> world position. They stay.
+
+    Raises
+    ------
+    InputError
+        If more modes are to be fitted than the model has.
     """
     told, begin = settings or FitSettings(), pose
     shape, layout = model.shape, model.shape.layout
+    if max(told.modes) > len(shape.std):
+        raise InputError(
+            f"fit of {max(told.modes)} modes, expected at most the model's {len(shape.std)}"
+        )
     stages: dict[str, FloatArray] = {"pose": pose.world(shape.mean)[0]}
     start, found_tips = model.start(frame, pose, shape)
     b = np.zeros(told.modes[0])

@@ -6,10 +6,11 @@ import hashlib
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib.npyio import NpzFile
@@ -23,7 +24,7 @@ from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch
 from mvest.imaging.detection.position import PositionDetector
 from mvest.imaging.detection.rim_detector import RimDetector
 from mvest.imaging.detection.shape_model import ShapeModel
-from mvest.imaging.detection.shape_start import ShapeStart
+from mvest.imaging.detection.shape_start import MODES, ShapeStart
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
@@ -32,18 +33,33 @@ __all__ = ["Accuracy", "DetectionModel", "load_model", "save_model"]
 
 FORMAT = "mvest detection model"
 VERSION = 1
-STAGES = (
-    "position",
-    "pose_coarse",
-    "pose_fine",
-    *(f"pose_refine_{k}" for k in range(len(REFINEMENTS))),
-    "shape",
-    *(f"landmark_{k}" for k in range(len(LANDMARKS))),
-    "annulus",
-    "free_edge",
-    "boundary",
-)
+OUTPUTS: Final = {
+    "position": 1,
+    "pose_coarse": 1,
+    "pose_fine": 1,
+    **{f"pose_refine_{k}": 7 for k in range(len(REFINEMENTS))},
+    "shape": MODES + 6,
+    **{f"landmark_{k}": 3 for k in range(len(LANDMARKS))},
+    "annulus": 2,
+    "free_edge": 2,
+    "boundary": 1,
+}
+"""How many outputs each set of trees has."""
+
+STAGES: Final = tuple(OUTPUTS)
 """Names of all sets of trees."""
+
+UNREADABLE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    ValueError,
+    KeyError,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+)
+"""What a file that is no model, or a damaged one, raises when it is read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +109,11 @@ class DetectionModel:
         missing = [name for name in STAGES if name not in boosters]
         if missing:
             raise InputError(f"detection model: no trees for {', '.join(missing)}")
+        for name, count in OUTPUTS.items():
+            if boosters[name].outputs != count:
+                raise InputError(
+                    f"detection model: {boosters[name].outputs} outputs of {name}, expected {count}"
+                )
         self.shape, self.boosters = shape, dict(boosters)
         self.trained_on, self.accuracy, self.sha256 = dict(trained_on), accuracy, sha256
         self.position = PositionDetector(boosters["position"])
@@ -172,47 +193,66 @@ def load_model(path: Path | str) -> DetectionModel:
             f"{source}: cannot be read ({fault.strerror}), expected a model"
         ) from fault
     try:
-        with np.load(io.BytesIO(raw), allow_pickle=False) as stored:
+        stored = np.load(io.BytesIO(raw), allow_pickle=False)
+        if not isinstance(stored, NpzFile):
+            raise ValueError("a single array")
+        with stored:
             return _model(stored, source, hashlib.sha256(raw).hexdigest())
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, OSError) as fault:
-        if isinstance(fault, InputError):
+    except UNREADABLE as fault:
+        if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
         raise InputError(f"{source}: {fault}; expected a {FORMAT} of version {VERSION}") from fault
 
 
 def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
     about = json.loads(_text(stored["about"]))
+    if not isinstance(about, dict):
+        raise ValueError("says nothing about itself")
     if about.get("format") != FORMAT or about.get("version") != VERSION:
         raise InputError(
             f"{source}: format {about.get('format')!r}, version {about.get('version')!r}; expected "
             f"{FORMAT!r}, version {VERSION}"
         )
-    layout = ValveLayout(about["columns"], about["rows"], tuple(about["region_names"]))
+    kinds = {"columns": int, "rows": int, "region_names": list, "trees": dict, "trained_on": dict}
+    for key, kind in kinds.items():
+        if not isinstance(about[key], kind):
+            raise ValueError(f"{key} is no {kind.__name__}")
+    names = about["region_names"]
+    if len(names) != 2 or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"region_names are {len(names)} values, not two names")
+    layout = ValveLayout(about["columns"], about["rows"], (names[0], names[1]))
+    n, k = layout.size, len(np.atleast_1d(stored["shape.std"]))
     shape = ShapeModel(
         layout,
-        float(stored["shape.size_mm"]),
-        stored["shape.mean"].astype(np.float64),
-        stored["shape.modes"].astype(np.float64),
-        stored["shape.std"],
-        stored["shape.tips"],
+        float(_numbers(stored, "shape.size_mm", ())),
+        _numbers(stored, "shape.mean", (n, 3)),
+        _numbers(stored, "shape.modes", (k, n, 3)),
+        _numbers(stored, "shape.std", (k,)),
+        _numbers(stored, "shape.tips", (2, 3)),
     )
-    if shape.mean.shape != (layout.size, 3) or shape.modes.shape[1:] != (layout.size, 3):
-        raise InputError(f"{source}: shapes do not fit its layout")
-    boosters = {
-        name: Boosters(
-            tuple(_text(stored[f"trees.{name}.{k}"]) for k in range(outputs)), f"{source}, {name}"
-        )
-        for name, outputs in about["trees"].items()
-    }
+    boosters = {}
+    for name, outputs in about["trees"].items():
+        if not isinstance(outputs, int):
+            raise ValueError(f"trees of {name}: {outputs!r} outputs")
+        texts = tuple(_text(stored[f"trees.{name}.{i}"]) for i in range(outputs))
+        boosters[name] = Boosters(texts, f"{source}, {name}")
     accuracy = None
     if "accuracy.std_mm" in stored.files:
+        count = np.shape(stored["accuracy.samples"])[:2]
         accuracy = Accuracy(
-            stored["accuracy.std_mm"],
-            float(stored["accuracy.correlation_length_mm"]),
-            stored["accuracy.samples"].astype(np.float64),
-            stored["accuracy.tip_samples"].astype(np.float64),
+            _numbers(stored, "accuracy.std_mm", (n,)),
+            float(_numbers(stored, "accuracy.correlation_length_mm", ())),
+            _numbers(stored, "accuracy.samples", (*count, n, 3)),
+            _numbers(stored, "accuracy.tip_samples", (*count, 2, 3)),
         )
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
+
+
+def _numbers(stored: NpzFile, name: str, shape: tuple[int, ...]) -> FloatArray:
+    found = np.asarray(stored[name])
+    if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
+        raise ValueError(f"{name} has shape {found.shape}, or is not finite; expected {shape}")
+    return np.asarray(found, dtype=np.float64)
 
 
 def _bytes(text: str) -> NDArray[np.uint8]:
@@ -220,4 +260,6 @@ def _bytes(text: str) -> NDArray[np.uint8]:
 
 
 def _text(array: Any) -> str:
-    return bytes(array.astype(np.uint8)).decode()
+    if not isinstance(array, np.ndarray) or array.dtype != np.uint8:
+        raise ValueError("no text where there should be one")
+    return array.tobytes().decode()

@@ -24,7 +24,7 @@ from mvest.imaging.detection.pose_search import REFINEMENTS, rating_samples, ref
 from mvest.imaging.detection.position import position_samples
 from mvest.imaging.detection.rim_detector import rim_samples
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
-from mvest.imaging.detection.shape_start import shape_start_samples
+from mvest.imaging.detection.shape_start import MODES, shape_start_samples
 from mvest.imaging.detection.truth import TrueValve
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.moving_valve import MovingValve
@@ -203,10 +203,12 @@ def train_model(
     Raises
     ------
     InputError
-        If there is no valve, or fewer shapes than modes.
+        If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
     """
     if not valves:
         raise InputError("training: no valves")
+    if settings.modes < MODES:
+        raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
     tell = progress or (lambda what, done, all_: None)
     shape = fit_shape_model(valves, settings.modes)
     seeds = np.random.SeedSequence(seed).spawn(settings.volumes)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mvest.errors import InputError
 from mvest.imaging.detection.boundary import leaflet_axes
 from mvest.imaging.detection.detect import FitSettings, fit_frame, search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
@@ -135,3 +136,13 @@ def test_with_all_landmarks_by_hand_none_is_looked_for(shape, true):
 def test_the_confidence_is_that_of_the_pose_rating(shape, true):
     found = fit_frame(NumberedFrame(), oracle_model(shape, [true], best=0.4), true.pose)
     assert 0.3 < found.confidence <= 0.4
+
+
+def test_more_modes_than_the_model_has_are_refused(shape, true):
+    with pytest.raises(InputError, match="15 modes, expected at most the model's 14"):
+        fit_frame(
+            NumberedFrame(),
+            oracle_model(shape, [true]),
+            true.pose,
+            replace(FitSettings(), modes=(10, 15, 12)),
+        )

@@ -1,0 +1,245 @@
+"""The model's file: it comes back as it was, and a wrong one is refused in one line."""
+
+import hashlib
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.detection.detect import fit_frame, search_frame
+from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
+
+
+@pytest.fixture(scope="module")
+def path(trained, tmp_path_factory):
+    found = tmp_path_factory.mktemp("models") / "made_up.npz"
+    save_model(found, trained)
+    return found
+
+
+@pytest.fixture(scope="module")
+def loaded(path):
+    return load_model(path)
+
+
+# --- there and back -----------------------------------------------------------------------------
+
+
+def test_all_trees_say_the_same(trained, loaded):
+    # Stages or outputs in another order, or numbers rounded in the text, are seen here.
+    rng = np.random.default_rng(0)
+    for name in STAGES:
+        before, after = trained.boosters[name], loaded.boosters[name]
+        x = rng.uniform(0, 255, (20, before.features)).astype(np.float32)
+        np.testing.assert_array_equal(after(x), before(x))
+
+
+def test_shapes_and_accuracy_come_back(trained, loaded):
+    assert loaded.shape.layout == trained.shape.layout
+    assert loaded.shape.size_mm == trained.shape.size_mm
+    np.testing.assert_allclose(loaded.shape.mean, trained.shape.mean, atol=1e-5)
+    np.testing.assert_allclose(loaded.shape.modes, trained.shape.modes, atol=1e-6)
+    np.testing.assert_array_equal(loaded.shape.std, trained.shape.std)
+    np.testing.assert_array_equal(loaded.shape.tips, trained.shape.tips)
+    np.testing.assert_array_equal(loaded.accuracy.std_mm, trained.accuracy.std_mm)
+    assert loaded.accuracy.correlation_length_mm == 6.5
+    np.testing.assert_allclose(loaded.accuracy.samples, trained.accuracy.samples, atol=1e-6)
+    np.testing.assert_allclose(loaded.accuracy.tip_samples, trained.accuracy.tip_samples, atol=1e-6)
+    assert loaded.trained_on == {"seed": 5, "valves": ["a", "b"]}
+
+
+def test_a_valve_is_found_alike(trained, loaded, seen_valve):
+    # The whole way from a frame to a valve: a stage tied to the trees of another is seen here.
+    frame, true = seen_valve
+    poses = [search_frame(frame, model, 2)[0] for model in (trained, loaded)]
+    np.testing.assert_array_equal(poses[0].centre, poses[1].centre)
+    found = [fit_frame(frame, model, true.pose) for model in (trained, loaded)]
+    np.testing.assert_allclose(found[0].vertices, found[1].vertices, atol=1e-2)
+    np.testing.assert_allclose(found[0].tips, found[1].tips, atol=1e-2)
+    assert np.isfinite(found[0].vertices).all()
+
+
+def test_a_loaded_model_is_saved_as_the_same_file(loaded, path, tmp_path):
+    save_model(tmp_path / "again.npz", loaded)
+    with np.load(path) as a, np.load(tmp_path / "again.npz") as b:
+        assert a.files == b.files
+        assert all(np.array_equal(a[name], b[name]) for name in a.files)
+
+
+def test_the_digest_is_that_of_the_file(loaded, trained, path):
+    assert loaded.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert trained.sha256 == ""
+
+
+def test_a_model_that_was_never_tested_has_no_accuracy(trained, tmp_path):
+    bare = DetectionModel(trained.shape, trained.boosters, {})
+    save_model(tmp_path / "bare.npz", bare)
+    assert load_model(tmp_path / "bare.npz").accuracy is None
+
+
+def test_nothing_is_left_behind_and_an_earlier_file_is_replaced(trained, tmp_path):
+    target = tmp_path / "model.npz"
+    target.write_bytes(b"earlier")
+    save_model(target, trained)
+    assert [p.name for p in tmp_path.iterdir()] == ["model.npz"]
+    load_model(target)
+
+
+def test_a_folder_that_is_not_there_is_said(trained, tmp_path):
+    with pytest.raises(InputError, match="cannot write"):
+        save_model(tmp_path / "nowhere" / "model.npz", trained)
+
+
+# --- refused ------------------------------------------------------------------------------------
+
+
+def refused(path, words):
+    with pytest.raises(InputError) as told:
+        load_model(path)
+    message = str(told.value)
+    assert str(path) in message
+    assert words in message
+    assert "\n" not in message
+    assert len(message) < 300 + len(str(path))
+
+
+def altered(path, tmp_path, change):
+    """A copy of the model's file whose arrays `change` has changed."""
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    change(arrays)
+    target = tmp_path / "altered.npz"
+    np.savez(target, **arrays)
+    return target
+
+
+def told(change):
+    """A change of the part of the file that says what it is."""
+
+    def of(arrays):
+        about = json.loads(bytes(arrays["about"]).decode())
+        about = change(about) or about
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+    return of
+
+
+def as_text(text):
+    return lambda a: a.update(about=np.frombuffer(text.encode(), np.uint8))
+
+
+def one_less(name):
+    return lambda a: a.update({name: a[name][..., :-1]})
+
+
+def spoiled(name):
+    def of(arrays):
+        arrays[name] = np.full_like(arrays[name], np.nan)
+
+    return of
+
+
+def without_a_stage(about):
+    del about["trees"]["free_edge"]
+
+
+BAD = {
+    "another format": (told(lambda a: a.update(format="mvest case")), "'mvest case'"),
+    "another version": (told(lambda a: a.update(version=99)), "99"),
+    "no format": (told(lambda a: a.pop("format") and None), "None"),
+    "not an object": (told(lambda a: [1, 2]), "expected"),
+    "no JSON": (as_text("{"), "expected"),
+    "no text": (lambda a: a.update(about=np.array([255, 254], np.uint8)), "expected"),
+    "number for text": (lambda a: a.update(about=np.array(3.0)), "expected"),
+    "no columns": (told(lambda a: a.pop("columns") and None), "columns"),
+    "words for columns": (told(lambda a: a.update(columns="many")), "expected"),
+    "impossible layout": (told(lambda a: a.update(columns=5)), "layout"),
+    "another layout": (told(lambda a: a.update(columns=24)), "shape.mean"),
+    "nothing about itself": (lambda a: a.pop("about"), "about"),
+    "no mean": (lambda a: a.pop("shape.mean"), "shape.mean"),
+    "no trees": (lambda a: a.pop("trees.boundary.0"), "trees.boundary.0"),
+    "a stage missing": (told(without_a_stage), "free_edge"),
+    "fewer deviations": (one_less("shape.std"), "shape"),
+    "flat tips": (one_less("shape.tips"), "shape"),
+    "flat modes": (one_less("shape.modes"), "shape"),
+    "no numbers": (spoiled("shape.mean"), "shape"),
+    "accuracy of another layout": (one_less("accuracy.std_mm"), "accuracy"),
+    "half an accuracy": (lambda a: a.pop("accuracy.samples"), "accuracy.samples"),
+    "fewer outputs": (told(lambda a: a["trees"].update(annulus=1)), "annulus"),
+    "no outputs": (told(lambda a: a["trees"].update(boundary=0)), "boundary"),
+    "one region": (told(lambda a: a.update(region_names=["anterior"])), "region_names"),
+    "no outputs but words": (told(lambda a: a["trees"].update(boundary="one")), "boundary"),
+    "no trees but words": (
+        lambda a: a.update({"trees.boundary.0": np.frombuffer(b"tree", np.uint8)}),
+        "boundary",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", list(BAD))
+def test_a_wrong_file_is_refused_by_name(path, tmp_path, how):
+    change, words = BAD[how]
+    refused(altered(path, tmp_path, change), words)
+
+
+def test_pickled_objects_are_not_unpickled(path, tmp_path):
+    # Loading with allow_pickle would run whatever the file says.
+    ran = tmp_path / "ran"
+
+    class Runs:
+        def __reduce__(self):
+            return ran.write_text, ("it did",)
+
+    def change(arrays):
+        arrays["shape.tips"] = np.array([Runs()], dtype=object)
+
+    refused(altered(path, tmp_path, change), "expected")
+    assert not ran.exists()
+
+
+def test_files_that_are_no_archive_are_refused(path, tmp_path):
+    raw = path.read_bytes()
+    for k, content in enumerate((b"", b"hello", raw[: len(raw) // 2], raw[:-1], b"PK\x03\x04")):
+        target = tmp_path / f"{k}.npz"
+        target.write_bytes(content)
+        refused(target, "expected")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    refused(tmp_path / "array.npy", "expected")
+    with zipfile.ZipFile(tmp_path / "other.npz", "w") as archive:
+        archive.writestr("about.npy", "no array")
+    refused(tmp_path / "other.npz", "expected")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_damaged_files_are_refused(path, tmp_path, seed):
+    # A checksum or a packed stream that does not fit: whatever the library calls it.
+    raw = bytearray(path.read_bytes())
+    rng = np.random.default_rng(seed)
+    for at in rng.integers(len(raw) // 10, len(raw) // 2, 200):
+        raw[at] ^= 0xFF
+    target = tmp_path / "damaged.npz"
+    target.write_bytes(bytes(raw))
+    refused(target, "expected")
+
+
+def test_a_file_that_is_not_there_and_a_folder_are_refused(tmp_path):
+    refused(tmp_path / "none.npz", "cannot be read")
+    refused(tmp_path, "cannot be read")
+
+
+def test_a_model_without_all_stages_is_refused(trained):
+    boosters = dict(trained.boosters)
+    del boosters["landmark_4"], boosters["position"]
+    with pytest.raises(InputError, match="no trees for position, landmark_4"):
+        DetectionModel(trained.shape, boosters, {})
+
+
+def test_accuracy_is_kept_apart_from_shapes(trained):
+    # Stored deviations of vertices are those measured, not those of the shapes.
+    changed = replace(trained.accuracy, std_mm=trained.accuracy.std_mm + 1)
+    other = DetectionModel(trained.shape, trained.boosters, {}, changed)
+    assert other.accuracy.std_mm.shape == (trained.shape.layout.size,)
+    assert np.all(other.accuracy.std_mm > trained.accuracy.std_mm)
