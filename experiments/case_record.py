@@ -57,7 +57,7 @@ def case_record(
         innovation = {**innovation, "tests": _whiteness(found)}
     of_all = {key: record[key] for key in ("iterates", "iterate_std", "identifiability")}
     if of_all["identifiability"] is not None:
-        of_all["identifiability"]["observation_std_mm"] = case.uncertainty.std_mm
+        of_all["identifiability"]["observation_std_mm"] = case.uncertainty.typical_mm
     # What every study's record tells is the moduli; ``unknowns`` tells all.
     record = _of_moduli(record)
     return record | {
@@ -78,7 +78,7 @@ def case_record(
             "cells": [found.settings.mesh.columns, found.settings.mesh.rows, 1],
             "source": found.settings.mesh.source,
             "filter": "iterated",
-            "noise_mm": case.uncertainty.std_mm,
+            "noise_mm": case.uncertainty.typical_mm,
         },
         "data": {"citation": case.source, "sha256": case.sha256},
         "unknowns": unknowns,

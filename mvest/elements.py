@@ -55,6 +55,9 @@ class Element:
     outside : callable
         ``(q, 3) -> (q,)`` distance (in reference coordinates) by which a point is outside; <= 0
         inside.
+    inside : callable
+        ``(q, 3) -> (q, 3)`` a point of the element near to each point; the point itself where it
+        is inside.
     face : str
         Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
     """
@@ -68,6 +71,7 @@ class Element:
     enhanced: Evaluate
     node_coordinates: FloatArray
     outside: Evaluate
+    inside: Evaluate
     face: str
     centre: FloatArray
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -134,6 +138,13 @@ def _no_modes(xi: FloatArray) -> FloatArray:
     return np.zeros((xi.shape[0], 0))
 
 
+def _simplex(xi: FloatArray) -> FloatArray:
+    """Points ``(q, d)`` with coordinates >= 0 that sum to at most 1, near to any points."""
+    positive = np.maximum(xi, 0.0)
+    total = positive.sum(axis=1, keepdims=True)
+    return np.asarray(positive / np.maximum(total, 1.0))
+
+
 def _gauss(n: int) -> tuple[FloatArray, FloatArray]:
     points, weights = np.polynomial.legendre.leggauss(n)
     return np.asarray(points), np.asarray(weights)
@@ -184,6 +195,7 @@ def _brick(name: str, thickness_order: int) -> Element:
         enhanced=modes if thickness_order == 1 else _no_modes,
         node_coordinates=nodes,
         outside=lambda xi: np.max(np.abs(xi), axis=1) - 1.0,
+        inside=lambda xi: np.clip(xi, -1.0, 1.0),
         face="quad9",
         centre=np.zeros((1, 3)),
         top_face=np.arange(9) + 9 * (len(zetas) - 1),
@@ -226,6 +238,9 @@ def _wedge(name: str, thickness_order: int) -> Element:
         node_coordinates=nodes,
         outside=lambda xi: np.max(
             np.stack([-xi[:, 0], -xi[:, 1], xi[:, 0] + xi[:, 1] - 1, np.abs(xi[:, 2]) - 1]), axis=0
+        ),
+        inside=lambda xi: np.column_stack(
+            [_simplex(xi[:, :2]), np.clip(xi[:, 2], -1.0, 1.0)],
         ),
         face="tri6",
         centre=np.array([[1 / 3, 1 / 3, 0.0]]),
@@ -278,6 +293,7 @@ def _tetrahedron(name: str, order: int) -> Element:
         enhanced=_no_modes,
         node_coordinates=nodes,
         outside=lambda xi: -np.min(bary(xi), axis=1),
+        inside=_simplex,
         face="tri3" if order == 1 else "tri6",
         centre=np.full((1, 3), 0.25),
     )

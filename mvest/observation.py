@@ -9,7 +9,7 @@ import numpy as np
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import ObservationModel, Prediction
-from mvest.estimation.noise import NoiseCovariance, stacked_noise
+from mvest.estimation.noise import NoiseCovariance, scaled_noise, stacked_noise
 from mvest.estimation.prediction import require_finite
 from mvest.observation_errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
@@ -33,6 +33,8 @@ class Observation:
         read what was not observed.
     variance : (f,) mm²
         Variance of each coordinate in each frame that the filter is to assume.
+    scale : (n,) or None
+        Standard deviation of each vertex as a part of that of its frame; None: all alike.
     correlation : SpatialCorrelation or None
         Correlation between vertices that the filter is to assume; None for independent errors.
     """
@@ -41,6 +43,7 @@ class Observation:
     positions: FloatArray
     variance: FloatArray
     correlation: SpatialCorrelation | None = None
+    scale: FloatArray | None = None
 
     def __post_init__(self) -> None:
         require_frames(self.frames)
@@ -73,6 +76,18 @@ class Observation:
         for name, values in (("positions", positions), ("variance", variance)):
             values.setflags(write=False)
             object.__setattr__(self, name, values)
+        if self.scale is not None:
+            scale = np.array(self.scale, dtype=np.float64)
+            if scale.shape != positions.shape[1:2]:
+                raise InputError(
+                    f"R has a scale of shape {scale.shape}, expected one for each of "
+                    f"{positions.shape[1]} vertices"
+                )
+            require_finite(scale, "the scale of R")
+            if np.any(scale <= 0.0):
+                raise InputError(f"scale of R = {scale.min():g}, expected > 0")
+            scale.setflags(write=False)
+            object.__setattr__(self, "scale", scale)
 
     @property
     def seen(self) -> BoolArray:
@@ -99,13 +114,23 @@ class Observation:
     def R(self) -> NoiseCovariance:
         """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
         counts = 3 * self.seen.sum(axis=1)
-        if self.correlation is None:
-            return np.repeat(self.variance, counts)
-        blocks = [
-            self.correlation.of(seen).noise(float(variance), 3)
-            for seen, variance in zip(self.seen, self.variance, strict=True)
-            if seen.any()
-        ]
+        told = self.correlation
+        if told is None:
+            variance = np.repeat(self.variance, counts)
+            if self.scale is None:
+                return variance
+            return np.asarray(
+                variance
+                * np.concatenate([np.repeat(self.scale[seen], 3) for seen in self.seen]) ** 2
+            )
+        blocks = []
+        for seen, variance in zip(self.seen, self.variance, strict=True):
+            if not seen.any():
+                continue
+            noise = told.of(seen).noise(float(variance), 3)
+            if self.scale is not None:
+                noise = scaled_noise(noise, np.repeat(self.scale[seen], 3))
+            blocks.append(noise)
         return stacked_noise(blocks)
 
 

@@ -38,7 +38,12 @@ import numpy as np
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import ObservationModel, Prediction
-from mvest.estimation.noise import NoiseCovariance, observation_noise, stacked_noise
+from mvest.estimation.noise import (
+    NoiseCovariance,
+    observation_noise,
+    scaled_noise,
+    stacked_noise,
+)
 from mvest.observation import FRAMES
 from mvest.observation_errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -84,6 +89,8 @@ class ObservedSurface:
         Closed curve along the free edge; the last point joins the first.
     annulus : (k, 3) mm or None
         Closed curve along the annulus.
+    scale : (q,) or None
+        Standard deviation of each point as a part of that of the observation; None: all alike.
 
     Raises
     ------
@@ -96,6 +103,7 @@ class ObservedSurface:
     region: IntArray
     free_edge: FloatArray | None = None
     annulus: FloatArray | None = None
+    scale: FloatArray | None = None
 
     def __post_init__(self) -> None:
         points = _points(f"points seen in frame {self.frame}", self.points)
@@ -111,9 +119,20 @@ class ObservedSurface:
             if getattr(self, name) is not None:
                 what = f"{name} seen in frame {self.frame}"
                 object.__setattr__(self, name, _curve(what, getattr(self, name)))
+        if self.scale is not None:
+            scale = np.array(self.scale, dtype=np.float64)
+            if scale.shape != (len(points),) or not np.all(np.isfinite(scale) & (scale > 0)):
+                raise InputError(
+                    f"frame {self.frame}: scale of the errors of shape {scale.shape}, expected a "
+                    f"positive number for each of {len(points)} points"
+                )
+            scale.setflags(write=False)
+            object.__setattr__(self, "scale", scale)
 
-    def inner(self, distance: float) -> ObservedSurface:
+    def inner(self, distance: float | FloatArray) -> ObservedSurface:
         """The same without the points nearer than ``distance`` mm to a curve that is seen.
+
+        ``distance`` is one number or one for each point ``(q,)``.
 
         They are the points that noise may put beyond the border; the curves tell where that is.
         """
@@ -122,7 +141,8 @@ class ObservedSurface:
             if curve is not None:
                 offset = closest_on_loop(self.points, curve)[2]
                 keep &= np.linalg.norm(offset, axis=1) >= distance
-        return replace(self, points=self.points[keep], region=self.region[keep])
+        scale = None if self.scale is None else self.scale[keep]
+        return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,9 +326,11 @@ class SurfaceObservation:
                 extent = float(np.ptp(seen.points, axis=0).max())
                 apart = seen.region * (extent + 1000.0 * length)
                 points = seen.points + apart[:, None]
-                parts.append(SpatialCorrelation(points, length).noise(self.std_mm**2, 1))
+                noise = SpatialCorrelation(points, length).noise(self.std_mm**2, 1)
             elif q:
-                parts.append(observation_noise(self.std_mm**2, q))
+                noise = observation_noise(self.std_mm**2, q)
+            if q:
+                parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
             if rest := self._size(seen) - q:
                 assert self.curve_std_mm is not None
                 parts.append(observation_noise(self.curve_std_mm**2, rest))

@@ -91,6 +91,18 @@ def test_outside_measures_the_distance_in_reference_coordinates(name):
     assert np.all(e.outside(e.centre + np.array([[0, 0, 3.0]])) > 0)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_point_near_to_one_outside_is_of_the_element(name):
+    e = ELEMENTS[name]
+    own = inside(name)
+    np.testing.assert_allclose(e.inside(own), own, atol=1e-15)
+    away = e.centre + np.random.default_rng(3).normal(scale=2.0, size=(50, 3))
+    near = e.inside(away)
+    assert np.all(e.outside(near) <= 1e-12)
+    out = e.outside(away) > 0
+    assert np.all(np.abs(near - away)[out].max(axis=1) > 0)
+
+
 @pytest.mark.parametrize("name", ["hex18", "wedge12", "hex27"])
 def test_enhanced_modes_do_no_work_on_a_constant_stress(name):
     # Patch test condition of enhanced strains: the modes integrate to zero over the element.

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.cases.case import Role, Uncertainty
 from mvest.errors import InputError
-from mvest.estimation import Prediction
+from mvest.estimation import Prediction, observation_noise
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ClosureProtocol
 from mvest.personalise import (
@@ -158,6 +158,43 @@ def test_a_closed_frame_is_observed_as_the_case_says(monkeypatch):
     np.testing.assert_array_equal(
         chain.observation().positions[0], case.frame(Role.CLOSED).vertices
     )
+
+
+def covariance(R):
+    white = R.whiten(np.eye(R.size))
+    return np.linalg.inv(white.T @ white)
+
+
+@pytest.mark.parametrize("correspondence", [True, False])
+@pytest.mark.parametrize("length", [0.0, 8.0])
+def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, correspondence, length):
+    use(monkeypatch)
+    case = made_up_case(0.3, length)
+    n = len(case.surface.vertices)
+    std = np.random.default_rng(3).uniform(0.2, 0.5, n)
+    told = replace(case, uncertainty=Uncertainty(std, length))
+    wanted = settings(correspondence=correspondence)
+    one = _Chain(case, wanted, None, None).observation()
+    own = _Chain(told, wanted, None, None).observation()
+    if not correspondence:
+        # Points that noise may put beyond the border are left out where it is large.
+        assert all(len(o.seen[0].points) > 100 for o in (one, own))
+        (seen,) = own.seen
+        at = [
+            int(np.argmin(np.linalg.norm(case.frame(Role.CLOSED).vertices - x, axis=1)))
+            for x in seen.points
+        ]
+        expected = std[at]
+        R = observation_noise(own.R, len(own.y))
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance(R)))[: len(at)], expected, rtol=1e-6)
+        return
+    R = [covariance(observation_noise(o.R, 3 * n)) for o in (one, own)]
+    scale = np.repeat(std / 0.3, 3)
+    np.testing.assert_allclose(R[1], scale[:, None] * R[0] * scale, atol=1e-7)
+    # The same for all is the one number, whatever it is called.
+    alike = replace(case, uncertainty=Uncertainty(np.full(n, 0.3), length))
+    same = observation_noise(_Chain(alike, wanted, None, None).observation().R, 3 * n)
+    np.testing.assert_allclose(covariance(same), R[0], rtol=1e-9, atol=1e-12)
 
 
 def test_the_registered_valve_is_the_rigid_motion_of_least_squares(monkeypatch):

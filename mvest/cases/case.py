@@ -16,7 +16,11 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy import Chordae, LeafletSurface, Motion, Valve
 
-__all__ = ["Frame", "Role", "Uncertainty", "ValveCase"]
+__all__ = ["ErrorSamples", "Frame", "Role", "Uncertainty", "ValveCase"]
+
+FEWEST_SAMPLES, MOST_SAMPLES = 4, 500
+LARGEST_ERROR = 20.0
+"""mm, displacement of a point in any sample."""
 
 
 class Role(Enum):
@@ -75,27 +79,107 @@ class Frame:
     corresponds: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
     """How well vertices are seen.
 
     Attributes
     ----------
-    std_mm : float
-        Standard deviation of each coordinate.
+    std_mm : float or (n,) ndarray
+        Standard deviation of each coordinate, of all vertices or of each vertex.
     correlation_length_mm : float
         Over which errors of neighbouring vertices are alike along the leaflets; 0: independent.
     """
 
-    std_mm: float
+    std_mm: float | FloatArray
     correlation_length_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.std_mm) and self.std_mm > 0):
+        std = np.array(self.std_mm, dtype=np.float64)
+        if std.ndim > 1:
+            raise InputError(f"observation std_mm: shape {std.shape}, expected one number or (n,)")
+        bad = np.flatnonzero(~(np.isfinite(std) & (std > 0)))
+        if len(bad) and std.ndim == 0:
             raise InputError(f"observation std_mm = {self.std_mm}, expected > 0")
+        if len(bad):
+            raise InputError(
+                f"observation std_mm = {std[bad[0]]:g} at vertex {bad[0]} ({len(bad)} vertices in "
+                "all), expected > 0"
+            )
         length = self.correlation_length_mm
         if not (np.isfinite(length) and length >= 0):
             raise InputError(f"observation correlation_length_mm = {length}, expected >= 0")
+        if std.ndim == 1:
+            std.setflags(write=False)
+            object.__setattr__(self, "std_mm", std)
+
+    @property
+    def per_vertex(self) -> bool:
+        """Whether every vertex has a standard deviation of its own."""
+        return isinstance(self.std_mm, np.ndarray)
+
+    @property
+    def typical_mm(self) -> float:
+        """The standard deviation, or its root mean square over the vertices."""
+        if isinstance(self.std_mm, np.ndarray):
+            return float(np.sqrt(np.mean(self.std_mm**2)))
+        return float(self.std_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorSamples:
+    """Where a valve may truly have been, instead of where it was seen: joint errors of all frames.
+
+    Errors of the frames that a model is built from (its open shape, the motion of its boundary, the
+    lengths of its chordae) are no noise of an observation: they change what is predicted. Each
+    sample is one way in which all frames may be wrong at once.
+
+    Attributes
+    ----------
+    vertices : (K, f, n, 3) mm
+        Displacement from where each vertex was seen to where it may have been, in each frame of
+        the case, in the axes of the case. The annulus and the free edge move with their vertices.
+    tips : (K, f, t, 3) mm
+        The same of the papillary tips.
+    """
+
+    vertices: FloatArray
+    tips: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "tips"):
+            given = np.asarray(getattr(self, name))
+            if (
+                given.ndim != 4
+                or given.shape[3] != 3
+                or not np.issubdtype(given.dtype, np.floating)
+            ):
+                raise InputError(
+                    f"error samples, {name}: {given.dtype} of shape {given.shape}, expected "
+                    "floating-point numbers (samples, frames, points, 3)"
+                )
+            values = np.array(given, dtype=np.float64)
+            bad = np.argwhere(~(np.abs(values) <= LARGEST_ERROR))
+            if len(bad):
+                where = tuple(bad[0].tolist())
+                raise InputError(
+                    f"error samples, {name}: {values[where]} mm at {where}, expected a displacement "
+                    f"of at most {LARGEST_ERROR:g} mm"
+                )
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        if self.vertices.shape[:2] != self.tips.shape[:2]:
+            raise InputError(
+                f"error samples: {self.vertices.shape[:2]} samples and frames of the vertices, "
+                f"{self.tips.shape[:2]} of the tips; expected as many"
+            )
+        if not FEWEST_SAMPLES <= len(self) <= MOST_SAMPLES:
+            raise InputError(
+                f"{len(self)} error samples, expected {FEWEST_SAMPLES} to {MOST_SAMPLES}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +200,11 @@ class ValveCase:
         In the order of time, one of them the reference and one the closed frame.
     chordae : Chordae
     uncertainty : Uncertainty
+    error_samples : ErrorSamples or None
+        Joint errors of all frames, in their order; all frames correspond then.
+    chordae_follow : bool
+        Whether the chordae were laid out by the shape of the frames, so that they are laid out anew
+        where the frames are taken to be elsewhere; otherwise they are known by themselves.
     derived : tuple of str
         Sentences, one for everything that was not given but derived.
     sha256 : str
@@ -135,6 +224,8 @@ class ValveCase:
     uncertainty: Uncertainty
     derived: tuple[str, ...] = ()
     sha256: str = ""
+    error_samples: ErrorSamples | None = None
+    chordae_follow: bool = False
 
     def __post_init__(self) -> None:
         for role in (Role.REFERENCE, Role.CLOSED):
@@ -150,6 +241,39 @@ class ValveCase:
         times = [frame.time for frame in self.frames]
         if any(b <= a for a, b in itertools.pairwise(times)):
             raise InputError(f"case {self.name}: frame times {times} s do not increase")
+        self._check_uncertainty()
+
+    def _check_uncertainty(self) -> None:
+        n, std = len(self.surface.vertices), self.uncertainty.std_mm
+        if isinstance(std, np.ndarray):
+            if std.shape != (n,):
+                raise InputError(
+                    f"case {self.name}: observation std_mm of {len(std)} vertices, expected {n}"
+                )
+            if not self.frame(Role.CLOSED).corresponds:
+                raise InputError(
+                    f"case {self.name}: observation std_mm of each vertex, but the vertices of the "
+                    "closed frame do not correspond; expected one number"
+                )
+        samples = self.error_samples
+        if samples is None:
+            return
+        f, t = len(self.frames), len(self.frame(Role.REFERENCE).papillary_tips)
+        for name, found, wanted in (
+            ("vertices", samples.vertices.shape[1:3], (f, n)),
+            ("tips", samples.tips.shape[1:3], (f, t)),
+        ):
+            if found != wanted:
+                raise InputError(
+                    f"case {self.name}: error samples, {name} of {found[0]} frames of {found[1]} "
+                    f"points, expected {wanted[0]} of {wanted[1]}"
+                )
+        strange = [frame.name for frame in self.frames if not frame.corresponds]
+        if strange:
+            raise InputError(
+                f"case {self.name}: error samples, but the vertices of frame {strange[0]!r} do not "
+                "correspond; expected frames that all do"
+            )
 
     def frame(self, role: Role) -> Frame:
         """The only frame of a role (reference or closed)."""

@@ -8,14 +8,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mvest.cases.case import Role, Uncertainty, ValveCase
+from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.checks import at, check_closing_pressure, check_frames, check_regions
 from mvest.cases.csv_files import read_numbers
-from mvest.cases.frames import SECONDS_PER, check_reference, place_frame, read_frame
+from mvest.cases.error_file import read_error_samples
+from mvest.cases.frames import SECONDS_PER, SeenFrame, check_reference, place_frame, read_frame
 from mvest.cases.paths import CASE_FILE, CaseFolder
 from mvest.cases.pressure_curve import PressureCurve, generic_curve
-from mvest.cases.schema import CaseFile, read_case_file
-from mvest.cases.tissue import read_chordae, read_leaflets
+from mvest.cases.schema import (
+    CaseFile,
+    ChordaeEntry,
+    ObservationEntry,
+    PointData,
+    read_case_file,
+)
+from mvest.cases.tissue import point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
 
@@ -59,6 +66,7 @@ def read_case(path: Path | str) -> ValveCase:
     frames = tuple(frame for frame, _ in placed)
     surface = read_leaflets(folder.case, document, reference, derived)
     chordae = read_chordae(folder, document, reference, placed, derived)
+    samples = None
     if document.observation is None:
         uncertainty = GENERIC_UNCERTAINTY
         derived.append(
@@ -66,8 +74,9 @@ def read_case(path: Path | str) -> ValveCase:
             f"{uncertainty.correlation_length_mm:g} mm assumed"
         )
     else:
-        given = document.observation
-        uncertainty = Uncertainty(given.std_mm, given.correlation_length_mm)
+        uncertainty = _uncertainty(folder, document.observation, first)
+        samples = _error_samples(folder, document, frames)
+    entry = document.chordae
     return ValveCase(
         name=document.name,
         description=document.description,
@@ -82,7 +91,29 @@ def read_case(path: Path | str) -> ValveCase:
         uncertainty=uncertainty,
         derived=tuple(derived),
         sha256=folder.sha256(),
+        error_samples=samples,
+        chordae_follow=entry is None or (isinstance(entry, ChordaeEntry) and entry.follow),
     )
+
+
+def _uncertainty(folder: CaseFolder, given: ObservationEntry, first: SeenFrame) -> Uncertainty:
+    with at(folder.case, "observation.std_mm"):
+        std = given.std_mm
+        if not isinstance(std, PointData):
+            return Uncertainty(std, given.correlation_length_mm)
+        return Uncertainty(point_data(first, std.point_data, 1)[:, 0], given.correlation_length_mm)
+
+
+def _error_samples(
+    folder: CaseFolder, document: CaseFile, frames: tuple[Frame, ...]
+) -> ErrorSamples | None:
+    assert document.observation is not None
+    where, name = "observation.error_samples", document.observation.error_samples
+    if name is None:
+        return None
+    file = folder.file(name, where)
+    with at(folder.case, where):
+        return read_error_samples(file, [frame.name for frame in frames])
 
 
 def _pressures(folder: CaseFolder, document: CaseFile, derived: list[str]) -> list[float]:

@@ -131,14 +131,29 @@ class ChordaeEntry(_Model):
         0.015, gt=0, lt=0.5, description="strain over which the stiffness rises, in (0, 0.5)"
     )
     families: list[Name] | None = Field(None, description="names of all families, in order")
+    follow: bool = Field(
+        False,
+        strict=True,
+        description="true or false: laid out by a program as in the template, so that they are laid "
+        "out anew for every error sample",
+    )
 
 
 class ObservationEntry(_Model):
     """How well the vertices of a frame are seen."""
 
-    std_mm: Number = Field(gt=0, description="standard deviation of a coordinate in mm, > 0")
+    std_mm: Annotated[
+        Annotated[Number, Field(gt=0), Tag("<number>")] | Annotated[PointData, Tag("<point data>")],
+        Discriminator(_kind),
+    ] = Field(
+        description="standard deviation of a coordinate in mm, > 0: a number, or "
+        "{point_data: NAME} of the reference surface"
+    )
     correlation_length_mm: NotNegative = Field(
         description="mm along the leaflets over which errors are alike, >= 0"
+    )
+    error_samples: Name | None = Field(
+        None, description="a .npz file with joint errors of all frames: frames, vertices and tips"
     )
 
 
@@ -183,7 +198,7 @@ class CaseFile(_Model):
         | None
     ) = Field(None, description="a .csv file, or a mapping with file, toe_strain and families")
     observation: ObservationEntry | None = Field(
-        None, description="a mapping with std_mm and correlation_length_mm"
+        None, description="a mapping with std_mm, correlation_length_mm and error_samples"
     )
     corresponds: bool | Literal["auto"] = Field(
         "auto", description="true, false or auto: do vertices correspond between all frames"

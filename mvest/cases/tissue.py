@@ -20,7 +20,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy import Chordae, LeafletSurface
 from mvest.valve.surface_coordinates import surface_coordinates
 
-__all__ = ["CHORD_COLUMNS", "GENERIC_THICKNESS", "read_chordae", "read_leaflets"]
+__all__ = ["CHORD_COLUMNS", "GENERIC_THICKNESS", "point_data", "read_chordae", "read_leaflets"]
 
 CHORD_COLUMNS = ("tip", "x", "y", "z", "family", "rest_length_mm", "stiffness_n")
 GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
@@ -58,7 +58,7 @@ def _thickness(
 ) -> FloatArray:
     given = document.thickness
     if isinstance(given, PointData):
-        return MM_PER[document.units.length] * _point_data(seen, given.point_data, 1)[:, 0]
+        return MM_PER[document.units.length] * point_data(seen, given.point_data, 1)[:, 0]
     if isinstance(given, float):
         return np.full(len(seen.vertices), given)
     by_name: Mapping[str, float] = GENERIC_THICKNESS if given is None else given
@@ -77,7 +77,7 @@ def _thickness(
 def _fibre(document: CaseFile, reference: ReferenceFrame, derived: list[str]) -> FloatArray:
     seen, rims = reference.seen, reference.rims
     if document.fibre is not None:
-        return _point_data(seen, document.fibre, 3)
+        return point_data(seen, document.fibre, 3)
     derived.append(
         "fibre: circumferential, perpendicular to the gradient from annulus to free edge"
     )
@@ -86,7 +86,7 @@ def _fibre(document: CaseFile, reference: ReferenceFrame, derived: list[str]) ->
     ).circumferential
 
 
-def _point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
+def point_data(seen: SeenFrame, name: str, components: int) -> FloatArray:
     """Finite point data ``(n, components)`` of the reference surface."""
     if name not in seen.point_data:
         listed = ", ".join(sorted(seen.point_data)) or "none"

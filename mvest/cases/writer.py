@@ -12,6 +12,7 @@ import yaml
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.csv_files import write_columns
+from mvest.cases.error_file import write_error_samples
 from mvest.cases.paths import CASE_FILE
 from mvest.cases.schema import VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
@@ -94,11 +95,9 @@ def _write_files(folder: Path, case: ValveCase) -> None:
             "file": "chordae.csv",
             "toe_strain": float(chordae.toe_strain),
             "families": list(chordae.family_names),
+            **({"follow": True} if case.chordae_follow else {}),
         },
-        "observation": {
-            "std_mm": float(case.uncertainty.std_mm),
-            "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
-        },
+        "observation": _observation(folder, case),
         "derived": list(case.derived),
     }
     families = [chordae.family_names[k] for k in chordae.family]
@@ -118,12 +117,27 @@ def _write_files(folder: Path, case: ValveCase) -> None:
     (folder / CASE_FILE).write_text(text, encoding="utf-8")
 
 
+def _observation(folder: Path, case: ValveCase) -> dict[str, Any]:
+    std = case.uncertainty.std_mm
+    entry: dict[str, Any] = {
+        "std_mm": {"point_data": "std_mm"} if isinstance(std, np.ndarray) else float(std),
+        "correlation_length_mm": float(case.uncertainty.correlation_length_mm),
+    }
+    if case.error_samples is not None:
+        entry["error_samples"] = "errors.npz"
+        names = [frame.name for frame in case.frames]
+        write_error_samples(folder / "errors.npz", case.error_samples, names)
+    return entry
+
+
 def _write_frame(folder: Path, case: ValveCase, number: int) -> dict[str, Any]:
     frame = case.frames[number]
     stem = f"frame_{number:02d}"
     point_data = {}
     if frame.role is Role.REFERENCE:
         point_data = {"fibre": case.surface.fibre, "thickness": case.surface.thickness}
+        if isinstance(case.uncertainty.std_mm, np.ndarray):
+            point_data["std_mm"] = case.uncertainty.std_mm
     write_surface(
         folder / f"{stem}.vtp",
         frame.vertices,

@@ -126,6 +126,36 @@ def stacked_noise(parts: Sequence[ObservationNoise]) -> ObservationNoise:
     )
 
 
+def scaled_noise(base: ObservationNoise, scale: FloatArray) -> ObservationNoise:
+    """Noise of which every observation is multiplied by a factor of its own, D R D.
+
+    Parameters
+    ----------
+    base : ObservationNoise
+        R of n observations.
+    scale : (n,)
+        The positive diagonal of D.
+
+    Raises
+    ------
+    InputError
+        If the factors are not of n observations, or not positive.
+    """
+    factor = np.asarray(scale, dtype=np.float64)
+    if factor.shape != (base.size,):
+        raise InputError(f"scale of noise has shape {factor.shape}, expected ({base.size},)")
+    require_finite(factor, "scale of noise")
+    if np.any(factor <= 0.0):
+        raise InputError(f"scale of noise is {factor.min():g}, expected > 0")
+
+    def whiten(values: FloatArray) -> FloatArray:
+        return base.whiten((np.asarray(values).T / factor).T)
+
+    return ObservationNoise(
+        base.size, base.log_determinant + 2.0 * float(np.sum(np.log(factor))), whiten
+    )
+
+
 def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNoise:
     """Noise with what q unknown quantities add to it, R + C Cᵀ.
 

@@ -173,23 +173,29 @@ class _Chain:
     def observation(self) -> Observed:
         """The closed frame, with the uncertainty that the case states."""
         told = self.case.uncertainty
-        length, frame = told.correlation_length_mm, self.closed
+        length, frame, std = told.correlation_length_mm, self.closed, told.typical_mm
+        scale = told.std_mm / std if isinstance(told.std_mm, np.ndarray) else None
         kept = _thinned(len(frame.vertices))
         if self.corresponding:
             correlation = (
                 SpatialCorrelation(self.case.surface.vertices, length) if length > 0 else None
             )
             seen = np.where(kept[:, None], frame.vertices, np.nan)
-            return Observation(("closed",), seen[None], np.array(told.std_mm**2), correlation)
+            return Observation(("closed",), seen[None], np.array(std**2), correlation, scale)
         points = ObservedSurface(
-            "closed", frame.vertices[kept], _vertex_region(frame)[kept], frame.free_edge
+            "closed",
+            frame.vertices[kept],
+            _vertex_region(frame)[kept],
+            frame.free_edge,
+            scale=None if scale is None else scale[kept],
         )
         if length > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
-            near = replace(points, annulus=frame.annulus).inner(BORDER * told.std_mm)
+            border = BORDER * std * (1.0 if points.scale is None else points.scale)
+            near = replace(points, annulus=frame.annulus).inner(border)
             points = replace(near, annulus=None)
         surface = replace(PredictedSurface.of_valve(self.model.valve), annulus=None)
-        return SurfaceObservation((points,), surface, told.std_mm, told.std_mm, length)
+        return SurfaceObservation((points,), surface, std, std, length)
 
     @property
     def corresponding(self) -> bool:
@@ -235,7 +241,13 @@ class _Chain:
             seen = self.observation()
             assert isinstance(seen, SurfaceObservation)
             std = float(np.sqrt(paper.R))
-            observation = replace(seen, std_mm=std, curve_std_mm=std, correlation_length_mm=0.0)
+            observation = replace(
+                seen,
+                seen=tuple(replace(points, scale=None) for points in seen.seen),
+                std_mm=std,
+                curve_std_mm=std,
+                correlation_length_mm=0.0,
+            )
         filter_ = PaperFilter(paper.Q, max_iterations=paper.max_iterations)
         return self.estimate_moduli(filter_, observation, log=False, variance=paper.P0)
 

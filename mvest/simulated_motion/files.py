@@ -37,11 +37,15 @@ def save_population(path: Path, population: Population) -> None:
         If there is no valve, the valves' layouts differ, or the file cannot be written.
     """
     valves = population.valves
-    layouts = {(v.layout.columns, v.layout.rows, v.layout.region_names) for v in valves}
+    layouts = {v.layout for v in valves}
     if len(layouts) != 1:
         raise InputError(f"{path}: valves of {len(layouts)} layouts, expected one layout")
-    if ValveLayout(*next(iter(layouts))) != ValveLayout(*next(iter(layouts))[:2]):
-        raise InputError(f"{path}: regions {next(iter(layouts))[2]}, expected those of a layout")
+    layout = valves[0].layout
+    if layout != ValveLayout(layout.columns, layout.rows):
+        raise InputError(
+            f"{path}: valves of the regions {', '.join(layout.region_names)}, expected "
+            f"{', '.join(ValveLayout().region_names)}"
+        )
 
     def joined(name: str, kind: type = np.float32) -> Any:
         return np.concatenate([np.asarray(getattr(v, name), dtype=kind) for v in valves])
@@ -52,7 +56,7 @@ def save_population(path: Path, population: Population) -> None:
         "refused_reasons": np.array(list(population.refused), dtype=np.str_),
         "refused_counts": np.array(list(population.refused.values()), dtype=np.int32),
         "names": np.array([v.name for v in valves]),
-        "layout": np.array([valves[0].layout.columns, valves[0].layout.rows], dtype=np.int32),
+        "layout": np.array([layout.columns, layout.rows], dtype=np.int32),
         "frames": np.array([len(v.times) for v in valves], dtype=np.int32),
         "chordae": np.array([len(v.chord_phi) for v in valves], dtype=np.int32),
         "chord_tip": joined("chord_tip", np.int32),
@@ -134,7 +138,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file, expected a population of simulated valves")
     arrays: dict[str, Any] = {}
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             found = set(file.files)
             if found != set(ARRAYS):
                 raise InputError(

@@ -135,6 +135,12 @@ def embed(
         best[at], host[at], local[at] = violation[better], e[better], xi[better]
     size = np.linalg.norm(np.ptp(mesh.nodes[mesh.elements[host]], axis=1), axis=1)
     distance = np.maximum(best, 0.0) * size / 2
+    far = np.flatnonzero(np.isfinite(distance) & (distance > tolerance))
+    if far.size:
+        # Elements are thin: across the leaflet the same violation is less of a distance.
+        nearest = reference.shape(reference.inside(local[far]))
+        at = np.einsum("ka,kai->ki", nearest, mesh.nodes[mesh.elements[host[far]]])
+        distance[far] = np.minimum(distance[far], np.linalg.norm(points[far] - at, axis=1))
     if not np.all(distance <= tolerance):
         i = int(np.argmax(distance))
         raise GeometryError(

@@ -121,6 +121,25 @@ def test_a_point_far_from_the_mesh_is_refused_with_its_place_and_distance():
         embed(mesh, near, tolerance=0.1)
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("tet")])
+def test_the_distance_from_a_thin_element_is_one_across_it(name):
+    # Cells of 8 x 8 x 0.8 mm: half a cell above is 0.4 mm, and not half of their size.
+    flat = block(name)
+    mesh = SolidMesh(
+        flat.nodes * [8.0, 8.0, 0.8],
+        flat.elements,
+        name,
+        flat.region,
+        flat.region_names,
+        flat.fibre,
+        flat.pressure_faces,
+    )
+    above = np.array([[12.0, 9.0, 1.2], [3.0, 4.0, -0.4]])
+    np.testing.assert_allclose(embed(mesh, above)(mesh.nodes), above, atol=1e-9)
+    with pytest.raises(GeometryError, match=r"about 0\.4 mm from .* tolerance 0\.35 mm"):
+        embed(mesh, above, tolerance=0.35)
+
+
 @pytest.mark.parametrize(
     ("points", "message"),
     [

@@ -159,6 +159,7 @@ def _values(path: Path, field: str, frames: NDArray[np.generic]) -> NDArray[np.g
     """The frames as uint8, int16 or float32, each of which shows something."""
     if frames.dtype.kind not in "iuf":
         raise fault(path, field, f"type {frames.dtype}", "one real number for each voxel")
+    frames = np.ascontiguousarray(frames)
     for number, frame in enumerate(frames):
         low, high = float(np.min(frame)), float(np.max(frame))
         if not (np.isfinite(low) and np.isfinite(high)):
@@ -169,11 +170,11 @@ def _values(path: Path, field: str, frames: NDArray[np.generic]) -> NDArray[np.g
                 path, field, f"all voxels of frame {number} are {low:g}", "an image in every frame"
             )
     if frames.dtype == np.uint8:
-        return np.ascontiguousarray(frames)
+        return frames
     if frames.dtype.kind in "iu":
         limits = np.iinfo(np.int16)
         if frames.min() >= limits.min and frames.max() <= limits.max:
-            return np.ascontiguousarray(frames, dtype=np.int16)
+            return frames.astype(np.int16, copy=False)
     elif np.abs(frames).max() > np.finfo(np.float32).max:
         raise fault(path, field, f"{np.abs(frames).max():g}", "numbers in the range of 4 bytes")
-    return np.ascontiguousarray(frames, dtype=np.float32)
+    return frames.astype(np.float32, copy=False)

@@ -132,6 +132,8 @@ def _check_numbers(path: Path, field: str, value: str, count: int) -> None:
         raise fault(path, field, repr(value), f"{count} numbers")
     if field in (NAMES.size, NAMES.spacing) and min(numbers) <= 0:
         raise fault(path, field, value, "positive numbers")
+    if field == NAMES.size and not all(number.is_integer() for number in numbers):
+        raise fault(path, field, value, "whole numbers")
 
 
 def _voxel_type(path: Path, fields: dict[str, str]) -> np.dtype[np.generic]:

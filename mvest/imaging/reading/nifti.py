@@ -13,7 +13,6 @@ from typing import Any
 
 import nibabel
 import numpy as np
-from nibabel.spatialimages import HeaderDataError
 
 from mvest.imaging.reading.checks import check_size
 from mvest.imaging.reading.data import from_gzip, plainly, read_exactly
@@ -26,6 +25,8 @@ NAMES = FieldNames("dim", "sform or qform", "sform or qform", "sform or qform", 
 GZIP = b"\x1f\x8b"
 MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 1e-3}
 TO_LPS = np.array([-1.0, -1.0, 1.0])
+LARGEST_CODE = 5
+"""Of the forms of coordinates that the format knows."""
 ROUNDING = 1e-3
 """Relative difference of lengths that the header gives twice."""
 BYTES_BEFORE = (352, 2**24)
@@ -66,11 +67,14 @@ def read_nifti(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     if b"ni" in (begin[344:346], begin[4:6]):
         raise fault(path, "magic", "a header without its image", "one file, .nii or .nii.gz")
     try:
-        header = kind(begin[: kind.template_dtype.itemsize])
+        # Unchecked, as nibabel's checks put right by guessing what is wrong.
+        header = kind(begin[: kind.template_dtype.itemsize], check=False)
         shape = header.get_data_shape()
         dtype = header.get_data_dtype()
         affine = np.asarray(header.get_best_affine(), dtype=np.float64)
-    except (HeaderDataError, ValueError, KeyError) as error:
+        units = header.get_xyzt_units()
+        scaling = header.get_slope_inter()
+    except Exception as error:  # nibabel fails in many ways on a damaged header
         raise fault(path, "header", error, "one that nibabel reads") from error
     if len(shape) not in (3, 4):
         raise fault(path, "dim", " ".join(map(str, shape)), "3 or 4 axes")
@@ -78,16 +82,25 @@ def read_nifti(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
         raise fault(path, "datatype", dtype, "one grey value, no colour or complex number")
     sizes = (*shape, 1)[:4]
     check_size(path, "dim", [sizes[3], *sizes[:3]], dtype.itemsize)
-    steps, origin = _geometry(path, header, affine)
-    times = _times(path, header, len(shape), int(sizes[3]))
+    steps, origin = _geometry(path, header, affine, units[0])
+    times = _times(path, header, len(shape), int(sizes[3]), units[1])
     frames = _frames(path, header, dtype, sizes)
+    slope, intercept = scaling
+    if slope is not None and (slope, intercept) != (1.0, 0.0):
+        frames = frames.astype(np.float32)
+        frames *= np.float32(slope)
+        frames += np.float32(intercept)
     return StatedVolume(frames, steps, origin, times, None, NAMES), (path,)
 
 
-def _geometry(path: Path, header: Any, affine: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _geometry(
+    path: Path, header: Any, affine: FloatArray, unit: str
+) -> tuple[FloatArray, FloatArray]:
+    for field in ("sform_code", "qform_code"):
+        if not 0 <= int(header[field]) <= LARGEST_CODE:
+            raise fault(path, field, int(header[field]), f"0 to {LARGEST_CODE}")
     if int(header["sform_code"]) == 0 and int(header["qform_code"]) == 0:
         raise fault(path, "sform_code", "0, as is qform_code", "a direction of the axes")
-    unit = header.get_xyzt_units()[0]
     if unit not in MM_PER_UNIT:
         raise fault(path, "xyzt_units", unit, "mm")
     lengths = np.linalg.norm(affine[:3, :3], axis=0)
@@ -103,14 +116,13 @@ def _geometry(path: Path, header: Any, affine: FloatArray) -> tuple[FloatArray, 
     return affine[:3, :3] * scale[:, np.newaxis], affine[:3, 3] * scale
 
 
-def _times(path: Path, header: Any, dimension: int, count: int) -> StatedTimes:
+def _times(path: Path, header: Any, dimension: int, count: int, unit: str) -> StatedTimes:
     if dimension == 3:
         return StatedTimes(None, "", "dim")
-    unit = header.get_xyzt_units()[1]
     if unit in ("hz", "ppm", "rads"):
         raise fault(path, "xyzt_units", unit, "a fourth axis of time")
     step = float(header["pixdim"][4])
-    if step <= 0:
+    if not step > 0:
         return StatedTimes(None, "", "pixdim[4]")
     values = float(header["toffset"]) + step * np.arange(count, dtype=np.float64)
     return StatedTimes(values, "" if unit == "unknown" else unit, "pixdim[4] with xyzt_units")
@@ -118,18 +130,13 @@ def _times(path: Path, header: Any, dimension: int, count: int) -> StatedTimes:
 
 def _frames(path: Path, header: Any, dtype: np.dtype[Any], sizes: tuple[int, ...]) -> np.ndarray:
     size = int(np.prod(sizes, dtype=np.int64)) * dtype.itemsize
-    start = int(header.get_data_offset())
-    if not BYTES_BEFORE[0] <= start <= BYTES_BEFORE[1]:
-        raise fault(path, "vox_offset", start, f"{BYTES_BEFORE[0]} to {BYTES_BEFORE[1]} bytes")
+    offset = float(header["vox_offset"])
+    if not BYTES_BEFORE[0] <= offset <= BYTES_BEFORE[1]:
+        raise fault(path, "vox_offset", offset, f"{BYTES_BEFORE[0]} to {BYTES_BEFORE[1]} bytes")
+    start = int(offset)
     with path.open("rb") as file:
         compressed = file.read(2) == GZIP
         file.seek(0)
         chunks = from_gzip(file) if compressed else plainly(file)
         content = read_exactly(path, "data", chunks, start + size)
-    frames = content[start:].view(dtype).reshape(sizes, order="F")
-    slope, intercept = header.get_slope_inter()
-    if slope is not None and (slope, intercept) != (1.0, 0.0):
-        frames = frames.astype(np.float32)
-        frames *= np.float32(slope)
-        frames += np.float32(intercept)
-    return np.moveaxis(frames, 3, 0)
+    return np.moveaxis(content[start:].view(dtype).reshape(sizes, order="F"), 3, 0)

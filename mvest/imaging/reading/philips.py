@@ -132,7 +132,7 @@ def _number(path: Path, data: Any, field: Any, code: str) -> float:
         number = float(value)
     except KeyError as error:
         raise fault(path, name, "not stated", "a number") from error
-    except (TypeError, ValueError, NotImplementedError) as error:
+    except Exception as error:  # pydicom fails in many ways on a damaged value
         raise fault(path, name, error, "a number") from error
     if not np.isfinite(number):
         raise fault(path, name, number, "a number")

@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+import numpy as np
+
 from mvest.errors import InputError
 from mvest.imaging.reading.checks import checked_sequence
 from mvest.imaging.reading.metaimage import is_metaimage, read_metaimage
 from mvest.imaging.reading.nifti import is_nifti, read_nifti
 from mvest.imaging.reading.nrrd_file import read_nrrd
 from mvest.imaging.reading.philips import is_dicom, read_philips
-from mvest.imaging.reading.stated import fault
+from mvest.imaging.reading.stated import StatedVolume, fault
 from mvest.imaging.volume import Modality, VolumeSequence
 
 __all__ = ["read_volume"]
@@ -63,23 +65,29 @@ def read_volume(
         )
     if not source.is_file():
         raise InputError(f"{source}: no such file")
-    try:
-        with source.open("rb") as file:
-            head = file.read(1024)
-        if head.startswith(b"NRRD"):
-            stated, files = read_nrrd(source)
-        elif is_nifti(source):
-            stated, files = read_nifti(source)
-        elif is_dicom(head):
-            stated, files = read_philips(source)
-        elif is_metaimage(head):
-            stated, files = read_metaimage(source)
-        else:
-            raise fault(source, "content", f"{head[:8]!r}", READABLE)
-        sha256 = _sha256(files)
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read: {error.strerror or error}") from error
-    return checked_sequence(source, stated, sha256, modality, frame_interval_s, time_unit)
+    # What overflows is refused with the numbers that are no finite ones.
+    with np.errstate(all="ignore"):
+        try:
+            stated, files = _stated(source)
+            sha256 = _sha256(files)
+        except OSError as error:
+            raise InputError(f"{source}: cannot be read: {error.strerror or error}") from error
+        return checked_sequence(source, stated, sha256, modality, frame_interval_s, time_unit)
+
+
+def _stated(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
+    """What the file states, and the files that it consists of."""
+    with path.open("rb") as file:
+        head = file.read(1024)
+    if head.startswith(b"NRRD"):
+        return read_nrrd(path)
+    if is_nifti(path):
+        return read_nifti(path)
+    if is_dicom(head):
+        return read_philips(path)
+    if is_metaimage(head):
+        return read_metaimage(path)
+    raise fault(path, "content", f"{head[:8]!r}", READABLE)
 
 
 def _sha256(files: tuple[Path, ...]) -> str:

@@ -76,7 +76,7 @@ def _axis(low: float, high: float, width: float, lobe_db: float, per_width: floa
     margin = math.ceil(reach / step)
 
     def shape(x: FloatArray, spread: float) -> FloatArray:
-        total = np.exp(-0.5 * (x / spread) ** 2, dtype=np.float64)
+        total = np.exp(-0.5 * (x / spread) ** 2)
         if level >= 1e-6:
             for place, share, sign in LOBES:
                 for side in (-1, 1):
@@ -84,7 +84,7 @@ def _axis(low: float, high: float, width: float, lobe_db: float, per_width: floa
                     total += sign * share * level * lobe
         return np.asarray(total)
 
-    kernel = sigma / narrow * shape(step * np.arange(-margin, margin + 1), narrow)
+    kernel = sigma / narrow * shape(np.arange(-margin, margin + 1, dtype=np.float64) * step, narrow)
     fine = np.linspace(-4 * width, 4 * width, 4001)
     energy = float((shape(fine, sigma) ** 2).sum() * (fine[1] - fine[0]))
     return Axis(low, step, count, kernel.astype(np.float32), energy)

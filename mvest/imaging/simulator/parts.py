@@ -69,7 +69,7 @@ def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[
 
 
 def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[Part]:
-    """Pericardium, and tissue around ventricle and atrium, less so towards aorta and right heart."""
+    """Pericardium, and tissue around ventricle and atrium, not towards aorta and right heart."""
     free = 1 - heart.outflow
     pericardium = Material("pericardium", a.vessel_db + 2.0)
     around = Material("surroundings", a.wall_db - 2.0, specular=False, fineness=0.5)

@@ -58,7 +58,7 @@ def scan_convert(levels: Float32Array, grid: BeamGrid) -> NDArray[np.uint8]:
     i, j, k = a.shape
     x = (np.arange(i) - 0.5 * (i - 1)) * a.voxel_mm
     y = (np.arange(j) - 0.5 * (j - 1)) * a.voxel_mm
-    z = a.depth_mm[0] + np.arange(k) * a.voxel_mm
+    z = np.arange(k, dtype=np.float64) * a.voxel_mm + a.depth_mm[0]
     half = math.radians(a.azimuth_deg) / 2, math.radians(a.elevation_span_deg) / 2
     across = (np.arctan(x[:, None] / z) + half[0]) / grid.azimuth.step
     up = (np.arctan(y[:, None] / z) + half[1]) / grid.elevation.step

@@ -73,7 +73,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def normals(points: FloatArray) -> FloatArray:
-    """Unit normals (row direction x column direction) of grids ``(..., R, C, 3)``, columns closed."""
+    """Unit normals, rows x columns, of grids ``(..., R, C, 3)`` that are closed around."""
     return _unit(np.cross(_differences(points, -3, False), _differences(points, -2, True)))
 
 

@@ -26,7 +26,7 @@ def checked_path(path: Path | str, suffix: str) -> Path:
     return target
 
 
-def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then give it that name.
 
     Raises

@@ -81,6 +81,7 @@ BAD = {
     "five axes": (r"NDims = 4", "NDims = 5", "NDims"),
     "few voxels": (r"DimSize = \d+", "DimSize = 10", "DimSize"),
     "absurd size": (r"DimSize = .*", "DimSize = 3000 3000 3000 30", "DimSize"),
+    "no whole number": (r"DimSize = 20", "DimSize = 20.5", "DimSize"),
     "more voxels than bytes": (r"DimSize = 20", "DimSize = 21", "ElementDataFile"),
     "fewer voxels than bytes": (r"DimSize = 20", "DimSize = 19", "ElementDataFile"),
     "colour": (r"ElementType", "ElementNumberOfChannels = 3\nElementType", "ElementNumberOf"),

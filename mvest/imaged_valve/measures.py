@@ -1,4 +1,4 @@
-"""What users of valve software expect of a valve from images: measures and surfaces per frame."""
+"""Measures of a valve from images in every frame, and the tables that hold them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.clinical import clinical_meaning, clinical_measurements, clinical_names
-from mvest.valve.io import region_arrays, write_surface, write_whole
+from mvest.valve.io import write_whole
 
 __all__ = [
     "OPEN_SHARE",
+    "closed_frame",
     "contact_distance",
     "measure_meaning",
     "measure_sequence",
     "write_measures",
-    "write_surfaces",
 ]
 
 Row: TypeAlias = dict[str, float | None]
@@ -143,6 +143,20 @@ def _finite(value: Any) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
+def closed_frame(rows: Sequence[Row]) -> int | None:
+    """Frame in which the leaflets touch over the largest area, of the measures of all frames.
+
+    Where they touch in none the one with the smallest orifice; None if no frame has either. The
+    orifice alone would take leaflets for closed that only overlap in the line of sight.
+    """
+    known = [row for row in rows if row["coaptation_area_mm2"] is not None]
+    known = [row for row in known if row["orifice_mm2"] is not None]
+    if not known:
+        return None
+    best = min(known, key=lambda row: (-(row["coaptation_area_mm2"] or 0.0), row["orifice_mm2"]))
+    return int(best["frame"] or 0)
+
+
 def measure_meaning(name: str) -> tuple[str, str]:
     """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`."""
     return _OWN[name] if name in _OWN else clinical_meaning(name)
@@ -192,30 +206,3 @@ def _cell(value: float | None) -> str:
 
 def _write_text(file: Path, text: str) -> None:
     file.write_text(text, encoding="utf-8")
-
-
-def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -> Path:
-    """Write the valve of every frame for ParaView and 3D Slicer; returns the index.
-
-    ``NAME_0000.vtp``, ... hold the midsurface in LPS mm with ``confidence`` and ``std_mm`` (NaN
-    where it was never measured) at its points and ``region`` in its triangles;
-    ``NAME.vtp.series`` lists them with their times in s, as ParaView's readers expect it (ParaView
-    user's guide, "file series"). It is written last.
-
-    Raises
-    ------
-    InputError
-        A point that is no finite number, or a file that cannot be written.
-    """
-    layout = sequence.layout
-    cells = region_arrays(layout.region, layout.region_names)
-    files = []
-    for t, time in enumerate(sequence.times):
-        points = {"confidence": sequence.vertex_confidence[t], "std_mm": sequence.std_mm}
-        file = folder / f"{name}_{t:04d}.vtp"
-        write_surface(file, sequence.vertices[t], layout.triangles, points, cells)
-        files.append({"name": file.name, "time": float(time)})
-    text = json.dumps({"file-series-version": "1.0", "files": files}, indent=1)
-    index = folder / f"{name}.vtp.series"
-    write_whole(index, lambda file: _write_text(file, text + "\n"))
-    return index

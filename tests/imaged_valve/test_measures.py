@@ -1,4 +1,4 @@
-"""Measures and surfaces of every frame, and the files that hold them."""
+"""Measures of every frame, and the tables that hold them."""
 
 import csv
 import dataclasses
@@ -9,14 +9,13 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaged_valve import (
+    closed_frame,
     contact_distance,
     measure_meaning,
     measure_sequence,
     write_measures,
-    write_surfaces,
 )
 from mvest.imaging.layout import ValveLayout
-from mvest.valve.io import read_surface
 from tests import made_up_sequence
 
 SMALL = ValveLayout(32, 9)
@@ -102,18 +101,13 @@ def test_nothing_to_write_and_nowhere_to_write_are_refused(tmp_path, rows):
         write_measures(tmp_path / "none", rows)
 
 
-def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
-    valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
-    valve.std_mm[3] = np.nan
-    index = write_surfaces(tmp_path, valve)
-    series = json.loads(index.read_text(encoding="utf-8"))
-    assert index.name == "valve.vtp.series"
-    assert series["file-series-version"] == "1.0"
-    assert [entry["time"] for entry in series["files"]] == [0.0, 0.04]
-    second = read_surface(tmp_path / series["files"][1]["name"])
-    np.testing.assert_allclose(second.vertices, valve.vertices[1])
-    np.testing.assert_array_equal(second.triangles, SMALL.triangles)
-    np.testing.assert_allclose(second.point_data["confidence"], valve.vertex_confidence[1])
-    np.testing.assert_allclose(second.point_data["std_mm"], valve.std_mm)
-    np.testing.assert_array_equal(second.cell_data["region"], SMALL.region)
-    assert "region.posterior" in second.cell_data
+def test_the_closed_frame_is_where_most_touches(rows):
+    assert closed_frame(rows) == 0
+
+    def row(frame, touching, orifice):
+        return {"frame": frame, "coaptation_area_mm2": touching, "orifice_mm2": orifice}
+
+    nothing = row(0, None, None)
+    assert closed_frame([nothing, row(1, 5.0, 2.0), row(2, 9.0, 8.0)]) == 2
+    assert closed_frame([nothing, row(1, 0.0, 20.0), row(2, 0.0, 8.0)]) == 2
+    assert closed_frame([nothing]) is None
