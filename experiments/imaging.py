@@ -6,7 +6,6 @@ import hashlib
 import json
 import shutil
 import sys
-import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -128,7 +127,7 @@ def require_apart(*populations: tuple[MovingValve, ...]) -> None:
     """
     seen: dict[str, str] = {}
     for valves in populations:
-        own = {}
+        own: dict[str, str] = {}
         for valve in valves:
             shape = hashlib.sha256(np.ascontiguousarray(valve.vertices).tobytes()).hexdigest()
             own |= {valve.name: valve.name, shape: valve.name}
@@ -164,9 +163,12 @@ def require_imaging(config: Values) -> None:
                 "imaging.training.volumes"
             )
     if len(set(imaging["curve"])) < len(imaging["curve"]):
-        raise ConfigurationError(f"imaging.curve = {imaging['curve']}, expected different numbers")
-    for name, least in (("volumes", 1), ("shifted", 1), ("sequences", 1), ("shifted_sequences", 0),
-                        ("curve_volumes", 1 if imaging["curve"] else 0), ("without_valve", 1)):  # fmt: skip
+        raise ConfigurationError(f"imaging.curve = {imaging['curve']}, expected other numbers")
+    curve = 1 if imaging["curve"] else 0
+    for name, least in {
+        "volumes": 1, "shifted": 1, "sequences": 1, "shifted_sequences": 0, "without_valve": 1,
+        "curve_volumes": curve,
+    }.items():  # fmt: skip
         _at_least(least, f"held_out.{name}", held_out[name])
     most = min(held_out["volumes"], held_out["shifted"])
     if held_out["curve_volumes"] > most:

@@ -15,8 +15,8 @@ from experiments.imaging_store import ImagingStore, Spent
 from experiments.imaging_trials import SEQUENCES, VOLUMES, WITHOUT_VALVE
 from mvest.imaging.detection.accuracy import Correlogram, share_within
 from mvest.imaging.detection.model import Accuracy
-from mvest.imaging.layout import ValveLayout
 from mvest.provenance import provenance
+from mvest.typing import FloatArray
 
 __all__ = ["imaging_record", "learning_rows", "table_row"]
 
@@ -24,13 +24,15 @@ Values = Mapping[str, Any]
 Row = Mapping[str, Any]
 
 LEARNING = (
-    ("position", "mm", lambda errors: errors["position"]),
-    ("pose", "degrees", lambda errors: errors["turn"]),
-    ("landmarks", "mm", lambda errors: errors["stages"]["landmarks"]),
-    ("hinge", "mm", lambda errors: errors["annulus"]),
-    ("surface", "mm", lambda errors: errors["surface"]),
+    ("position", "mm", "position"),
+    ("pose", "degrees", "turn"),
+    ("landmarks", "mm", "landmarks"),
+    ("hinge", "mm", "annulus"),
+    ("surface", "mm", "surface"),
 )
-"""Stage, unit, and where its error is in a row."""
+"""Stage, unit, and the name of its error in a row."""
+
+SIZES = ("surface", "points", "tips")
 
 SETTING = {"sequence": VOLUMES[0], "shifted sequence": VOLUMES[1]}
 """What tables call volumes over time."""
@@ -118,14 +120,15 @@ def _tested(
             "sequences": len(accuracy.samples),
             "mean_error_mm": float(np.linalg.norm(accuracy.samples.mean(axis=0), axis=2).mean()),
             "correlogram": {
-                k: [round(float(v), 4) for v in vs] for k, vs in asdict(correlogram).items()
-            },  # fmt: skip
+                key: [round(float(v), 4) for v in values]
+                for key, values in asdict(correlogram).items()
+            },
             "within_95": [
                 row
                 for kind, setting in SETTING.items()
                 if held_out.sequences[kind]
                 for row in _coverage(held_out, kind, setting, accuracy)
-            ],  # fmt: skip
+            ],
         },
         "volumes": {str(size): rows for size, rows in held_out.volumes.items()},
         "sequence_frames": sequences,
@@ -133,7 +136,7 @@ def _tested(
 
 
 def table_row(row: Row, least_confidence: float) -> dict[str, Any]:
-    """What a table of volumes needs of one; nothing but the time where the valve is not believed in."""
+    """What a table of volumes needs of one; little where the valve is not believed in."""
     found = row["confidence"] >= least_confidence
     errors = row["errors"]
     return {
@@ -166,8 +169,8 @@ def learning_rows(volumes: Mapping[int, Sequence[Row]]) -> list[dict[str, Any]]:
     for size, rows in sorted(volumes.items()):
         for setting in VOLUMES:
             own = [r for r in rows if r["kind"] == setting and (setting, r["number"]) in common]
-            for stage, unit, error in LEARNING if own else ():
-                values = [error(row["errors"]) for row in own]
+            for stage, unit, name in LEARNING if own else ():
+                values = [{**row["errors"], **row["errors"]["stages"]}[name] for row in own]
                 out.append(
                     {
                         "stage": stage,
@@ -235,8 +238,8 @@ def _confidences(
     }
 
 
-def _threshold(with_valve: np.ndarray, without: np.ndarray) -> float:  # type: ignore[type-arg]
-    """The threshold that tells both kinds apart best: equal weights, the middle of the best ones."""
+def _threshold(with_valve: FloatArray, without: FloatArray) -> float:
+    """The threshold that tells both kinds apart best, of equally good ones the middle one."""
     edges = np.unique(np.concatenate([with_valve, without]))
     tried = np.concatenate([edges[:1] - 1e-3, 0.5 * (edges[1:] + edges[:-1]), edges[-1:] + 1e-3])
     right = [(with_valve >= t).mean() + (without < t).mean() for t in tried]

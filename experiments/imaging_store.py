@@ -27,7 +27,7 @@ from experiments.mirror import build
 from experiments.parallel import in_processes
 from experiments.progress import PartBar
 from experiments.truth import truth_key
-from mvest.errors import InputError, MvestError, cannot_write
+from mvest.errors import cannot_write
 from mvest.imaging.detection.boosting import Boosters
 from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
@@ -295,7 +295,7 @@ class ImagingStore:
 
     # -- tests ------------------------------------------------------------------------------------
     def kept(self, kind: str, described: Values) -> Path:
-        """Where the result of a test lies, by what is tested on what and by the code that does it."""
+        """Where the result of a trial lies: by what is tried on what, and by the code for it."""
         key = truth_key(dict(described), imaging_source(NOT_DETECTED_BY))[:24]
         return self._place(kind, f"{key}.npz")
 

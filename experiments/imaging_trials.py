@@ -20,7 +20,7 @@ from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.model import DetectionModel, load_model
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
-from mvest.imaging.detection.training import render_frame
+from mvest.imaging.detection.training import Setting, render_frame
 from mvest.imaging.detection.truth import TrueValve
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
@@ -83,7 +83,7 @@ class Trial:
     acquisition: Acquisition
 
     @property
-    def spread(self) -> str:
+    def spread(self) -> Setting:
         """Whether its acquisition is drawn as in training, or outside of those ranges."""
         return "shifted" if self.kind.startswith("shifted") else "training"
 
@@ -114,9 +114,9 @@ def try_volume(
     Returns
     -------
     dict
-        Name -> plain values: of every volume its kind, valve, frame, ``confidence`` and ``cpu_s`` of
-        one thread (what simulation takes is no part of it); where there is a valve, also errors in mm
-        and degrees, measures, found and true, and the distances after each stage.
+        Name -> plain values: of every volume its kind, valve, frame, ``confidence`` and ``cpu_s``
+        of one thread (what simulation takes is no part of it); where there is a valve, also errors
+        in mm and degrees, measures, found and true, and the distances after each stage.
     """
     choose, render = asked.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
@@ -199,17 +199,16 @@ def try_sequence(
     cpu_s = time.process_time() - began
     frames = []
     for k in range(len(true.times)):
-        there, back = surface_distances(found.vertices[k], true.vertices[k], layout)
+        x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
+        there, back = surface_distances(x, right, layout)
         frames.append(
             {
                 "surface": float(0.5 * (there.mean() + back.mean())),
-                "points": float(
-                    np.linalg.norm(found.vertices[k] - true.vertices[k], axis=1).mean()
-                ),
-                "tips": float(np.linalg.norm(found.tips[k] - true.tips[k], axis=1).mean()),
+                "points": float(np.linalg.norm(x - right, axis=1).mean()),
+                "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
                 "confidence": float(found.frame_confidence[k]),
-                "true": measures(true.vertices[k], true.tips[k], layout),
-                "found": measures(found.vertices[k], found.tips[k], layout),
+                "true": measures(right, true.tips[k], layout),
+                "found": measures(x, tips, layout),
             }
         )
     row = {
@@ -222,20 +221,12 @@ def try_sequence(
     }
     two = [0, closed]
     axes = [pose_of(true.vertices[k], true.tips[k], layout) for k in two]
-
-    def own(positions: FloatArray, right: FloatArray) -> FloatArray:
-        return np.stack(
-            [
-                (positions[k] - right[k]) @ pose.rotation[0]
-                for k, pose in zip(two, axes, strict=True)
-            ]
-        )
-
+    turn = np.concatenate([pose.rotation for pose in axes])
     return {
         "row": json.dumps(row),
-        "errors": own(found.vertices, true.vertices),
-        "tip_errors": own(found.tips, true.tips),
-        "rest": (true.vertices[0] - axes[0].centre[0]) @ axes[0].rotation[0],
+        "errors": (found.vertices[two] - true.vertices[two]) @ turn,
+        "tip_errors": (found.tips[two] - true.tips[two]) @ turn,
+        "rest": (true.vertices[0] - axes[0].centre[0]) @ turn[0],
     }
 
 

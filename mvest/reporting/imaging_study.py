@@ -42,8 +42,8 @@ OVER_TIME: Final = (
 )
 WITHOUT: Final = (
     "How sure the detectors are of a valve in simulated volumes, with and without one. Walls only: "
-    "leaflets, annulus and chordae send no echo; no tissue: nothing does; a volume over time counts "
-    "with its best frame. Nothing here was measured in patients."
+    "leaflets, annulus and chordae send no echo; no tissue: nothing does; a volume over time "
+    "counts with its best frame. Nothing here was measured in patients."
 )
 
 
@@ -88,8 +88,8 @@ def study_words(record: Record) -> list[str]:
     told.append(
         f"Confidence without a valve: at most {found['highest_without_valve']:.2f}; with one: at "
         f"least {found['lowest_with_valve']:.2f}; a valve is called one from "
-        f"{found['least_confidence']:g} on, and {found['best_threshold']:.2f} would tell them apart "
-        "best."
+        f"{found['least_confidence']:g} on, and {found['best_threshold']:.2f} would tell them "
+        "apart best."
     )
     return told
 
@@ -114,8 +114,8 @@ def write_imaging_study(folder: Path, record: Record) -> list[Path]:
     """All tables and figures of the study; nothing for one that only trained.
 
     ``imaging.*``, ``imaging_sequences.*`` and ``imaging_confidence.*`` (tables as CSV, Markdown and
-    LaTeX), and ``imaging_distance``, ``imaging_training``, ``imaging_confidence``, ``imaging_std`` and
-    ``imaging_correlation`` (figures).
+    LaTeX), and ``imaging_distance``, ``imaging_training``, ``imaging_confidence``, ``imaging_std``
+    and ``imaging_correlation`` (figures).
 
     Parameters
     ----------

@@ -52,10 +52,10 @@ class Correlogram:
 
 
 def matern(distance: FloatArray, length: float) -> FloatArray:
-    """Matérn correlation of smoothness 3/2, as the errors of an observation are told to an estimator.
+    """Matérn correlation of smoothness 3/2, which estimators take errors to have.
 
-    ``(1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` (Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, 2006, eq. 4.17).
+    ``(1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` (Rasmussen and Williams, Gaussian Processes for
+    Machine Learning, 2006, eq. 4.17).
     """
     d = np.sqrt(3.0) * np.asarray(distance) / length
     return np.asarray((1.0 + d) * np.exp(-d))
@@ -74,7 +74,7 @@ def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
     Returns
     -------
     Correlogram
-        Bins up to 30 mm; each value is the mean over pairs of errors over their standard deviations.
+        Bins up to 30 mm; each value is a mean over pairs, errors over their standard deviations.
     """
     size = np.sqrt((errors**2).mean(axis=0))
     if not (np.isfinite(size).all() and (size > 0).all()):

@@ -132,12 +132,15 @@ class RenderedFrame:
         In world coordinates, as are the tips.
     tips : (2, 3) mm
     acquisition : Acquisition
+    volume : VolumeSequence
+        Of this frame alone.
     """
 
     frame: StandardFrame
     vertices: FloatArray
     tips: FloatArray
     acquisition: Acquisition
+    volume: VolumeSequence
 
 
 def render_frame(
