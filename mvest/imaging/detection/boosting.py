@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import lightgbm
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,6 +61,8 @@ class Boosters:
     """Trees for each of several outputs of the same features."""
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
+        import lightgbm  # here, as it takes a second that studies without images need not wait
+
         self.texts = texts
         try:
             self._boosters = [lightgbm.Booster(model_str=text) for text in texts]
@@ -99,6 +100,8 @@ def train_boosters(
     objective : str
         ``regression`` (least squares) or ``binary`` (probability).
     """
+    import lightgbm
+
     data = lightgbm.Dataset(
         x,
         label=y[:, 0],
