@@ -75,18 +75,14 @@ class Boosters:
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
-<<<<<<< HEAD
         import lightgbm  # here, as it takes a second that studies without images need not wait
 
-        self.texts = texts
-=======
         checked = [checked_trees(text, source) for text in texts]
         self.texts, self._source = tuple(text for text, _ in checked), source
         counts = {features for _, features in checked}
         if len(counts) != 1:
             raise InputError(f"{source}: trees of {sorted(counts)} features, expected one number")
         self.features = counts.pop()
->>>>>>> dtests
         try:
             self._boosters = [lightgbm.Booster(model_str=text) for text in self.texts]
         except lightgbm.basic.LightGBMError as fault:
