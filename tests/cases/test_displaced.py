@@ -18,7 +18,7 @@ def told(follow):
     vertices = np.zeros((4, 3, n, 3))
     tips = np.zeros((4, 3, 2, 3))
     vertices[1], tips[1] = shift, shift  # everything as one
-    vertices[2, 2, :, 2] = -3.0  # the closed frame's leaflets alone
+    vertices[2, 2, :, 2] = 8.0  # the closed frame's leaflets alone
     return dataclasses.replace(
         case, error_samples=ErrorSamples(vertices, tips), chordae_follow=follow
     ), shift
@@ -41,10 +41,10 @@ def test_a_valve_that_moves_as_one_is_the_same_valve(follow):
 def test_chordae_that_follow_are_as_long_as_the_displaced_closed_frame_asks_for():
     case, _ = told(True)
     still, moved = displaced_case(case, 0), displaced_case(case, 2)
-    # Leaflets nearer to the tips: chordae that were not held by their open length are shorter.
-    shorter = still.chordae.rest_length - moved.chordae.rest_length
-    assert shorter.max() > 1.0
-    assert shorter.min() >= -1e-9
+    # Leaflets farther from the tips: chordae that were as long as this asks for are longer.
+    longer = moved.chordae.rest_length - still.chordae.rest_length
+    assert longer.max() > 1.0
+    assert longer.min() >= -1e-9
     np.testing.assert_array_equal(still.surface.vertices, moved.surface.vertices)
     given, _ = told(False)
     np.testing.assert_array_equal(
