@@ -29,7 +29,10 @@ __all__ = [
     "Hidden",
     "Simulation",
     "VirtualPatient",
+    "close_patient",
     "draw_hidden",
+    "held_states",
+    "patient_model",
     "simulate_patient",
 ]
 
@@ -192,33 +195,40 @@ def simulate_patient(
         If the valve does not close, or has no equilibrium in a frame that is held out.
     """
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
-    model = _model(template, seen, values, simulation, mechanics)
-    at = np.array([values[parameter] for parameter in model.names])
-    prediction = model(at)
-    if not prediction.converged:
-        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+    contact = template.valve(simulation.contact_columns, simulation.contact_rows)
+    model = patient_model(template, seen, contact, values, simulation, mechanics)
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
-    true = {CLOSED: displace(prediction.y.reshape(2, -1, 3)[1], registration, centre)}
-    held = _held(simulation, model.contact_valve)
-    for frame, found in zip(held, model.held(at, tuple(held.values())), strict=True):
-        if found is None:
-            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
-        true[frame] = displace(found, registration, centre)
+    true = {
+        frame: displace(found, registration, centre)
+        for frame, found in close_patient(name, model, values, simulation).items()
+    }
     case = _case(name, description, seen, true, simulation, mechanics, rng)
     return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
 
 
-def _model(
+def patient_model(
     template: Template,
     seen: Valve,
+    contact: Valve,
     values: Mapping[str, float],
     simulation: Simulation,
     mechanics: MechanicsSettings,
 ) -> ClosureModel:
+    """The model that closes a virtual patient, with the guides that it follows.
+
+    Parameters
+    ----------
+    template : Template
+    seen, contact : Valve
+        Of that template, where it is seen and where contact is sampled.
+    values : mapping
+        The parameters are its names, without those of a displacement.
+    simulation : Simulation
+    mechanics : MechanicsSettings
+    """
     names = tuple(name for name in values if name not in REGISTRATION)
     protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
-    contact = template.valve(simulation.contact_columns, simulation.contact_rows)
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
     # Closures are followed on coarser meshes only.
@@ -239,15 +249,44 @@ def _model(
     return guide
 
 
-def _held(simulation: Simulation, valve: Valve) -> dict[str, HeldState]:
-    """The frames that are held out, on the annulus of a valve."""
+def close_patient(
+    name: str, model: ClosureModel, values: Mapping[str, float], simulation: Simulation
+) -> dict[str, FloatArray]:
+    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
+
+    The first frame is the closed one; those that are held out follow.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or has no equilibrium in a frame that is held out.
+    """
+    at = np.array([values[parameter] for parameter in model.names])
+    prediction = model(at)
+    if not prediction.converged:
+        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+    true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
+    held = held_states(simulation, model.contact_valve)
+    for frame, found in zip(held, model.held(at, tuple(held.values())), strict=True):
+        if found is None:
+            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+        true[frame] = found
+    return true
+
+
+def held_states(simulation: Simulation, valve: Valve) -> dict[str, HeldState]:
+    """The frames that are held out, on the annulus of a valve.
+
+    Tips that move while the valve closes return with the annulus.
+    """
     start, end = valve.motion.annulus[0], valve.motion.annulus[-1]
     tips = valve.motion.papillary_tips[-1]
+    back = valve.motion.papillary_tips[0] - tips
     return {
         f"held_{pressure:g}_mmHg": HeldState(
             pressure,
             end + relaxation * (start - end),
-            tips + relaxation * np.array(simulation.held_tips),
+            tips + relaxation * (np.array(simulation.held_tips) + back),
         )
         for pressure, relaxation in zip(
             simulation.held_pressure_mmHg, simulation.held_relaxation, strict=True
@@ -277,7 +316,7 @@ def _case(
     closed = HeldState(
         mechanics.protocol.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1]
     )
-    states = {CLOSED: closed, **_held(simulation, seen)}
+    states = {CLOSED: closed, **held_states(simulation, seen)}
 
     def frame(name: str, time: float, role: Role, state: HeldState, vertices: FloatArray) -> Frame:
         return Frame(

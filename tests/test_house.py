@@ -72,6 +72,16 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.registration",
     ),
+    "mvest.simulated_motion": (
+        *LEAVES,
+        "mvest.provenance",
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.imaging",
+        "mvest.model",
+        "mvest.registration",
+        "mvest.virtual_patient",
+    ),
     "mvest.personalise": (
         *LEAVES,
         "mvest.cases",
@@ -85,7 +95,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.study",
         "mvest.surface_observation",
     ),
-    "mvest.reporting": (*LEAVES, "mvest.provenance", "mvest.valve", "mvest.estimation"),
+    "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
+    "mvest.reporting": (
+        *LEAVES,
+        "mvest.provenance",
+        "mvest.valve",
+        "mvest.imaging",
+        "mvest.estimation",
+    ),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
 NEVER_IN_EXPERIMENTS = ("tests",)
@@ -300,11 +317,7 @@ def test_what_is_imported_is_declared(project: dict) -> None:
     required = import_names(project["dependencies"])
     extras = project["optional-dependencies"]
     optional = import_names(
-        [
-            text
-            for name in ("viz", "imaging", "cluster", "postgres", "browser")
-            for text in extras[name]
-        ]
+        [text for name in ("viz", "cluster", "postgres", "browser") for text in extras[name]]
     )
     messages = [
         message

@@ -25,8 +25,8 @@ class ValveLayout:
     Attributes
     ----------
     columns : int
-        Vertices around the valve, a multiple of 4, at least 8: so the lines between the leaflets and
-        the middles of both are columns.
+        Vertices around the valve, a multiple of 4, at least 8: so the lines between the leaflets
+        and the middles of both are columns.
     rows : int
         Vertices from annulus to free edge, at least 3.
     region_names : tuple of str

@@ -1,7 +1,7 @@
 """A simulated valve over time, as the TEE simulator images it and as detectors learn from it.
 
-All positions are mm in the valve's own axes: the annulus about the plane z = 0, z towards the atrium, y
-to the anterior side, x to the line between the leaflets at phi = 0.
+All positions are mm in the valve's own axes: the annulus about the plane z = 0, z towards the
+atrium, y to the anterior side, x to the line between the leaflets at phi = 0.
 """
 
 from __future__ import annotations

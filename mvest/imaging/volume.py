@@ -24,7 +24,7 @@ class Modality(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeSequence:
-    """Frames of one region in space. World coordinates are LPS (x to the left, y to the back, z up).
+    """Frames of one region. World coordinates are LPS: x to the left, y to the back, z up.
 
     Attributes
     ----------

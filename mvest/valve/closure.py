@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
@@ -166,9 +167,17 @@ def _contact_fraction(
     contact_distance: float,
 ) -> BoolArray:
     """Say which points lie within the contact distance of an opposing, facing leaflet."""
-    closest = closest_points(points, vertices, opposing)
-    facing = (normals * _normals(vertices, opposing)[closest.triangle]).sum(axis=1) < 0
-    near: BoolArray = (closest.distance <= contact_distance) & facing
+    corners = vertices[opposing]
+    centroids = corners.mean(axis=1)
+    # Nothing of a triangle is farther from its centroid than its corners are.
+    reach = contact_distance + float(np.linalg.norm(corners - centroids[:, None], axis=2).max())
+    gap = cKDTree(centroids).query(points, distance_upper_bound=reach * (1 + 1e-9))[0]
+    near = np.asarray(np.isfinite(gap))
+    candidate = np.flatnonzero(near)
+    closest = closest_points(points[candidate], vertices, opposing)
+    other = _normals(vertices, opposing)[closest.triangle]
+    facing = (normals[candidate] * other).sum(axis=1) < 0
+    near[candidate] = (closest.distance <= contact_distance) & facing
     return near
 
 

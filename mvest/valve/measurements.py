@@ -21,6 +21,7 @@ from mvest.valve.closure import (
 )
 from mvest.valve.passing_ball import largest_passing_ball
 from mvest.valve.proximity import intersecting_triangles, plane_section
+from mvest.valve.spanning_surface import SpanningSurface
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +145,54 @@ def measure_tenting(
         height=float(column[np.argmax(column)]),
         area=float(column.sum() * resolution),
         volume=float(depth.sum() * resolution**2),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ProlapseMeasurements:
+    """What of the leaflets lies on the atrial side.
+
+    Attributes
+    ----------
+    height, volume
+        Largest height above the annulus plane, mm, and volume between them there, mm³.
+    billow_height, billow_volume
+        The same above the minimal surface that spans the annulus.
+    """
+
+    height: float
+    volume: float
+    billow_height: float
+    billow_volume: float
+
+
+def measure_prolapse(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    spanning: SpanningSurface,
+    resolution: float = 0.2,
+) -> ProlapseMeasurements:
+    """Measure what of the first leaflet surface seen from the atrium lies above the annulus.
+
+    An annulus is a saddle, and the leaflets near its two high points lie above its plane in every
+    valve (Levine et al. 1987, Circulation 75:756); above the surface that spans it only a leaflet
+    that bulges into the atrium does. Parameters as in `measure_tenting`.
+    """
+    image = project_leaflets(vertices, triangles, annulus, plane, resolution)
+    film = project_leaflets(spanning.vertices, spanning.triangles, annulus, plane, resolution)
+    seen = image.inside & np.isfinite(image.depth)
+    over_plane = np.where(seen, np.maximum(-image.depth, 0.0), 0.0)
+    both = seen & np.isfinite(film.depth)
+    over_film = np.zeros_like(over_plane)
+    over_film[both] = np.maximum(film.depth[both] - image.depth[both], 0.0)
+    pixel = resolution**2
+    return ProlapseMeasurements(
+        height=float(over_plane.max()),
+        volume=float(over_plane.sum() * pixel),
+        billow_height=float(over_film.max()),
+        billow_volume=float(over_film.sum() * pixel),
     )
 
 

@@ -364,8 +364,16 @@ class Template:
         """``(2, 3)`` mm: the tips for which the chordae have their lengths."""
         return _mirrored(self.parameters.tips)
 
-    def chordae(self) -> Chordae:
-        """The chordae of both halves, without the absent ones.
+    def chord_places(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+        """Where the chordae of both halves insert, in their order and without the absent ones.
+
+        Returns
+        -------
+        phi : (c,) degrees
+        s : (c,)
+        family : (c,)
+            0 marginal, 1 basal.
+        tip : (c,)
 
         Raises
         ------
@@ -385,6 +393,18 @@ class Template:
         if not np.any(present):
             raise InputError(f"chordae absent at {layout.absent}: none is left")
         phi, s, family, tip = phi[present], s[present], family[present], tip[present]
+        return phi, s, family, tip
+
+    def chordae(self) -> Chordae:
+        """The chordae of both halves, without the absent ones.
+
+        Raises
+        ------
+        InputError
+            If all of them are absent.
+        """
+        layout = self.parameters.chordae
+        phi, s, family, tip = self.chord_places()
         insertion = self.position(phi, s)
         tips = self.papillary_tips[tip]
         open_length = np.linalg.norm(insertion - tips, axis=1)

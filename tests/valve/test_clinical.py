@@ -8,7 +8,7 @@ import pytest
 from mvest.errors import GeometryError
 from mvest.valve import clinical
 from mvest.valve.anatomy import LeafletSurface
-from mvest.valve.clinical import clinical_measurements
+from mvest.valve.clinical import clinical_meaning, clinical_measurements, clinical_names
 from mvest.valve.template import Template, TemplateParameters
 
 CLOSURE = ("orifice_mm2", "passing_ball_mm", "coaptation_length_mm", "coaptation_area_mm2")
@@ -26,8 +26,9 @@ def measured(parameters=None, change=None, columns=80, rows=15, turn=AS_IT_LIES)
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Without the closure, whose passing ball takes a second."""
+    """Without the closure and the passing ball, which takes a second."""
     monkeypatch.setattr(clinical, "_closure", lambda distance: lambda *arguments: {})
+    monkeypatch.setattr(clinical, "_ball", lambda *arguments: {})
 
 
 @pytest.mark.parametrize(
@@ -85,6 +86,7 @@ def test_the_open_valve_has_an_orifice():
     assert set(CLOSURE) <= set(found)
     assert found["orifice_mm2"] > 100
     assert found["passing_ball_mm"] > 8
+    assert set(found) == set(clinical_names(("anterior", "posterior")))
 
 
 def three(surface):
@@ -115,3 +117,121 @@ def test_a_shape_that_defies_a_measurement_has_the_others(monkeypatch, quick):
     flat = np.zeros((24, 3))
     x = valve.surface.vertices
     assert clinical_measurements(x, valve.surface, flat, valve.papillary_tips, 1.0) == {}
+
+
+def dome(height, rim=15.0, n=96, rings=24):
+    """Two halves of a spherical cap of a height over a circle (negative: below it)."""
+    radius = (rim**2 + height**2) / (2 * abs(height))
+    angle = np.arange(n) * 2 * np.pi / n
+    loops = []
+    for r in rim * np.linspace(1.0, 0.004, rings):
+        z = np.sign(height) * (np.sqrt(radius**2 - r**2) - (radius - abs(height)))
+        loops.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(n, z)]))
+    here = np.arange(n)
+    triangles = np.concatenate(
+        [
+            part + k * n
+            for k in range(rings - 1)
+            for part in (
+                np.stack([here, here + n, (here + 1) % n + n], 1),
+                np.stack([here, (here + 1) % n + n, (here + 1) % n], 1),
+            )
+        ]
+    )
+    vertices = np.concatenate(loops)
+    middle = vertices[triangles].mean(axis=1)
+    surface = LeafletSurface(
+        vertices, triangles, (middle[:, 1] < 0).astype(int), ("anterior", "posterior"),
+        np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), np.ones(len(vertices)),
+    )  # fmt: skip
+    return vertices, surface, vertices[:n]
+
+
+TIPS = np.array([[10.0, -3.0, -25.0], [-10.0, -3.0, -23.0]])
+
+
+@pytest.mark.parametrize("height", [15.0, 5.0])
+def test_a_dome_into_the_atrium_prolapses_by_its_height_and_volume(quick, height):
+    vertices, surface, annulus = dome(height)
+    found = clinical_measurements(vertices, surface, annulus, TIPS, 1.0)
+    cap = np.pi * height * (3 * 15.0**2 + height**2) / 6
+    for name in ("prolapse", "billow"):
+        assert found[f"{name}_height_mm"] == pytest.approx(height, rel=0.01)
+        assert found[f"{name}_volume_mm3"] == pytest.approx(cap, rel=0.02)
+    assert found["tenting_volume_mm3"] == pytest.approx(-cap, rel=0.02)
+    # Both leaflets together are the cap: 2 pi R h.
+    both = found["anterior_area_mm2"] + found["posterior_area_mm2"]
+    assert both == pytest.approx(np.pi * (15.0**2 + height**2), rel=0.01)
+
+
+def test_a_dome_into_the_ventricle_tents_and_does_not_prolapse(quick):
+    vertices, surface, annulus = dome(-6.0)
+    found = clinical_measurements(vertices, surface, annulus, TIPS, 1.0)
+    assert found["tenting_height_mm"] == pytest.approx(6.0, rel=0.01)
+    cap = np.pi * 6 * (3 * 15.0**2 + 36) / 6
+    assert found["tenting_volume_mm3"] == pytest.approx(cap, rel=0.02)
+    for name in ("prolapse_height_mm", "billow_height_mm"):
+        assert found[name] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_saddle_prolapses_over_its_plane_but_does_not_billow(quick):
+    _, surface, flat = dome(-6.0)
+    angle = np.arctan2(flat[:, 1], flat[:, 0])
+    lift = -3.0 * np.cos(2 * angle)
+    # The leaflets hang 2 mm below a saddle with high points on the anterior and posterior side.
+    x = surface.vertices.copy()
+    share = np.hypot(x[:, 0], x[:, 1]) / 15.0
+    x[:, 2] = np.tile(lift, len(x) // len(flat)) * share**2 - 2.0 * (1 - share**2)
+    annulus = x[: len(flat)]
+    found = clinical_measurements(x, surface, annulus, TIPS, 1.0)
+    assert found["annulus_height_mm"] == pytest.approx(6.0, rel=0.01)
+    assert found["annulus_height_to_width_ratio"] == pytest.approx(6.0 / 30.0, rel=0.01)
+    assert found["prolapse_height_mm"] > 2.0
+    assert found["billow_height_mm"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_ratios_and_tips(quick):
+    p = replace(TemplateParameters(), flattening=0.0)
+    found = measured(p)
+    assert found["annulus_sphericity_ratio"] == pytest.approx(p.half_ap / p.half_commissural, 0.02)
+    assert found["tip_separation_mm"] == pytest.approx(2 * p.tips[0])
+    vertices, surface, annulus = dome(-6.0)
+    found = clinical_measurements(
+        vertices, surface, annulus, TIPS, 1.0, tip_names=("tip_0", "tip_180")
+    )
+    assert found["tip_0_depth_mm"] == pytest.approx(25.0)
+    assert found["tip_180_depth_mm"] == pytest.approx(23.0)
+    assert found["tip_depth_mm"] == pytest.approx(24.0)
+    near = 15.0 - np.hypot(10.0, 3.0)
+    assert found["tip_0_annulus_distance_mm"] == pytest.approx(np.hypot(near, 25.0), rel=1e-3)
+    assert found["tip_separation_mm"] == pytest.approx(np.hypot(20.0, 2.0))
+
+
+def test_every_number_has_a_meaning_and_a_unit():
+    names = ("tip_0", "tip_180")
+    valve = Template().valve(24, 7)
+    x, tips = valve.surface.vertices, valve.papillary_tips
+    found = clinical_measurements(
+        x, valve.surface, x[valve.annulus], tips, 1.0, tip_names=names, passing_ball=False
+    )
+    assert set(found) == set(clinical_names(("anterior", "posterior"), names, passing_ball=False))
+    assert "passing_ball_mm" not in found
+    ending = {"mm": "_mm", "mm²": "_mm2", "mm³": "_mm3", "": "_ratio"}
+    for name in found:
+        unit, meaning = clinical_meaning(name)
+        assert name.endswith(ending[unit])
+        assert "{" not in meaning
+    assert clinical_meaning("anterior_area_mm2")[1] == "area of the anterior leaflet"
+    assert "papillary tip 0" in clinical_meaning("tip_0_depth_mm")[1]
+    with pytest.raises(KeyError):
+        clinical_meaning("colour_mm")
+
+
+def test_a_twisted_annulus_loses_its_area_in_space_and_keeps_its_length(quick):
+    vertices, surface, annulus = dome(-6.0)
+    twisted = annulus.copy()
+    twisted[[3, 4]] = twisted[[4, 3]]
+    found = clinical_measurements(vertices, surface, twisted, TIPS, 1.0)
+    assert "annulus_area_3d_mm2" not in found
+    assert "billow_height_mm" not in found
+    assert found["annulus_circumference_mm"] > 2 * np.pi * 15.0 * 0.99

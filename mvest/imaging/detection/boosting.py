@@ -1,0 +1,116 @@
+"""Gradient-boosted trees (LightGBM), several outputs side by side, kept as plain text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import lightgbm
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import InputError
+from mvest.typing import FloatArray
+
+__all__ = ["BoostSettings", "Boosters", "train_boosters"]
+
+
+@dataclass(frozen=True, slots=True)
+class BoostSettings:
+    """How trees are grown.
+
+    Attributes
+    ----------
+    trees, leaves : int
+    rate : float
+        Share of each tree's answer that is taken.
+    least : int
+        Samples that a leaf holds at least.
+    share_features, share_rows : float
+        Of what there is, drawn anew for every tree.
+    threads : int
+    """
+
+    trees: int = 80
+    leaves: int = 24
+    rate: float = 0.12
+    least: int = 40
+    share_features: float = 0.25
+    share_rows: float = 0.7
+    threads: int = 1
+
+    def parameters(self, objective: str, seed: int) -> dict[str, Any]:
+        """LightGBM's names for them."""
+        return {
+            "objective": objective,
+            "num_leaves": self.leaves,
+            "learning_rate": self.rate,
+            "min_data_in_leaf": self.least,
+            "feature_fraction": self.share_features,
+            "bagging_fraction": self.share_rows,
+            "bagging_freq": 1,
+            "max_bin": 63,
+            "num_threads": self.threads,
+            "seed": seed,
+            "deterministic": True,
+            "force_row_wise": True,
+            "verbosity": -1,
+        }
+
+
+class Boosters:
+    """Trees for each of several outputs of the same features."""
+
+    def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
+        self.texts = texts
+        try:
+            self._boosters = [lightgbm.Booster(model_str=text) for text in texts]
+        except lightgbm.basic.LightGBMError as fault:
+            raise InputError(f"{source}: no trees that LightGBM reads ({fault})") from fault
+
+    def __reduce__(self) -> tuple[type[Boosters], tuple[tuple[str, ...]]]:
+        return Boosters, (self.texts,)
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.texts)
+
+    def __call__(self, x: NDArray[np.float32]) -> FloatArray:
+        """Outputs ``(P, outputs)`` for features ``(P, F)``."""
+        if not len(x):
+            return np.zeros((0, self.outputs))
+        found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
+        return np.stack(found, axis=1)
+
+
+def train_boosters(
+    x: NDArray[np.float32],
+    y: FloatArray,
+    settings: BoostSettings,
+    seed: int,
+    objective: str = "regression",
+    weight: FloatArray | None = None,
+) -> Boosters:
+    """Grow trees for every column of ``y (P, outputs)``.
+
+    Parameters
+    ----------
+    objective : str
+        ``regression`` (least squares) or ``binary`` (probability).
+    """
+    data = lightgbm.Dataset(
+        x,
+        label=y[:, 0],
+        weight=weight,
+        free_raw_data=False,
+        params={"max_bin": 63, "verbosity": -1},
+    )
+    texts = []
+    for k in range(y.shape[1]):
+        data.set_label(y[:, k])
+        booster = lightgbm.train(
+            settings.parameters(objective, seed + k), data, num_boost_round=settings.trees
+        )
+        texts.append(booster.model_to_string())
+    return Boosters(tuple(texts))

@@ -1,0 +1,178 @@
+"""The valve in one frame: position, pose, landmarks, rims, leaflets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvest.imaging.detection.fit import Pulls, fit_shape, relax
+from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.model import DetectionModel
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.shape_start import MODES
+from mvest.imaging.landmarks import landmark_vertices
+from mvest.typing import FloatArray
+
+__all__ = ["FitSettings", "FrameValve", "fit_frame", "search_frame"]
+
+PLACES = 12
+"""Places at which orientations are tried."""
+
+LANDMARK_STD_MM = 1.2
+RIM_STD_MM = (0.8, 0.8)
+"""mm, least standard deviation of a landmark's, a rim's and the boundary's pull: what the spread of
+votes does not tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """How leaflets are fitted.
+
+    Attributes
+    ----------
+    modes : tuple of int
+        Modes of the shape model in each round.
+    reach_mm : tuple of float
+        How far along normals the leaflets are looked for in each round.
+    alike : float
+        Neighbouring vertices see much the same: what is seen counts as if there were this many
+        times fewer of them.
+    stiffness, hold : float
+        Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
+    """
+
+    modes: tuple[int, ...] = (10, 12, 12)
+    reach_mm: tuple[float, ...] = (6.0, 4.0, 3.0)
+    alike: float = 8.0
+    stiffness: float = 4.0
+    hold: float = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameValve:
+    """A valve in one frame; positions in world mm.
+
+    Attributes
+    ----------
+    start, pose : Poses
+        One each: what the fit began with, and what it ended with.
+    coefficients : (K,)
+        Of the shape model.
+    vertices : (n, 3)
+    tips : (2, 3)
+    confidence : float
+        0 (no valve) to 1.
+    vertex_confidence : (n,)
+    stages : mapping
+        Name of a stage -> what it found, for tests of each.
+    """
+
+    start: Poses
+    pose: Poses
+    coefficients: FloatArray
+    vertices: FloatArray
+    tips: FloatArray
+    confidence: float
+    vertex_confidence: FloatArray
+    stages: Mapping[str, FloatArray] = field(default_factory=dict)
+
+
+def search_frame(
+    frame: StandardFrame, model: DetectionModel, count: int = 5
+) -> tuple[Poses, FloatArray]:
+    """The best ``count`` poses in a frame and their ratings (0 to 1), best first."""
+    places, _ = model.position(frame, PLACES)
+    return model.poses(frame, places, count)
+
+
+def fit_frame(
+    frame: StandardFrame,
+    model: DetectionModel,
+    pose: Poses,
+    settings: FitSettings | None = None,
+    *,
+    coefficients: FloatArray | None = None,
+    tips: FloatArray | None = None,
+    fixed: Mapping[int, FloatArray] | None = None,
+) -> FrameValve:
+    """Fit the valve from a pose (one).
+
+    Parameters
+    ----------
+    coefficients : (K,), optional
+        Where to start from; otherwise read off at the pose.
+    tips : (2, 3) mm, optional
+        Where papillary tips are looked for.
+    fixed : mapping, optional
+        Landmarks placed by hand: number -> world position. They stay.
+    """
+    told, begin = settings or FitSettings(), pose
+    shape, layout = model.shape, model.shape.layout
+    stages: dict[str, FloatArray] = {"pose": pose.world(shape.mean)[0]}
+    start, found_tips = model.start(frame, pose, shape)
+    b = np.zeros(told.modes[0])
+    b[:MODES] = start[0] if coefficients is None else coefficients[:MODES]
+    tips = found_tips[0] if tips is None else tips
+    vertices = pose.world(shape.shape(b[None]))[0]
+    stages["shape start"] = vertices
+    # Landmarks; those placed by hand are believed.
+    at = np.array(list(landmark_vertices(layout).values()))
+    guesses = np.concatenate([vertices[at], tips])
+    fixed = fixed or {}
+    free = np.array([k for k in range(len(guesses)) if k not in fixed], dtype=np.int64)
+    points, spread = np.array(guesses), np.full(len(guesses), 0.0)
+    points[free], spread[free] = model.landmarks(frame, pose, guesses[free], free)
+    for k, point in fixed.items():
+        points[k] = point
+    tips = points[len(at) :]
+    std = np.hypot(
+        np.where(np.isin(np.arange(len(at)), free), LANDMARK_STD_MM, 0.2), spread[: len(at)]
+    )
+    stages["landmarks"] = points
+    pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
+    manual = np.array([k for k in fixed if k < len(at)], dtype=np.int64)
+    pulls, confidence = None, np.zeros(layout.size)
+    for modes, reach in zip(told.modes, told.reach_mm, strict=True):
+        b = np.concatenate([b, np.zeros(modes - len(b))]) if modes > len(b) else b[:modes]
+        vertices = pose.world(shape.shape(b[None]))[0]
+        pulls, confidence = _seen(
+            frame, model, vertices, float(pose.log_scale[0]), reach, told.alike
+        )
+        if len(manual):
+            hand = Pulls.to_points(
+                at[manual], vertices[at[manual]], points[manual], np.full(len(manual), 0.2)
+            )
+            pulls = Pulls.joined([pulls, hand])
+        pose, b = fit_shape(shape, pose, b, pulls)
+        stages[f"shape fit {modes}"] = pose.world(shape.shape(b[None]))[0]
+    vertices = pose.world(shape.shape(b[None]))[0]
+    pulls, confidence = _seen(
+        frame, model, vertices, float(pose.log_scale[0]), told.reach_mm[-1], told.alike
+    )
+    vertices = relax(vertices, layout, pulls, told.stiffness, told.hold)
+    rating = float(model.poses.refined(frame, pose, 1)[1][0])
+    return FrameValve(begin, pose, b, vertices, tips, rating, confidence, stages)
+
+
+def _seen(
+    frame: StandardFrame,
+    model: DetectionModel,
+    vertices: FloatArray,
+    log_scale: float,
+    reach: float,
+    alike: float,
+) -> tuple[Pulls, FloatArray]:
+    """Pulls of leaflets and rims on a shape ``(n, 3)`` mm, and each vertex' confidence ``(n,)``."""
+    layout = model.shape.layout
+    normals, offset, std, confidence = model.boundary(frame, vertices, layout, reach)
+    root = np.sqrt(alike)
+    parts = [Pulls(np.arange(layout.size), normals, offset, root * std)]
+    for rim in (model.annulus, model.free_edge):
+        axes, off, spread = rim(frame, vertices, layout, log_scale)
+        at = layout.annulus if rim.row == 0 else layout.free_edge
+        # Columns are alike too, over about as many as rows are.
+        wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM[rim.row], spread)
+        parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
+    return Pulls.joined(parts), confidence

@@ -1,0 +1,136 @@
+"""One frame of a volume as detectors see it: ranks instead of grey values, at several scales."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mvest.errors import InputError
+from mvest.imaging.volume import VolumeSequence
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["LEVELS", "StandardFrame", "standard_frame"]
+
+VOXEL_MM = 0.8
+"""mm, spacing to which volumes are resampled whose own differs from it by more than a fifth."""
+
+LEVELS = 4
+"""Scales: cubes of 1, 2, 4 and 8 voxels."""
+
+LEAST_GREY_VALUES = 8
+"""Different values below which a frame holds no image."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandardFrame:
+    """Means over cubes of 1, 2, 4, ... voxels of the ranks of one frame's grey values.
+
+    A rank is the share of voxels within the field of view that are darker, so that gain, dynamic
+    range and any other monotone map of grey values make no difference.
+
+    Attributes
+    ----------
+    data : (N,) uint8
+        Ranks of all levels one after another, 255 the brightest; 0 outside the field of view.
+    starts : (L,)
+        Where each level begins.
+    shapes : (L, 3)
+        Voxels of each level.
+    to_index : (3, 3)
+        From mm in world axes to voxels of the first level.
+    origin : (3,) mm
+        World position of the first level's voxel (0, 0, 0).
+    """
+
+    data: NDArray[np.uint8]
+    starts: IntArray
+    shapes: IntArray
+    to_index: FloatArray
+    origin: FloatArray
+
+    def level(self, number: int) -> NDArray[np.uint8]:
+        """Ranks of one level ``(I, J, K)``."""
+        shape = self.shapes[number]
+        start = self.starts[number]
+        return self.data[start : start + int(np.prod(shape))].reshape(shape)
+
+    def centres(self, number: int) -> FloatArray:
+        """World positions ``(I * J * K, 3)`` mm of one level's voxels."""
+        side = 2**number
+        grids = np.meshgrid(
+            *((np.arange(k) + 0.5) * side - 0.5 for k in self.shapes[number]), indexing="ij"
+        )
+        index = np.stack(grids, axis=-1).reshape(-1, 3)
+        return np.asarray(self.origin + index @ np.linalg.inv(self.to_index).T)
+
+
+def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
+    """Prepare one frame of a volume.
+
+    Raises
+    ------
+    InputError
+        If the frame holds no image: hardly any different values.
+    """
+    grey = np.asarray(volume.frames[frame], dtype=np.float32)
+    spacing = np.asarray(volume.spacing, dtype=np.float64)
+    if np.any(np.abs(spacing / VOXEL_MM - 1) > 0.2):
+        shape = np.maximum(1, np.rint(np.array(grey.shape) * spacing / VOXEL_MM)).astype(int)
+        zoom = shape / np.array(grey.shape)
+        smooth = np.where(zoom < 1, 0.5 / zoom, 0.0)
+        grey = ndimage.zoom(
+            ndimage.gaussian_filter(grey, smooth), zoom, order=1, grid_mode=True, mode="nearest"
+        )
+        new = spacing / zoom
+        first = 0.5 * (new / spacing - 1)  # voxels of the old grid
+        origin = volume.world(first)
+        spacing = new
+    else:
+        origin = np.asarray(volume.origin, dtype=np.float64)
+    ranks = _ranks(grey, volume.source, frame)
+    levels = [ranks]
+    for _ in range(LEVELS - 1):
+        levels.append(_halved(levels[-1]))
+    shapes = np.array([level.shape for level in levels])
+    sizes = np.prod(shapes, axis=1)
+    return StandardFrame(
+        np.concatenate([level.ravel() for level in levels]),
+        np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+        shapes,
+        np.diag(1 / spacing) @ np.asarray(volume.direction).T,
+        origin,
+    )
+
+
+def _ranks(grey: NDArray[np.float32], source: str, frame: int) -> NDArray[np.uint8]:
+    low, high = float(grey.min()), float(grey.max())
+    if not high > low:
+        raise InputError(f"{source}, frame {frame}: all voxels are {low:g}, expected an image")
+    # A byte's worth of levels: what more there is, ranks cannot show.
+    binned = np.rint((grey - low) * (255 / (high - low))).astype(np.uint8)
+    # Outside the field of view there is nothing but the lowest value.
+    coarse = _halved(_halved(((binned > 0) * np.uint8(255)).astype(np.uint8)))
+    inside = ndimage.binary_dilation(coarse > 25, iterations=1)
+    inside = np.repeat(np.repeat(np.repeat(inside, 4, 0), 4, 1), 4, 2)
+    inside = inside[tuple(slice(0, k) for k in grey.shape)]
+    count = np.bincount(binned[inside], minlength=256)
+    if np.count_nonzero(count) < LEAST_GREY_VALUES:
+        raise InputError(
+            f"{source}, frame {frame}: {np.count_nonzero(count)} different grey values, expected "
+            "an image"
+        )
+    middle = (np.cumsum(count) - 0.5 * count) / count.sum()
+    table = np.maximum(1, np.rint(255 * middle)).astype(np.uint8)
+    return np.where(inside, table[binned], 0).astype(np.uint8)
+
+
+def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Means over 2 x 2 x 2 voxels; what is odd is filled up with its last layer."""
+    padded = np.pad(level, [(0, k % 2) for k in level.shape], mode="edge").astype(np.uint16)
+    total = padded[0::2] + padded[1::2]
+    total = total[:, 0::2] + total[:, 1::2]
+    total = total[:, :, 0::2] + total[:, :, 1::2]
+    return ((total + 4) // 8).astype(np.uint8)

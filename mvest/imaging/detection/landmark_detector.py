@@ -1,0 +1,97 @@
+"""Single points of the valve, each with trees of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.imaging.detection.boosting import Boosters
+from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.sampling import Pattern, features
+from mvest.imaging.detection.truth import Misses, TrueValve, missed_poses
+from mvest.imaging.detection.votes import consensus
+from mvest.imaging.landmarks import landmark_vertices
+from mvest.imaging.layout import ValveLayout
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["LandmarkDetector", "landmark_samples"]
+
+MISSES = Misses(0.0, 4.0, 0.03)
+START_MM = 4.0
+"""mm, standard deviation of each coordinate of candidates about a point, in training."""
+
+GRIDS_MM = (2.6, 1.3)
+"""mm between candidates in the first and second round."""
+
+
+def _pattern() -> Pattern:
+    rng = np.random.default_rng(4)
+    offsets = rng.standard_normal((130, 3)) * np.repeat([3.0, 7.0, 12.0], [50, 50, 30])[:, None]
+    return Pattern.paired(offsets, np.repeat([0, 1, 2], [50, 50, 30]), 70, 4)
+
+
+PATTERN = _pattern()
+
+
+def landmark_points(true: TrueValve, layout: ValveLayout) -> FloatArray:
+    """``(L, 3)`` mm, in the order of :data:`mvest.imaging.landmarks.LANDMARKS`."""
+    return np.concatenate([true.vertices[list(landmark_vertices(layout).values())], true.tips])
+
+
+def landmark_samples(
+    frame: StandardFrame,
+    true: TrueValve,
+    layout: ValveLayout,
+    which: int,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Candidates about one landmark, and where it lies from them ``(P, 3)`` in their axes."""
+    poses = missed_poses(true.pose, MISSES, count, rng)
+    point = landmark_points(true, layout)[which]
+    candidates = point + rng.standard_normal((count, 3)) * START_MM
+    gap = np.einsum("pij,pi->pj", poses.rotation, point - candidates)
+    return features(frame, PATTERN, candidates, poses.axes), gap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkDetector:
+    """Finds landmarks from where they are guessed to be.
+
+    Attributes
+    ----------
+    boosters : tuple of Boosters
+        One per landmark, three outputs: where it lies from a candidate, mm in the valve's axes.
+    """
+
+    boosters: tuple[Boosters, ...]
+
+    def __call__(
+        self, frame: StandardFrame, pose: Poses, points: FloatArray, which: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Landmarks ``(L, 3)`` mm, and how much votes for each disagree ``(L,)`` mm.
+
+        Parameters
+        ----------
+        pose : Poses
+            One.
+        points : (L, 3) mm
+            Guesses.
+        which : (L,)
+            Their numbers.
+        """
+        found, spread = np.array(points), np.zeros(len(points))
+        for step in GRIDS_MM:
+            ticks = step * np.arange(-2, 3)
+            grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
+            axes = np.broadcast_to(pose.axes, (len(grid), 3, 3))
+            for k, number in enumerate(which):
+                candidates = found[k] + grid @ pose.rotation[0].T
+                gap = self.boosters[number](features(frame, PATTERN, candidates, axes))
+                votes = candidates + gap @ pose.rotation[0].T
+                point, width = consensus(votes[None])
+                found[k], spread[k] = point[0], width[0]
+        return found, spread

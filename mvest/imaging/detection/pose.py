@@ -1,0 +1,131 @@
+"""Where a valve is, how it is turned and how large it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mvest.imaging.layout import ValveLayout
+from mvest.typing import BoolArray, FloatArray, IntArray
+
+__all__ = ["Poses", "pose_of", "rotation_grid"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Poses of P hypotheses (or frames).
+
+    Attributes
+    ----------
+    centre : (P, 3) mm
+        World position of the annulus' centre.
+    rotation : (P, 3, 3)
+        Columns are the valve's axes in world coordinates: x to the line between the leaflets at
+        phi = 0, y to the anterior side, z to the atrium.
+    log_scale : (P,)
+        Logarithm of the size over that of the mean valve.
+    """
+
+    centre: FloatArray
+    rotation: FloatArray
+    log_scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    def __getitem__(self, which: slice | IntArray | BoolArray | list[int]) -> Poses:
+        return Poses(self.centre[which], self.rotation[which], self.log_scale[which])
+
+    @property
+    def axes(self) -> FloatArray:
+        """``(P, 3, 3)`` axes with the scale."""
+        return np.asarray(self.rotation * np.exp(self.log_scale)[:, None, None])
+
+    def world(self, points: FloatArray) -> FloatArray:
+        """World positions ``(P, m, 3)`` mm of points ``(m, 3)`` or ``(P, m, 3)`` in own axes."""
+        return np.asarray(self.centre[:, None] + points @ np.swapaxes(self.axes, 1, 2))
+
+    def local(self, points: FloatArray) -> FloatArray:
+        """What :meth:`world` took: ``(P, m, 3)`` in the valve's axes, scale taken off."""
+        scale = np.exp(-self.log_scale)[:, None, None]
+        return np.asarray((points - self.centre[:, None]) @ self.rotation * scale)
+
+    def moved(self, by: FloatArray) -> Poses:
+        """Changed by ``(P, 7)``: shift (mm) and turn (rotation vector) in own axes, log scale."""
+        turn = Rotation.from_rotvec(by[:, 3:6]).as_matrix()
+        return Poses(
+            self.centre + np.einsum("pij,pj->pi", self.rotation, by[:, :3]),
+            self.rotation @ turn,
+            self.log_scale + by[:, 6],
+        )
+
+    def towards(self, other: Poses) -> FloatArray:
+        """``(P, 7)`` by which these poses are moved to become ``other``."""
+        shift = np.einsum("pij,pi->pj", self.rotation, other.centre - self.centre)
+        turn = Rotation.from_matrix(np.swapaxes(self.rotation, 1, 2) @ other.rotation).as_rotvec()
+        scale = other.log_scale - self.log_scale
+        return np.concatenate([shift, turn, scale[:, None]], axis=1)
+
+    def repeated(self, count: int) -> Poses:
+        """Every pose ``count`` times, one after another."""
+        return Poses(
+            *(np.repeat(v, count, 0) for v in (self.centre, self.rotation, self.log_scale))
+        )
+
+    @staticmethod
+    def joined(parts: list[Poses]) -> Poses:
+        """All poses of several."""
+        return Poses(
+            np.concatenate([p.centre for p in parts]),
+            np.concatenate([p.rotation for p in parts]),
+            np.concatenate([p.log_scale for p in parts]),
+        )
+
+
+def pose_of(
+    vertices: FloatArray, tips: FloatArray, layout: ValveLayout, size_mm: float = 1.0
+) -> Poses:
+    """The pose of one valve.
+
+    Parameters
+    ----------
+    vertices : (n, 3) mm
+    tips : (2, 3) mm
+    layout : ValveLayout
+    size_mm : float
+        Size of the mean valve: root mean square distance of the annulus from its centre.
+
+    Returns
+    -------
+    Poses
+        One: z along the annulus' normal away from the tips, x to phi = 0 as far as it is
+        perpendicular to z.
+    """
+    annulus = vertices[layout.annulus]
+    centre = annulus.mean(axis=0)
+    about = annulus - centre
+    z = np.linalg.svd(about, full_matrices=False)[2][2]
+    z = z if z @ (centre - tips.mean(axis=0)) > 0 else -z
+    x = annulus[0] - annulus[layout.column(180.0)]
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    size = np.sqrt((about**2).sum(axis=1).mean())
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    return Poses(centre[None], rotation[None], np.array([np.log(size / size_mm)]))
+
+
+def rotation_grid(count: int, seed: int = 0) -> FloatArray:
+    """``(count, 3, 3)`` rotations over all orientations, spread more evenly than random ones.
+
+    Drawn one after another, each the farthest of some candidates from those before it.
+    """
+    candidates = Rotation.random(4 * count, rng=np.random.default_rng(seed)).as_quat()
+    nearness = np.abs(candidates @ candidates[0])
+    chosen = [0]
+    for _ in range(count - 1):
+        k = int(np.argmin(nearness))
+        chosen.append(k)
+        nearness = np.maximum(nearness, np.abs(candidates @ candidates[k]))
+    return np.asarray(Rotation.from_quat(candidates[chosen]).as_matrix())

@@ -1,0 +1,142 @@
+"""How a valve lies: orientations are rated at every place, and the best ones refined step by step.
+
+Search in position first and in position, orientation and size then is the marginal space learning
+of Zheng et al. (IEEE Trans. Med. Imaging 27:1668, 2008); the refinement is a cascade of regressions
+from what is seen at a hypothesis to its error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.imaging.detection.boosting import Boosters
+from mvest.imaging.detection.frame import StandardFrame
+from mvest.imaging.detection.pose import Poses, rotation_grid
+from mvest.imaging.detection.sampling import Pattern, features
+from mvest.imaging.detection.shape_model import ShapeModel
+from mvest.imaging.detection.truth import Misses, TrueValve, missed_poses
+from mvest.typing import FloatArray
+
+__all__ = ["REFINEMENTS", "PoseSearch", "pose_error", "rating_samples", "refinement_samples"]
+
+ORIENTATIONS = 700
+"""Orientations tried at every place: neighbours are some 25 to 30 degrees apart."""
+
+REFINED = 24
+"""Hypotheses that are refined."""
+
+REFINEMENTS = (
+    Misses(7.0, 22.0, 0.12),
+    Misses(4.0, 12.0, 0.08),
+    Misses(2.2, 7.0, 0.05),
+)
+"""What each step of the cascade is trained to take back."""
+
+SCALE_MM = 6.0
+"""mm, a hypothesis' rating falls off over: exp(-error / SCALE)."""
+
+
+def _pattern(count: int, near: float, seed: int) -> Pattern:
+    """Samples about the annulus' centre, denser near the leaflets."""
+    rng = np.random.default_rng(seed)
+    offsets = rng.standard_normal((count, 3)) * np.array([15.0, 14.0, 13.0]) + [0, 0, -5.0]
+    radius = np.linalg.norm(offsets / np.array([20.0, 18.0, 16.0]), axis=1)
+    levels = np.where(radius > 1.6, 3, np.where(radius > near, 2, 1))
+    return Pattern.paired(offsets, levels, count // 2, seed)
+
+
+COARSE = _pattern(140, 0.3, 1)
+FINE = _pattern(220, 1.0, 2)
+
+
+def pose_error(poses: Poses, true: TrueValve, model: ShapeModel) -> FloatArray:
+    """``(P,)`` mm: mean distance of annulus and tips, laid by each pose, from where they belong."""
+    points = np.concatenate([model.mean[model.layout.annulus[::4]], model.tips])
+    gap = poses.world(points) - true.pose.world(points)
+    return np.asarray(np.linalg.norm(gap, axis=2).mean(axis=1))
+
+
+def rating_samples(
+    frame: StandardFrame,
+    true: TrueValve,
+    model: ShapeModel,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    fine: bool,
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Hypotheses from good to bad with ratings ``(P, 1)``.
+
+    With ``fine`` they are such as remain after refinement, else such as a grid of orientations at
+    likely places gives.
+    """
+    grid = rotation_grid(ORIENTATIONS)
+    kinds: tuple[Misses, ...]
+    if fine:
+        kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
+        parts = [missed_poses(true.pose, m, count // 4, rng) for m in kinds]
+    else:
+        kinds = (Misses(3.0, 10.0, 0.1), Misses(5.0, 22.0, 0.1))
+        parts = [missed_poses(true.pose, m, count // 4, rng) for m in kinds]
+    rest = count - sum(len(p) for p in parts)
+    far = missed_poses(true.pose, Misses(8.0, 0.0, 0.1), rest, rng)
+    parts.append(Poses(far.centre, grid[rng.integers(len(grid), size=rest)], far.log_scale))
+    poses = Poses.joined(parts)
+    # Some are where there is no valve at all.
+    stray = rng.random(len(poses)) < 0.1
+    centre = poses.centre + stray[:, None] * rng.standard_normal((len(poses), 3)) * 25.0
+    poses = Poses(centre, poses.rotation, poses.log_scale)
+    rating = np.exp(-pose_error(poses, true, model) / SCALE_MM)
+    pattern = FINE if fine else COARSE
+    return features(frame, pattern, poses.centre, poses.axes), rating[:, None]
+
+
+def refinement_samples(
+    frame: StandardFrame, true: TrueValve, step: int, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Poses missed as ``REFINEMENTS[step]`` says, and what takes each back ``(P, 7)``."""
+    poses = missed_poses(true.pose, REFINEMENTS[step], count, rng)
+    right = true.pose.repeated(count)
+    return features(frame, FINE, poses.centre, poses.axes), poses.towards(right)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSearch:
+    """Rates and refines poses.
+
+    Attributes
+    ----------
+    coarse, fine : Boosters
+        One output: the rating.
+    refine : tuple of Boosters
+        Seven outputs each: what takes the error back.
+    """
+
+    coarse: Boosters
+    fine: Boosters
+    refine: tuple[Boosters, ...]
+
+    def __call__(
+        self, frame: StandardFrame, places: FloatArray, count: int
+    ) -> tuple[Poses, FloatArray]:
+        """The best ``count`` poses at some places ``(P, 3)`` mm and their ratings, best first."""
+        grid = rotation_grid(ORIENTATIONS)
+        every = Poses(
+            np.repeat(places, len(grid), 0),
+            np.tile(grid, (len(places), 1, 1)),
+            np.zeros(len(places) * len(grid)),
+        )
+        rating = self.coarse(features(frame, COARSE, every.centre, every.axes))[:, 0]
+        best = np.argsort(-rating, kind="stable")[:REFINED]
+        return self.refined(frame, every[best], count)
+
+    def refined(self, frame: StandardFrame, poses: Poses, count: int) -> tuple[Poses, FloatArray]:
+        """Refine some poses; the best ``count`` of them and their ratings."""
+        for step in self.refine:
+            poses = poses.moved(step(features(frame, FINE, poses.centre, poses.axes)))
+        rating = self.fine(features(frame, FINE, poses.centre, poses.axes))[:, 0]
+        best = np.argsort(-rating, kind="stable")[:count]
+        return poses[best], rating[best]

@@ -1,0 +1,287 @@
+"""The valve in all frames of a volume: one trajectory through the hypotheses of every frame.
+
+Each frame has several hypotheses; the trajectory that is likely in every frame and moves no faster
+than a valve does is found by dynamic programming. What was fitted then is smoothed in time as far
+as each vertex was unsure, with a penalty on acceleration; a truncated Fourier series would flatten
+the closure itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mvest.errors import InputError
+from mvest.imaging.detection.detect import FitSettings, FrameValve, fit_frame, search_frame
+from mvest.imaging.detection.frame import StandardFrame, standard_frame
+from mvest.imaging.detection.model import DetectionModel
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
+from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.volume import VolumeSequence
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve", "smooth_in_time"]
+
+Landmarks = Mapping[int, Mapping[str, FloatArray]]
+"""Placed by hand: frame -> name -> world position (3,) mm."""
+
+
+class NoValveError(InputError):
+    """No frame of a volume shows a valve that the detectors believe in."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """How frames are joined.
+
+    Attributes
+    ----------
+    hypotheses : int
+        Of each frame's own search.
+    shared : int
+        Best ones of all frames that are tried in every frame.
+    speed_mm_s : float
+        Standard deviation of the speed at which a hypothesis moves (its annulus, in mm).
+    still_mm : float
+        Standard deviation of its change between frames however short their interval: errors.
+    smoothing_s : (float, float, float)
+        Times over which annulus, free edge and papillary tips are smoothed; 0: not at all.
+    least_confidence : float
+        Of the best frame: below it there is no valve.
+    fit : FitSettings
+    """
+
+    hypotheses: int = 3
+    shared: int = 3
+    speed_mm_s: float = 60.0
+    still_mm: float = 2.0
+    smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
+    least_confidence: float = 0.3
+    fit: FitSettings = field(default_factory=FitSettings)
+
+
+def detect_valve(
+    volume: VolumeSequence,
+    model: DetectionModel,
+    settings: TrackingSettings | None = None,
+    *,
+    landmarks: Landmarks | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ValveSequence:
+    """Find the valve in every frame of a volume.
+
+    Parameters
+    ----------
+    volume : VolumeSequence
+    model : DetectionModel
+    settings : TrackingSettings, optional
+    landmarks : mapping, optional
+        Placed by hand where the automatic ones failed; they stay where they are.
+    progress : callable, optional
+        Called with the number of frames done and of all.
+
+    Raises
+    ------
+    NoValveError
+        If no frame shows a valve with some confidence.
+    InputError
+        If a frame holds no image, or landmarks name no frame or point that there is.
+    """
+    told = settings or TrackingSettings()
+    by_hand = _checked(landmarks or {}, len(volume.times), model)
+    frames = [standard_frame(volume, k) for k in range(len(volume.times))]
+    poses = _trajectory(frames, np.asarray(volume.times), model, told, by_hand)
+    found: list[FrameValve] = []
+    for k, frame in enumerate(frames):
+        found.append(fit_frame(frame, model, poses[k : k + 1], told.fit, fixed=by_hand.get(k)))
+        if progress is not None:
+            progress(k + 1, len(frames))
+    confidence = np.array([valve.confidence for valve in found])
+    if confidence.max() < told.least_confidence:
+        raise NoValveError(
+            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
+            f"of {confidence.max():.2f}, expected at least {told.least_confidence:g} (a mitral "
+            "valve whole within the field of view, or landmarks placed by hand)"
+        )
+    sure = np.stack([valve.vertex_confidence for valve in found])
+    smooth = smooth_in_time(
+        np.asarray(volume.times),
+        np.stack([valve.vertices for valve in found]),
+        np.stack([valve.tips for valve in found]),
+        sure * confidence[:, None],
+        confidence,
+        model.shape.layout.s,
+        told.smoothing_s,
+    )
+    accuracy, layout = model.accuracy, model.shape.layout
+    return ValveSequence(
+        layout,
+        np.asarray(volume.times),
+        *smooth,
+        confidence,
+        sure,
+        np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
+        np.nan if accuracy is None else accuracy.correlation_length_mm,
+    )
+
+
+def _checked(
+    landmarks: Landmarks, frames: int, model: DetectionModel
+) -> dict[int, dict[int, FloatArray]]:
+    known = {name: k for k, name in enumerate(LANDMARKS)}
+    found: dict[int, dict[int, FloatArray]] = {}
+    for frame, points in landmarks.items():
+        if not 0 <= frame < frames:
+            raise InputError(f"landmarks of frame {frame}; the volume has frames 0 to {frames - 1}")
+        strange = [name for name in points if name not in known]
+        if strange:
+            raise InputError(
+                f"landmarks of frame {frame}: {', '.join(strange)}; expected some of "
+                f"{', '.join(known)}"
+            )
+        found[frame] = {known[name]: np.asarray(point, float) for name, point in points.items()}
+    return found
+
+
+def _trajectory(
+    frames: list[StandardFrame],
+    times: FloatArray,
+    model: DetectionModel,
+    told: TrackingSettings,
+    by_hand: Mapping[int, Mapping[int, FloatArray]],
+) -> Poses:
+    """One pose for every frame."""
+    own: list[tuple[Poses, FloatArray]] = []
+    for k, frame in enumerate(frames):
+        placed = _pose_by_hand(by_hand.get(k, {}), model)
+        if placed is None:
+            own.append(search_frame(frame, model, told.hypotheses))
+        else:
+            own.append((placed, np.ones(1)))
+    ratings = np.concatenate([rating for _, rating in own])
+    pool = Poses.joined([poses for poses, _ in own])
+    best = pool[_apart(pool, ratings, told.shared)]
+    candidates = []
+    for k, frame in enumerate(frames):
+        if _pose_by_hand(by_hand.get(k, {}), model) is not None:
+            candidates.append(own[k])
+            continue
+        again, rated = model.poses.refined(frame, best, len(best))
+        candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
+    path = _best_path(candidates, times, model, told)
+    return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
+
+
+def _apart(poses: Poses, ratings: FloatArray, count: int) -> IntArray:
+    """The best rated poses that are not about the same as a better one."""
+    kept: list[int] = []
+    for k in np.argsort(-ratings, kind="stable"):
+        turn = Rotation.from_matrix(np.swapaxes(poses.rotation[kept], 1, 2) @ poses.rotation[k])
+        gap = np.linalg.norm(poses.centre[kept] - poses.centre[k], axis=1)
+        if not kept or np.all((gap > 4.0) | (turn.magnitude() > np.deg2rad(15.0))):
+            kept.append(int(k))
+        if len(kept) == count:
+            break
+    return np.array(kept)
+
+
+def _best_path(
+    candidates: list[tuple[Poses, FloatArray]],
+    times: FloatArray,
+    model: DetectionModel,
+    told: TrackingSettings,
+) -> list[int]:
+    """The hypothesis of each frame on the likeliest trajectory (Viterbi)."""
+    points = np.concatenate([model.shape.mean[model.shape.layout.annulus[::4]], model.shape.tips])
+    where = [poses.world(points) for poses, _ in candidates]
+    cost = [-2 * np.log(np.clip(rating, 1e-3, 1.0)) for _, rating in candidates]
+    total, back = cost[0], []
+    for k in range(1, len(candidates)):
+        gap = where[k][:, None] - where[k - 1][None]
+        moved = np.linalg.norm(gap, axis=3).mean(axis=2)
+        std = np.hypot(told.still_mm, told.speed_mm_s * (times[k] - times[k - 1]))
+        # Bounded, so that one frame gone wrong does not drag the others along.
+        step = np.minimum(0.5 * (moved / std) ** 2, 8.0) + total[None]
+        back.append(np.argmin(step, axis=1))
+        total = cost[k] + step.min(axis=1)
+    path = [int(np.argmin(total))]
+    for pointer in reversed(back):
+        path.append(int(pointer[path[-1]]))
+    return path[::-1]
+
+
+def _pose_by_hand(points: Mapping[int, FloatArray], model: DetectionModel) -> Poses | None:
+    """The pose that lays the mean valve on landmarks, if there are four or more."""
+    if len(points) < 4:
+        return None
+    shape = model.shape
+    at = list(landmark_vertices(shape.layout).values())
+    from_ = np.concatenate([shape.mean[at], shape.tips])[list(points)]
+    to = np.stack(list(points.values()))
+    a, b = from_ - from_.mean(axis=0), to - to.mean(axis=0)
+    turn, _ = Rotation.align_vectors(b, a)
+    rotation = turn.as_matrix()
+    scale = float((b * (a @ rotation.T)).sum() / (a * a).sum())
+    centre = to.mean(axis=0) - scale * rotation @ from_.mean(axis=0)
+    return Poses(centre[None], rotation[None], np.log([max(scale, 0.3)]))
+
+
+def smooth_in_time(
+    times: FloatArray,
+    vertices: FloatArray,
+    tips: FloatArray,
+    vertex_weight: FloatArray,
+    frame_weight: FloatArray,
+    s: FloatArray,
+    smoothing_s: tuple[float, float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """Positions with little acceleration where they were not sure.
+
+    Parameters
+    ----------
+    times : (T,) s
+    vertices, tips : (T, n, 3), (T, 2, 3) mm
+    vertex_weight, frame_weight : (T, n), (T,)
+        How much each counts, relative to the others.
+    s : (n,)
+        0 at the annulus, 1 at the free edge.
+    smoothing_s : (float, float, float)
+        Times for annulus, free edge (in between: linear in s) and tips.
+
+    Returns
+    -------
+    vertices, tips
+    """
+    annulus, edge, tip = (max(float(t), 0.0) for t in smoothing_s)
+    length = (1 - s) * annulus + s * edge
+    smooth = _whittaker(times, vertices, vertex_weight, length)
+    weight = np.repeat(frame_weight[:, None], tips.shape[1], 1)
+    return smooth, _whittaker(times, tips, weight, np.full(tips.shape[1], tip))
+
+
+def _whittaker(
+    times: FloatArray, values: FloatArray, weight: FloatArray, length: FloatArray
+) -> FloatArray:
+    """Penalised least squares on second divided differences, for each column ``(T, m, 3)``.
+
+    Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt (Whittaker, Proc. Edinburgh Math. Soc.
+    41:63, 1923), so that what varies over much less than ``length`` (s) goes.
+    """
+    count = len(times)
+    if count < 3 or not np.any(length > 0):
+        return values
+    step = np.diff(times)
+    second = np.zeros((count - 2, count))
+    for k in range(count - 2):
+        a, b = step[k], step[k + 1]
+        second[k, k : k + 3] = np.array([1 / a, -1 / a - 1 / b, 1 / b]) * 2 / (a + b)
+    share = 0.5 * (np.concatenate([step, step[-1:]]) + np.concatenate([step[:1], step]))
+    bend = second.T @ (0.5 * (step[1:] + step[:-1])[:, None] * second)
+    weight = np.maximum(weight, 1e-3) / np.maximum(weight.mean(axis=0), 1e-3) * share[:, None]
+    matrix = length[:, None, None] ** 4 * bend + np.einsum("tm,tu->mtu", weight, np.eye(count))
+    right = np.swapaxes(weight[..., None] * values, 0, 1)
+    return np.asarray(np.swapaxes(np.linalg.solve(matrix, right), 0, 1))

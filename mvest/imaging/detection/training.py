@@ -1,0 +1,237 @@
+"""Learning the detectors from simulated volumes whose valves are known.
+
+Every volume is simulated, sampled for all stages at once and forgotten: guesses of every stage are
+missed by set amounts (each stage says which), so that no stage waits for the one before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeAlias
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import InputError
+from mvest.imaging.detection.boosting import Boosters, BoostSettings, train_boosters
+from mvest.imaging.detection.boundary import boundary_samples
+from mvest.imaging.detection.frame import StandardFrame, standard_frame
+from mvest.imaging.detection.landmark_detector import landmark_samples
+from mvest.imaging.detection.model import STAGES, DetectionModel
+from mvest.imaging.detection.pose_search import REFINEMENTS, rating_samples, refinement_samples
+from mvest.imaging.detection.position import position_samples
+from mvest.imaging.detection.rim_detector import rim_samples
+from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
+from mvest.imaging.detection.shape_start import shape_start_samples
+from mvest.imaging.detection.truth import TrueValve
+from mvest.imaging.landmarks import LANDMARKS
+from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.simulator import (
+    Acquisition,
+    draw_acquisition,
+    draw_probe,
+    simulate_volume,
+    true_sequence,
+)
+from mvest.typing import FloatArray
+
+__all__ = [
+    "RenderedFrame",
+    "SampleCounts",
+    "Samples",
+    "TrainingSettings",
+    "draw_samples",
+    "render_frame",
+    "train_model",
+]
+
+Setting: TypeAlias = Literal["training", "shifted"]
+"""Within the ranges that detectors are trained in, or outside of them."""
+
+Samples: TypeAlias = dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
+"""Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleCounts:
+    """Samples taken of one volume for each stage."""
+
+    position: int = 160
+    pose_rating: int = 120
+    pose_refinement: int = 70
+    shape: int = 60
+    landmark: int = 50
+    rim: int = 240
+    boundary: int = 720
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSettings:
+    """How detectors are trained.
+
+    Attributes
+    ----------
+    modes : int
+        Of the shape model.
+    samples : SampleCounts
+    boosting : BoostSettings
+    boundary_trees : int
+        For the boundary, which has the most samples.
+    volumes : int
+        Simulated: one frame each, of the valves in turn.
+    acquisition : Acquisition
+        About which the renderings vary.
+    """
+
+    modes: int = 40
+    samples: SampleCounts = field(default_factory=SampleCounts)
+    boosting: BoostSettings = field(default_factory=BoostSettings)
+    boundary_trees: int = 120
+    volumes: int = 240
+    acquisition: Acquisition = field(default_factory=Acquisition)
+
+
+def draw_samples(
+    frame: StandardFrame,
+    true: TrueValve,
+    model: ShapeModel,
+    counts: SampleCounts,
+    rng: np.random.Generator,
+) -> Samples:
+    """Samples of all stages from one frame."""
+    layout = model.layout
+    found: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
+        "position": position_samples(frame, true, counts.position, rng),
+        "pose_coarse": rating_samples(frame, true, model, counts.pose_rating, rng, fine=False),
+        "pose_fine": rating_samples(frame, true, model, counts.pose_rating, rng, fine=True),
+        "shape": shape_start_samples(frame, true, model, counts.shape, rng),
+        "annulus": rim_samples(frame, true, model, 0, counts.rim, rng),
+        "free_edge": rim_samples(frame, true, model, -1, counts.rim, rng),
+        "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
+    }
+    for k in range(len(REFINEMENTS)):
+        found[f"pose_refine_{k}"] = refinement_samples(frame, true, k, counts.pose_refinement, rng)
+    for k in range(len(LANDMARKS)):
+        found[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
+    return {name: (x, y.astype(np.float32)) for name, (x, y) in found.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrame:
+    """One simulated volume of one frame, and the valve in it.
+
+    Attributes
+    ----------
+    frame : StandardFrame
+    vertices : (n, 3) mm
+        In world coordinates, as are the tips.
+    tips : (2, 3) mm
+    acquisition : Acquisition
+    """
+
+    frame: StandardFrame
+    vertices: FloatArray
+    tips: FloatArray
+    acquisition: Acquisition
+
+
+def render_frame(
+    valve: MovingValve, which: int, base: Acquisition, spread: Setting, seed: np.random.SeedSequence
+) -> RenderedFrame:
+    """Simulate the volume of one frame of a valve, probe and rendering drawn at random."""
+    rng = np.random.default_rng(seed)
+    acquisition = draw_acquisition(rng, base, spread)
+    probe = draw_probe(rng, acquisition)
+    volume = simulate_volume(valve, acquisition, probe, int(rng.integers(2**31)), frames=[which])
+    true = true_sequence(valve, probe, [which])
+    return RenderedFrame(standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition)
+
+
+def _job(
+    valve: MovingValve, seed: np.random.SeedSequence, shape: ShapeModel, settings: TrainingSettings
+) -> Samples:
+    render, sample = seed.spawn(2)
+    which = int(np.random.default_rng(sample).integers(len(valve.times)))
+    seen = render_frame(valve, which, settings.acquisition, "training", render)
+    true = TrueValve.of(seen.vertices, seen.tips, shape)
+    return draw_samples(
+        seen.frame, true, shape, settings.samples, np.random.default_rng(sample.spawn(1)[0])
+    )
+
+
+def train_stage(
+    name: str,
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    settings: TrainingSettings,
+    seed: int,
+) -> Boosters:
+    """Trees of one stage from its samples."""
+    boosting = settings.boosting
+    if name == "boundary":
+        boosting = replace(boosting, trees=settings.boundary_trees)
+        return train_boosters(x, y.astype(np.float64), boosting, seed, "cross_entropy")
+    return train_boosters(x, y.astype(np.float64), boosting, seed)
+
+
+def train_model(
+    valves: Sequence[MovingValve],
+    settings: TrainingSettings,
+    seed: int,
+    *,
+    processes: int = 1,
+    trained_on: Mapping[str, Any] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> DetectionModel:
+    """Simulate volumes and learn all stages.
+
+    Parameters
+    ----------
+    valves : sequence of MovingValve
+        Of one layout.
+    settings : TrainingSettings
+    seed : int
+        The result depends on it and on no number of processes.
+    processes : int
+    trained_on : mapping, optional
+        Plain values that are kept with the model.
+    progress : callable, optional
+        Called with what is being done, how much is done and how much there is.
+
+    Raises
+    ------
+    InputError
+        If there is no valve, or fewer shapes than modes.
+    """
+    if not valves:
+        raise InputError("training: no valves")
+    tell = progress or (lambda what, done, all_: None)
+    shape = fit_shape_model(valves, settings.modes)
+    seeds = np.random.SeedSequence(seed).spawn(settings.volumes)
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
+        drawn = parallel(
+            joblib.delayed(_job)(valves[k % len(valves)], seeds[k], shape, settings)
+            for k in range(settings.volumes)
+        )
+        samples: list[Samples] = []
+        for k, found in enumerate(drawn):
+            samples.append(found)
+            tell("volumes", k + 1, settings.volumes)
+        grown = parallel(
+            joblib.delayed(train_stage)(
+                name,
+                np.concatenate([part[name][0] for part in samples]),
+                np.concatenate([part[name][1] for part in samples]),
+                settings,
+                seed + 1000 * number,
+            )
+            for number, name in enumerate(STAGES)
+        )
+        boosters = {}
+        for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
+            boosters[name] = found_boosters
+            tell("stages", k + 1, len(STAGES))
+    return DetectionModel(shape, boosters, dict(trained_on or {}))

@@ -1,0 +1,87 @@
+"""What a file states of a volume over time, before any of it is believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import InputError
+from mvest.imaging.volume import Modality
+from mvest.typing import FloatArray
+
+__all__ = ["FieldNames", "StatedTimes", "StatedVolume", "fault"]
+
+LONGEST_WORDS = 300
+"""Characters of a message that come from a file or from a library."""
+
+
+def fault(path: Path, field: str, found: object, expected: str) -> InputError:
+    """What to raise where a file's field is not what it must be, in one line."""
+    words = " ".join(str(found).split())
+    if len(words) > LONGEST_WORDS:
+        words = words[:LONGEST_WORDS] + " ..."
+    return InputError(f"{path}: {field}: {words}, expected {expected}")
+
+
+@dataclass(frozen=True, slots=True)
+class FieldNames:
+    """How the format calls what a message may be about.
+
+    Attributes
+    ----------
+    size, spacing, direction, origin, values : str
+    """
+
+    size: str
+    spacing: str
+    direction: str
+    origin: str
+    values: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StatedTimes:
+    """When the frames were taken, as far as a file says.
+
+    Attributes
+    ----------
+    values : (T,) or None
+        In `unit`; None where the file says nothing.
+    unit : str
+        As the file writes it; empty where it does not.
+    field : str
+        Where they stand, or where they would.
+    """
+
+    values: FloatArray | None
+    unit: str
+    field: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StatedVolume:
+    """Frames with their place in space and time as a file states them.
+
+    Attributes
+    ----------
+    frames : (T, I, J, K)
+        Numbers of any type, in any order of memory.
+    steps : (3, 3) mm
+        Its columns lead from one voxel to the next along i, j and k, in LPS.
+    origin : (3,) mm
+        Centre of voxel (0, 0, 0), in LPS.
+    times : StatedTimes
+    modality : Modality or None
+        None where the file does not say.
+    names : FieldNames
+    """
+
+    frames: NDArray[np.generic]
+    steps: FloatArray
+    origin: FloatArray
+    times: StatedTimes
+    modality: Modality | None
+    names: FieldNames

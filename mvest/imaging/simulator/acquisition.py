@@ -1,0 +1,174 @@
+"""How a simulated echo volume is acquired: every setting of the rendering, with its unit.
+
+Levels in dB are of amplitude, relative to the root mean square of fully developed speckle of an
+echo strength of 0 dB, seen face on and without attenuation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from mvest.errors import InputError
+
+__all__ = ["SMALL", "SPEED_OF_SOUND", "Acquisition"]
+
+SPEED_OF_SOUND = 1540.0
+"""m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """One setting of the simulated scanner. Where no source is named, a value is a choice.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+        Centre of the band; transoesophageal matrix probes work at 3 to 8 MHz.
+    axial_mm, lateral_deg, elevation_deg : float
+        Full width at half maximum of the amplitude of a point's image: along, and in the two
+        directions across the beam (these in degrees, so that they grow with depth).
+    side_lobe_db : float
+        First side lobes of the beam under its main lobe.
+    azimuth_deg, elevation_span_deg : float
+        Full opening of the pyramid.
+    depth_mm : (float, float)
+        Distance from the apex of the nearest and the farthest sample.
+    dynamic_range_db, gain_db : float
+        Grey levels 0 to 255 show ``-dynamic_range_db - gain_db`` to ``-gain_db``.
+    attenuation_db_per_cm_mhz, blood_attenuation_db_per_cm_mhz : float
+        One way, of tissue (0.5) and blood (0.15 to 0.2) (Duck, Physical Properties of Tissue,
+        1990).
+    compensation_db_per_cm_mhz : float
+        One way, what the time gain compensation makes good; it also amplifies electronic noise.
+    shadow_db_per_cm : float
+        One way, added in dense tissue (parts of the annulus), so that it casts shadows.
+    angle_exponent, angle_floor_db : float
+        Walls and leaflets send the share ``floor + (1 - floor) |n . beam|^exponent`` of their echo.
+    dropout : float
+        Share of the leaflets in patches that send hardly any echo, 0 to 0.6.
+    dropout_db : float
+        Echo within such patches, under the leaflets' own.
+    blood_db, electronics_db, haze_db : float
+        Noise: of blood (blurred as tissue is), of the electronics (at the nearest depth), and of
+        reverberations close to the probe.
+    haze_mm : float
+        Over which reverberations fade by a factor e.
+    contact_db : float
+        Standard deviation of the smooth variation of gain between directions.
+    wall_db, leaflet_db, annulus_db, chord_db, papillary_db, vessel_db : float
+        Echo strengths.
+    beats : int
+        Sub-sectors in azimuth, one per heart beat, from which the volume is stitched.
+    beat_shift_mm, beat_turn_deg : float
+        Standard deviation of each component by which the scene is displaced and turned in a beat.
+    scatterers_per_cell : float
+        In a resolution cell at the depth of the valve; at least 10 give fully developed speckle
+        (Wagner et al., IEEE Trans. Sonics Ultrason. 30, 1983).
+    voxel_mm : float
+        Edge of the cubic voxels.
+    shape : (int, int, int)
+        Voxels along azimuth, elevation and depth.
+
+    Raises
+    ------
+    InputError
+        If a setting is not finite or has no meaning.
+    """
+
+    frequency_mhz: float = 5.0
+    axial_mm: float = 0.9
+    lateral_deg: float = 1.9
+    elevation_deg: float = 2.4
+    side_lobe_db: float = -28.0
+    azimuth_deg: float = 84.0
+    elevation_span_deg: float = 76.0
+    depth_mm: tuple[float, float] = (4.0, 116.0)
+    dynamic_range_db: float = 50.0
+    gain_db: float = 0.0
+    attenuation_db_per_cm_mhz: float = 0.5
+    blood_attenuation_db_per_cm_mhz: float = 0.15
+    compensation_db_per_cm_mhz: float = 0.17
+    shadow_db_per_cm: float = 20.0
+    angle_exponent: float = 1.5
+    angle_floor_db: float = -22.0
+    dropout: float = 0.1
+    dropout_db: float = -20.0
+    blood_db: float = -49.0
+    electronics_db: float = -63.0
+    haze_db: float = -22.0
+    haze_mm: float = 7.0
+    contact_db: float = 2.0
+    wall_db: float = -17.0
+    leaflet_db: float = -3.0
+    annulus_db: float = -3.0
+    chord_db: float = -9.0
+    papillary_db: float = -18.0
+    vessel_db: float = -10.0
+    beats: int = 4
+    beat_shift_mm: float = 0.4
+    beat_turn_deg: float = 0.5
+    scatterers_per_cell: float = 10.0
+    voxel_mm: float = 0.7
+    shape: tuple[int, int, int] = (160, 128, 160)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if not math.isfinite(number):
+                    self._refuse(field.name, "a finite number")
+        for name in (
+            "frequency_mhz", "axial_mm", "dynamic_range_db", "scatterers_per_cell", "voxel_mm",
+            "haze_mm",
+        ):  # fmt: skip
+            if not getattr(self, name) > 0:
+                self._refuse(name, "> 0")
+        for name in (
+            "attenuation_db_per_cm_mhz", "blood_attenuation_db_per_cm_mhz", "shadow_db_per_cm",
+            "compensation_db_per_cm_mhz", "angle_exponent", "contact_db", "beat_shift_mm",
+            "beat_turn_deg",
+        ):  # fmt: skip
+            if not getattr(self, name) >= 0:
+                self._refuse(name, ">= 0")
+        for name in ("side_lobe_db", "angle_floor_db", "dropout_db"):
+            if not getattr(self, name) <= 0:
+                self._refuse(name, "<= 0 dB")
+        for name in ("azimuth_deg", "elevation_span_deg"):
+            if not 10 <= getattr(self, name) <= 120:
+                self._refuse(name, "10 to 120 degrees")
+        for name, span in (
+            ("lateral_deg", self.azimuth_deg),
+            ("elevation_deg", self.elevation_span_deg),
+        ):
+            if not 0.2 <= getattr(self, name) <= span / 4:
+                self._refuse(name, "0.2 degrees to a quarter of the opening")
+        if not 0 <= self.dropout <= 0.6:
+            self._refuse("dropout", "0 to 0.6")
+        if len(self.depth_mm) != 2 or not 0 < self.depth_mm[0] < self.depth_mm[1]:
+            self._refuse("depth_mm", "two increasing distances > 0")
+        if self.axial_mm > (self.depth_mm[1] - self.depth_mm[0]) / 4:
+            self._refuse("axial_mm", "a quarter of the depth range at most")
+        if not 1 <= self.beats <= 12:
+            self._refuse("beats", "1 to 12")
+        if len(self.shape) != 3 or min(self.shape) < 8:
+            self._refuse("shape", "three numbers of voxels >= 8")
+
+    def _refuse(self, name: str, expected: str) -> None:
+        raise InputError(f"acquisition {name} = {getattr(self, name)}, expected {expected}")
+
+    @property
+    def wave_number(self) -> float:
+        """2 pi over the wavelength, rad/mm."""
+        return 2e3 * math.pi * self.frequency_mhz / SPEED_OF_SOUND
+
+
+SMALL = Acquisition(
+    axial_mm=2.2,
+    lateral_deg=4.0,
+    elevation_deg=5.0,
+    depth_mm=(4.0, 100.0),
+    voxel_mm=2.0,
+    shape=(48, 40, 48),
+)
+"""Coarse and fast, for tests."""

@@ -1,0 +1,251 @@
+"""Echoes in the coordinates of the beams: distance, azimuth and elevation.
+
+A direction is (tan a, tan e, 1) along azimuth, elevation and beam. The signal is complex baseband:
+a scatterer at distance r adds its amplitude times ``exp(2 i k r)``, blurred by the point spread
+function, which is separable in distance and the two angles (linear image formation, as in Gao et
+al., IEEE Trans. Ultrason. Ferroelectr. Freq. Control 56, 2009).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.imaging.simulator._beam_kernels import (
+    add_losses,
+    add_noise,
+    blur_across,
+    deposit,
+    envelope,
+)
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.scene import Echoes
+from mvest.typing import FloatArray
+
+__all__ = ["Axis", "BeamGrid", "Losses", "render_window"]
+
+Float32Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Axis:
+    """Samples along one coordinate of the beams, with the blur along it.
+
+    Attributes
+    ----------
+    start, step : float
+        First sample and spacing, mm or rad.
+    count : int
+        Samples shown; the blur also needs ``margin`` more at either end.
+    kernel : (2 margin + 1,) float32
+        Blur of the samples, such that a point spread over its two neighbours by linear weights gets
+        the amplitude 1 and the full width at half maximum wanted.
+    energy : float
+        Integral of the squared amplitude of a point's image, mm or rad.
+    """
+
+    start: float
+    step: float
+    count: int
+    kernel: Float32Array
+    energy: float
+
+    @property
+    def margin(self) -> int:
+        """Half width of the kernel."""
+        return len(self.kernel) // 2
+
+
+PER_WIDTH_ACROSS, PER_WIDTH_ALONG = 2.2, 2.5
+LOBES = ((1.45, 1.0, -1.0), (2.3, 0.5, 1.0))
+"""Side lobes: distance over the full width, level over the first one's, sign."""
+
+
+def _axis(low: float, high: float, width: float, lobe_db: float, per_width: float) -> Axis:
+    count = max(2, math.ceil((high - low) / width * per_width) + 1)
+    step = (high - low) / (count - 1)
+    sigma = width / math.sqrt(8 * math.log(2))
+    # Linear weights have variance step^2 / 6, which the kernel leaves out.
+    narrow = math.sqrt(sigma**2 - step**2 / 6)
+    level = 10 ** (lobe_db / 20)
+    reach = 3 * sigma if level < 1e-6 else (LOBES[-1][0] + 0.6) * width
+    margin = math.ceil(reach / step)
+
+    def shape(x: FloatArray, spread: float) -> FloatArray:
+        total = np.exp(-0.5 * (x / spread) ** 2)
+        if level >= 1e-6:
+            for place, share, sign in LOBES:
+                for side in (-1, 1):
+                    lobe = np.exp(-0.5 * ((x - side * place * width) / (0.8 * spread)) ** 2)
+                    total += sign * share * level * lobe
+        return np.asarray(total)
+
+    kernel = sigma / narrow * shape(np.arange(-margin, margin + 1, dtype=np.float64) * step, narrow)
+    fine = np.linspace(-4 * width, 4 * width, 4001)
+    energy = float((shape(fine, sigma) ** 2).sum() * (fine[1] - fine[0]))
+    return Axis(low, step, count, kernel.astype(np.float32), energy)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamGrid:
+    """The samples of an acquisition.
+
+    Attributes
+    ----------
+    acquisition : Acquisition
+    azimuth, elevation, distance : Axis
+        rad, rad, mm.
+    """
+
+    acquisition: Acquisition
+    azimuth: Axis
+    elevation: Axis
+    distance: Axis
+
+    @classmethod
+    def of(cls, a: Acquisition) -> BeamGrid:
+        """The grid that samples an acquisition's point spread function well enough."""
+        half_a, half_e = math.radians(a.azimuth_deg) / 2, math.radians(a.elevation_span_deg) / 2
+        lateral, elevation = math.radians(a.lateral_deg), math.radians(a.elevation_deg)
+        return cls(
+            a,
+            _axis(-half_a, half_a, lateral, a.side_lobe_db, PER_WIDTH_ACROSS),
+            _axis(-half_e, half_e, elevation, a.side_lobe_db, PER_WIDTH_ACROSS),
+            _axis(*a.depth_mm, a.axial_mm, -math.inf, PER_WIDTH_ALONG),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Samples along azimuth, elevation and distance."""
+        return self.azimuth.count, self.elevation.count, self.distance.count
+
+    def windows(self) -> list[tuple[int, int]]:
+        """First and past the last azimuth of each beat."""
+        edges = np.linspace(0, self.azimuth.count, self.acquisition.beats + 1).round().astype(int)
+        return [(a, b) for a, b in pairwise(edges.tolist())]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Losses:
+    """What is lost on the way to a sample and back, on a coarse grid over the whole pyramid.
+
+    Attributes
+    ----------
+    decibel : (A, E, D) float32
+        Two-way, beyond that of blood.
+    start, step : (3,)
+        Of azimuth and elevation (rad) and distance (mm).
+    """
+
+    decibel: Float32Array
+    start: FloatArray
+    step: FloatArray
+
+    @classmethod
+    def of(cls, grid: BeamGrid, echoes: Echoes, contact: FloatArray) -> Losses:
+        """Attenuation by the scatterers' tissue, summed along each beam.
+
+        Parameters
+        ----------
+        grid : BeamGrid
+        echoes : Echoes
+        contact : (p, q) dB
+            Gain over the pyramid, at directions evenly spaced from edge to edge.
+        """
+        axes = (grid.azimuth, grid.elevation, grid.distance)
+        wide = (2.2, 2.2, 3.0)
+        reach = np.array([(x.count + 2 * x.margin) * x.step for x in axes])
+        start = np.array([x.start - x.margin * x.step for x in axes])
+        count = [math.ceil(r / (w * x.step)) + 1 for r, w, x in zip(reach, wide, axes, strict=True)]
+        step = reach / (np.array(count) - 1)
+        start[2] = max(start[2], 0.5 * step[2])
+        loss = np.zeros(count, dtype=np.float32)
+        add_losses(loss, echoes.points, echoes.loss, start, step)
+        # mm to cm, there and back; of the own cell half.
+        path = (0.2 * step[2]) * (np.cumsum(loss, axis=2) - 0.5 * loss)
+        p, q = (np.linspace(0, n - 1, m) for n, m in zip(contact.shape, count[:2], strict=True))
+        i, j = (
+            np.minimum(v.astype(int), n - 2) for v, n in zip((p, q), contact.shape, strict=True)
+        )
+        x, y = (p - i)[:, None], (q - j)[None]
+        gain = (1 - x) * (1 - y) * contact[i][:, j] + (1 - x) * y * contact[i][:, j + 1]
+        gain += x * (1 - y) * contact[i + 1][:, j] + x * y * contact[i + 1][:, j + 1]
+        return cls((path - gain[..., None]).astype(np.float32), start, step)
+
+
+def render_window(
+    grid: BeamGrid,
+    echoes: Echoes,
+    losses: Losses,
+    window: tuple[int, int],
+    rng: np.random.Generator,
+) -> Float32Array:
+    """Envelope of the signal in the azimuths of one beat ``(a, E, D)``, 1 being 0 dB.
+
+    Parameters
+    ----------
+    grid : BeamGrid
+    echoes : Echoes
+        As displaced in this beat.
+    losses : Losses
+    window : (int, int)
+        First and past the last azimuth.
+    rng : numpy Generator
+        Of the noise.
+    """
+    a = grid.acquisition
+    az, el, along = grid.azimuth, grid.elevation, grid.distance
+    first = window[0] - az.margin
+    shape = (
+        window[1] - window[0] + 2 * az.margin,
+        el.count + 2 * el.margin,
+        2,
+        along.count + 2 * along.margin,
+    )
+    start = np.array(
+        [
+            az.start + first * az.step,
+            el.start - el.margin * el.step,
+            along.start - along.margin * along.step,
+        ]
+    )
+    step = np.array([az.step, el.step, along.step])
+    distance = start[2] + step[2] * np.arange(shape[3])
+    signal = _noise(rng, shape)
+    level = _blood(a, distance) / np.prod([np.linalg.norm(x.kernel) for x in (az, el, along)])
+    add_noise(signal, level, start, step, losses.decibel, losses.start, losses.step)
+    gain_per_mm = (
+        0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
+    )
+    energy = az.energy * el.energy * along.energy
+    deposit(
+        signal, echoes.points, echoes.amplitude / math.sqrt(energy), 2 * a.wave_number, gain_per_mm,
+        start, step, losses.decibel, losses.start, losses.step,
+    )  # fmt: skip
+    signal = blur_across(signal, az.kernel, el.kernel)
+    compensation = 0.2 * a.frequency_mhz * a.compensation_db_per_cm_mhz
+    hiss = 10 ** ((a.electronics_db + compensation * (distance - along.start)) / 20)
+    hiss /= math.sqrt(2) * np.linalg.norm(along.kernel)
+    signal += hiss.astype(np.float32) * rng.standard_normal(signal.shape, dtype=np.float32)
+    return np.asarray(envelope(signal, along.kernel))
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32Array:
+    """Real and imaginary parts of complex Gaussian noise of mean power 1."""
+    noise = rng.standard_normal(shape, dtype=np.float32)
+    noise *= np.float32(math.sqrt(0.5))
+    return noise
+
+
+def _blood(a: Acquisition, distance: FloatArray) -> FloatArray:
+    """Amplitude of noise from blood and reverberations over distance, after compensation."""
+    gain = (
+        0.2 * a.frequency_mhz * (a.compensation_db_per_cm_mhz - a.blood_attenuation_db_per_cm_mhz)
+    )
+    blood = 10 ** ((a.blood_db + gain * distance) / 20)
+    haze = 10 ** (a.haze_db / 20) * np.exp(-np.maximum(distance - a.depth_mm[0], 0) / a.haze_mm)
+    return np.asarray(np.hypot(blood, haze))

@@ -1,0 +1,37 @@
+"""Simulated valves in motion: what detectors learn from and are tested on.
+
+Closures of :mod:`mvest.model`, on anatomies around given ones, as
+:class:`mvest.imaging.moving_valve.MovingValve`.
+"""
+
+from mvest.simulated_motion.closing import MotionSettings, close_in_motion
+from mvest.simulated_motion.files import load_population, save_population
+from mvest.simulated_motion.patient import (
+    IMAGED,
+    ImagedPatient,
+    simulate_imaged_patient,
+)
+from mvest.simulated_motion.population import (
+    Population,
+    PopulationSettings,
+    draw_population,
+    population_hash,
+)
+from mvest.simulated_motion.refusal import MotionLimits, Refusal, RefusedError
+
+__all__ = [
+    "IMAGED",
+    "ImagedPatient",
+    "MotionLimits",
+    "MotionSettings",
+    "Population",
+    "PopulationSettings",
+    "Refusal",
+    "RefusedError",
+    "close_in_motion",
+    "draw_population",
+    "load_population",
+    "population_hash",
+    "save_population",
+    "simulate_imaged_patient",
+]

@@ -1,0 +1,25 @@
+"""A valve that moves in a made-up way: from the open template half way to its intended closure."""
+
+import numpy as np
+
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.valve.template import Template
+
+FRAMES = 3
+
+
+def made_up_valve() -> MovingValve:
+    template, layout = Template(), ValveLayout()
+    valve = template.valve(layout.columns, layout.rows)
+    still, s = valve.surface.vertices, layout.s
+    share = 0.5 * np.linspace(0, 1, FRAMES)[:, None, None]
+    inward = np.stack([0 * s, -0.8 * s * still[:, 1], 0.3 * s * still[:, 2]], axis=1)
+    tips = valve.papillary_tips + np.array([0.0, 0.0, 2.0]) * share
+    phi = np.array(template.parameters.chordae.marginal_phi)
+    phi = np.mod(np.concatenate([phi, 180 - phi]), 360)
+    return MovingValve(
+        "made up", layout, 0.04 * np.arange(FRAMES), still + share * inward, tips,
+        template.thickness(layout.phi, s), phi, np.full(len(phi), 0.97),
+        np.repeat([0, 1], len(phi) // 2),
+    )  # fmt: skip

@@ -1,0 +1,88 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.simulator import SMALL, Acquisition, draw_acquisition
+from mvest.imaging.simulator.spread import SHIFTED, TRAINING, Range, Spread
+
+# Echo strengths and compensation may be those of training in both.
+BOTH = {"wall_db", "chord_db", "papillary_db", "vessel_db", "compensation_db_per_cm_mhz"}
+
+
+def test_the_wavelength_follows_from_1540_m_per_s():
+    # 5 MHz: 0.308 mm.
+    assert 2 * math.pi / Acquisition(frequency_mhz=5.0).wave_number == pytest.approx(0.308)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("frequency_mhz", 0.0),
+        ("axial_mm", -1.0),
+        ("axial_mm", 40.0),
+        ("lateral_deg", 0.0),
+        ("elevation_deg", 30.0),
+        ("azimuth_deg", 150.0),
+        ("dropout", 0.7),
+        ("dropout_db", 3.0),
+        ("side_lobe_db", 1.0),
+        ("attenuation_db_per_cm_mhz", -0.1),
+        ("dynamic_range_db", 0.0),
+        ("blood_db", math.nan),
+        ("depth_mm", (50.0, 20.0)),
+        ("depth_mm", (0.0, 20.0)),
+        ("beats", 0),
+        ("voxel_mm", 0.0),
+        ("shape", (4, 40, 40)),
+        ("shape", (40, 40)),
+    ],
+)
+def test_a_setting_without_meaning_is_refused_by_name(setting, value):
+    with pytest.raises(InputError, match=f"acquisition {setting} = .*expected"):
+        replace(SMALL, **{setting: value})
+
+
+def test_shifted_acquisitions_lie_outside_of_all_training_ranges():
+    training = {r.setting: r for r in TRAINING.ranges}
+    assert {r.setting for r in SHIFTED.ranges} == set(training)
+    for entry in SHIFTED.ranges:
+        assert entry.how == training[entry.setting].how
+        ((low, high),) = training[entry.setting].intervals
+        outside = [b < low or a > high for a, b in entry.intervals]
+        assert all(outside) or entry.setting in BOTH, entry.setting
+
+
+@pytest.mark.parametrize("spread", [TRAINING, SHIFTED])
+def test_what_is_drawn_lies_in_the_ranges_and_fills_them(spread):
+    rng, base = np.random.default_rng(0), Acquisition()
+    drawn = [draw_acquisition(rng, base, spread.name) for _ in range(200)]
+    for entry in spread.ranges:
+        before = getattr(base, entry.setting)
+        values = np.array([getattr(a, entry.setting) for a in drawn])
+        values = values / before if entry.how == "times" else values - before
+        inside = [(values >= a - 1e-9) & (values <= b + 1e-9) for a, b in entry.intervals]
+        assert np.all(np.any(inside, axis=0)), entry.setting
+        assert all(np.any(i) for i in inside), entry.setting
+        width = entry.intervals[-1][1] - entry.intervals[0][0]
+        assert np.ptp(values) > 0.8 * width, entry.setting
+    assert {a.shape for a in drawn} == {base.shape}
+
+
+def test_unknown_spreads_and_settings_are_refused():
+    with pytest.raises(InputError, match="spread 'wild', expected training or shifted"):
+        draw_acquisition(np.random.default_rng(0), spread="wild")
+    with pytest.raises(InputError, match="range of 'colour'"):
+        Range("colour", "plus", ((0.0, 1.0),))
+    with pytest.raises(InputError, match="range of 'beats'"):
+        Range("beats", "plus", ((0.0, 1.0),))
+    with pytest.raises(InputError, match="intervals"):
+        Range("gain_db", "plus", ((1.0, 0.0),))
+
+
+def test_a_draw_that_makes_no_sense_is_refused_not_clipped():
+    nonsense = Spread("nonsense", (Range("dropout", "plus", ((-1.0, -0.9),)),))
+    with pytest.raises(InputError, match="dropout"):
+        draw_acquisition(np.random.default_rng(0), SMALL, nonsense)

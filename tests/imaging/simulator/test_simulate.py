@@ -1,0 +1,148 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from mvest.errors import InputError
+from mvest.imaging.simulator import SMALL, Probe, draw_probe, simulate_volume, true_sequence
+from mvest.imaging.simulator.chambers import make_heart
+from mvest.imaging.simulator.parts import make_parts
+from mvest.imaging.simulator.scene import make_scene
+from mvest.imaging.simulator.simulate import _displacements
+from tests.imaging.simulator.made_up_valve import made_up_valve
+
+VALVE = made_up_valve()
+# Half way tilted, and world axes that are none of the probe's or the valve's.
+AXES = Rotation.from_euler("xyz", [35, 80, -20], degrees=True).as_matrix()
+TILTED = Rotation.from_euler("xz", [155, 40], degrees=True).as_matrix()
+APEX = np.array([40.0, -10.0, 25.0])
+PROBE = Probe(AXES @ TILTED, APEX + AXES @ [2.0, -1.0, 50.0], APEX, AXES[:, 2], AXES[:, 0])
+STILL = replace(SMALL, beat_shift_mm=0.0, beat_turn_deg=0.0, contact_db=0.0)
+
+
+def seen(volume, world, frame=0):
+    index = np.moveaxis(volume.index(world), -1, 0)
+    return map_coordinates(volume.frames[frame].astype(float), index, order=1)
+
+
+def test_leaflets_are_bright_where_the_truth_says_in_every_frame():
+    volume = simulate_volume(VALVE, STILL, PROBE, 3)
+    truth = true_sequence(VALVE, PROBE)
+    assert volume.frames.shape == (3, *SMALL.shape)
+    assert volume.frames.dtype == np.uint8
+    np.testing.assert_array_equal(volume.times, VALVE.times)
+    for k in range(3):
+        bright = seen(volume, truth.vertices[k], k).mean()
+        # As a mirror image, or in another place, they would not be.
+        mirrored = PROBE.to_world(VALVE.vertices[k] * [1, -1, 1] + [0, 8, 0])
+        blood = PROBE.to_world(VALVE.vertices[k] * 0.2 + [0, -3, 10])
+        assert bright > 110
+        assert bright > seen(volume, mirrored, k).mean() + 30
+        assert seen(volume, blood, k).mean() < 60
+
+
+def test_the_truth_is_the_valve_in_the_world():
+    truth = true_sequence(VALVE, PROBE, [0, 2])
+    np.testing.assert_allclose(truth.vertices[1], PROBE.to_world(VALVE.vertices[2]))
+    np.testing.assert_allclose(truth.tips[1], PROBE.to_world(VALVE.tips[2]))
+    np.testing.assert_array_equal(truth.times, VALVE.times[[0, 2]])
+
+
+def test_a_seed_gives_one_volume_whichever_frames_are_asked_for():
+    both = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[0, 2])
+    last = simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2])
+    np.testing.assert_array_equal(both.frames[1], last.frames[0])
+    assert simulate_volume(VALVE, SMALL, PROBE, 7, frames=[2]).sha256 == last.sha256
+    assert simulate_volume(VALVE, SMALL, PROBE, 8, frames=[2]).sha256 != last.sha256
+    assert "simulated" in last.source
+
+
+def test_beats_that_are_not_displaced_leave_no_seam():
+    # What is stitched from four sub-sectors must be what one sweep gives, but for the noise.
+    quiet = replace(STILL, blood_db=-200.0, electronics_db=-200.0, haze_db=-200.0)
+    stitched = simulate_volume(VALVE, quiet, PROBE, 1, frames=[0]).frames.astype(int)
+    swept = simulate_volume(VALVE, replace(quiet, beats=1), PROBE, 1, frames=[0]).frames
+    assert np.abs(stitched - swept).max() <= 1
+
+
+def test_beats_are_displaced_about_the_truth():
+    rng = np.random.default_rng(0)
+    acquisition = replace(SMALL, beats=4, beat_shift_mm=0.7, beat_turn_deg=2.0)
+    drawn = [_displacements(acquisition, PROBE, rng) for _ in range(300)]
+    shift = np.array([[beat[2] for beat in beats] for beats in drawn])
+    np.testing.assert_allclose(shift.mean(axis=1), 0, atol=1e-12)
+    # Three of four are free.
+    assert shift.std() == pytest.approx(0.7 * np.sqrt(3 / 4), rel=0.05)
+    turn = Rotation.from_matrix([beat[0] for beats in drawn for beat in beats])
+    assert np.rad2deg(turn.as_rotvec().std()) == pytest.approx(2, rel=0.05)
+    np.testing.assert_allclose(drawn[0][0][1], [2, -1, 50], atol=1e-9)
+    seam = simulate_volume(VALVE, replace(SMALL, beat_shift_mm=3.0), PROBE, 1, frames=[0])
+    plain = simulate_volume(VALVE, replace(SMALL, beat_shift_mm=0.0), PROBE, 1, frames=[0])
+    assert np.mean(seam.frames != plain.frames) > 0.05
+
+
+def test_dropouts_darken_the_share_wanted_of_the_leaflets():
+    rng = np.random.default_rng(0)
+    heart = make_heart(VALVE, PROBE.apex_in_valve, rng)
+    for dropout in (0.0, 0.3):
+        acquisition = replace(SMALL, dropout=dropout, dropout_db=-40.0)
+        leaflet = make_parts(VALVE, heart, acquisition, rng)[0]
+        assert leaflet.material.name == "leaflet"
+        dark = leaflet.strength(leaflet.sow(rng, 4000)) < 0.15
+        assert dark.mean() == pytest.approx(dropout, abs=0.07)
+
+
+def test_tissue_is_as_dense_and_attenuates_as_much_as_set():
+    acquisition = replace(SMALL, frequency_mhz=4.0, shadow_db_per_cm=0.0)
+    scene = make_scene(VALVE, acquisition, PROBE, np.random.default_rng(0))
+    wall = next(k for k, p in enumerate(scene.parts) if p.material.name == "wall")
+    volume = scene.parts[wall].volume
+    # (0.5 - 0.15) dB/cm/MHz at 4 MHz.
+    assert scene.losses[wall].sum() == pytest.approx(1.4 * volume, rel=1e-6)
+    distance = np.linalg.norm(PROBE.apex_in_valve)
+    cell = 2.2 * np.deg2rad(4.0) * np.deg2rad(5.0) * distance**2
+    assert len(scene.seeds[wall]) * cell / volume == pytest.approx(10, rel=0.01)
+    dense = make_scene(
+        VALVE, replace(acquisition, shadow_db_per_cm=30.0), PROBE, np.random.default_rng(0)
+    )
+    more = [b.sum() > a.sum() for a, b in zip(scene.losses, dense.losses, strict=True)]
+    assert [p.material.name for p, m in zip(scene.parts, more, strict=True) if m] == ["annulus"]
+
+
+def test_the_heart_tells_front_from_back_and_leaves_room_for_the_probe():
+    rng = np.random.default_rng(0)
+    phi = VALVE.layout.phi[VALVE.layout.annulus]
+    annulus = VALVE.vertices[0, VALVE.layout.annulus]
+    for _ in range(20):
+        probe = draw_probe(rng)
+        heart = make_heart(VALVE, probe.apex_in_valve, rng)
+        gap = np.linalg.norm(heart.ventricle[0, 0] - annulus, axis=1)
+        assert gap[phi == 90] > 18
+        assert gap[(phi > 200) & (phi < 340)].max() < 4
+        # The aorta's back wall stands on the front of the annulus.
+        apart = np.linalg.norm(heart.aorta[0] - annulus[phi == 90], axis=-1)
+        assert apart.min() < 3
+        for k in range(2):
+            np.testing.assert_allclose(heart.muscles[k][:, 0], VALVE.tips[:, k])
+        # All the atrium lies in front of the probe, if not further off than its wall could be.
+        assert probe.to_probe(heart.atrium[0])[..., 2].min() > -15
+        sight = heart.atrium[0] - probe.apex_in_valve
+        assert np.linalg.norm(sight, axis=-1).min() > 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, "seed"),
+        ({"frames": []}, "frames"),
+        ({"frames": [0, 3]}, "0 to 2"),
+        ({"frames": [1, 0]}, "increasing"),
+        ({"probe": Probe(np.eye(3), np.array([0.0, 0.0, -50.0]))}, "along the beam"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(change, message):
+    arguments = {"valve": VALVE, "acquisition": SMALL, "probe": PROBE, "seed": 0, **change}
+    with pytest.raises(InputError, match=message):
+        simulate_volume(**arguments)
