@@ -15,6 +15,7 @@ from mvest.simulated_motion.population import (
     Population,
     PopulationSettings,
     draw_population,
+    draw_tip_motion,
     population_hash,
 )
 from mvest.simulated_motion.refusal import MotionLimits, Refusal, RefusedError
@@ -30,6 +31,7 @@ __all__ = [
     "RefusedError",
     "close_in_motion",
     "draw_population",
+    "draw_tip_motion",
     "load_population",
     "population_hash",
     "save_population",

@@ -24,7 +24,13 @@ from mvest.typing import FloatArray
 from mvest.valve.template import Template, TemplateParameters
 from mvest.valve.variation import vary
 
-__all__ = ["Population", "PopulationSettings", "draw_population", "population_hash"]
+__all__ = [
+    "Population",
+    "PopulationSettings",
+    "draw_population",
+    "draw_tip_motion",
+    "population_hash",
+]
 
 MOST_DRAWS = 20
 """Valves drawn in a row until one closes."""
@@ -189,7 +195,7 @@ def _draw(
         values["pressure_scale"] = _factor(settings.pressure_spread, rng)
         values["chord_rest_length"] = _factor(settings.chord_rest_length_spread, rng)
         duration = settings.motion.duration * _factor(settings.duration_spread, rng)
-        tip_motion = _tip_motion(template, settings.tip_motion, rng)
+        tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
         motion = replace(settings.motion, duration=duration)
         try:
             return close_in_motion(name, template, values, motion, mechanics, tip_motion), reasons
@@ -202,12 +208,19 @@ def _factor(spread: float, rng: np.random.Generator) -> float:
     return float(np.exp(spread * rng.standard_normal()))
 
 
-def _tip_motion(
+def draw_tip_motion(
     template: Template, reach: tuple[float, float], rng: np.random.Generator
 ) -> FloatArray:
     """Where open tips are relative to closed ones ``(2, 3)`` mm: nearer to their insertions.
 
     Farther away, chordae would be taut in the open valve, which is to be free of stress.
+
+    Parameters
+    ----------
+    template : Template
+    reach : (float, float)
+        mm, range of the distance.
+    rng : numpy.random.Generator
     """
     direction = rng.standard_normal((2, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

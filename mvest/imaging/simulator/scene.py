@@ -14,7 +14,7 @@ from mvest.imaging.simulator.probe import Probe
 from mvest.imaging.simulator.tissue import Part
 from mvest.typing import FloatArray
 
-__all__ = ["Echoes", "Scene", "make_scene"]
+__all__ = ["Echoes", "Scene", "cell_volume", "make_scene"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
