@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import lightgbm
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,6 +75,8 @@ class Boosters:
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
+        import lightgbm  # here, as it takes a second that studies without images need not wait
+
         checked = [checked_trees(text, source) for text in texts]
         self.texts, self._source = tuple(text for text, _ in checked), source
         counts = {features for _, features in checked}
@@ -123,6 +124,8 @@ def train_boosters(
     objective : str
         ``regression`` (least squares), or ``cross_entropy`` (probability; labels from 0 to 1).
     """
+    import lightgbm
+
     data = lightgbm.Dataset(
         x,
         label=np.ascontiguousarray(y[:, 0]),

@@ -48,7 +48,7 @@ class FitSettings:
         Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
     """
 
-    modes: tuple[int, ...] = (10, 12, 12)
+    modes: tuple[int, ...] = (14, 25, 40)
     reach_mm: tuple[float, ...] = (6.0, 4.0, 3.0)
     alike: float = 8.0
     stiffness: float = 4.0
