@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.model import STAGES, DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.truth import TrueValve
@@ -22,6 +23,9 @@ from mvest.valve.template import Template
 from tests.made_up_sequence import leaflets
 
 LAYOUT = ValveLayout(16, 7)
+FIT = FitSettings((10, 12, 12), (6.0, 4.0, 3.0))
+"""No more modes than the small shape model has."""
+
 TIPS = np.array([Template().parameters.tips, Template().parameters.tips]) * [[1, 1, 1], [-1, 1, 1]]
 
 

@@ -7,11 +7,12 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection.boundary import leaflet_axes
-from mvest.imaging.detection.detect import FitSettings, fit_frame, search_frame
+from mvest.imaging.detection.detect import fit_frame, search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.truth import TrueValve
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from tests.imaging.detection.made_up import (
+    FIT,
     LAYOUT,
     NumberedFrame,
     moving_valve,
@@ -47,7 +48,7 @@ def test_the_search_finds_the_pose(shape, true):
 def test_the_fit_arrives_at_the_true_valve(shape, true):
     # Pulls along wrong normals, or coefficients lost between rounds, stop short of it.
     model = oracle_model(shape, [true])
-    found = fit_frame(NumberedFrame(), model, true.pose.moved(MISSED))
+    found = fit_frame(NumberedFrame(), model, true.pose.moved(MISSED), FIT)
     assert mean_gap(found.stages["pose"], true.vertices) > 2.0
     assert mean_gap(found.vertices, true.vertices) < 0.3
     np.testing.assert_allclose(found.tips, true.tips, atol=1e-3)
@@ -69,7 +70,7 @@ def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypa
             NumberedFrame(),
             oracle_model(shape, [other]),
             other.pose.moved(MISSED),
-            replace(FitSettings(), stiffness=stiffness, hold=0.001),
+            replace(FIT, stiffness=stiffness, hold=0.001),
         )
         off = leaflet_axes(x, LAYOUT)[:, :, 2]
         fitted = list(found.stages.values())[-1]
@@ -82,14 +83,14 @@ def test_what_the_model_cannot_show_is_taken_up_at_the_end(shape, true, monkeypa
 
 
 def test_vertices_are_pose_and_coefficients_up_to_the_free_displacement(shape, true):
-    found = fit_frame(NumberedFrame(), oracle_model(shape, [true]), true.pose.moved(MISSED))
+    found = fit_frame(NumberedFrame(), oracle_model(shape, [true]), true.pose.moved(MISSED), FIT)
     fitted = found.pose.world(shape.shape(found.coefficients[None]))[0]
     assert mean_gap(found.vertices, fitted) < 0.3
 
 
 def test_a_given_start_is_begun_with(shape, true):
     b = shape.coefficients(true.pose.local(true.vertices[None]))[0]
-    found = fit_frame(NumberedFrame(), oracle_model(shape, [true]), true.pose, coefficients=b)
+    found = fit_frame(NumberedFrame(), oracle_model(shape, [true]), true.pose, FIT, coefficients=b)
     np.testing.assert_allclose(
         found.stages["shape start"], true.pose.world(shape.shape(b[None, :8]))[0], atol=1e-9
     )
@@ -102,7 +103,7 @@ def test_a_landmark_placed_by_hand_stays_where_it_was_put(shape, true, name):
     vertex = landmark_vertices(LAYOUT)[name]
     by_hand = true.vertices[vertex] + 3.0 * true.pose.rotation[0][:, 2]
     found = fit_frame(
-        NumberedFrame(), oracle_model(shape, [true]), true.pose, fixed={number: by_hand}
+        NumberedFrame(), oracle_model(shape, [true]), true.pose, FIT, fixed={number: by_hand}
     )
     assert np.linalg.norm(found.vertices[vertex] - by_hand) < 0.5
     far = np.linalg.norm(true.vertices - true.vertices[vertex], axis=1) > 15
@@ -115,6 +116,7 @@ def test_a_tip_placed_by_hand_is_the_tip(shape, true):
         NumberedFrame(),
         oracle_model(shape, [true]),
         true.pose,
+        FIT,
         fixed={LANDMARKS.index("tip_180"): by_hand},
     )
     np.testing.assert_array_equal(found.tips[1], by_hand)
@@ -127,6 +129,7 @@ def test_with_all_landmarks_by_hand_none_is_looked_for(shape, true):
         NumberedFrame(),
         oracle_model(shape, [true]),
         true.pose.moved(MISSED),
+        FIT,
         fixed=dict(enumerate(points)),
     )
     np.testing.assert_array_equal(found.tips, true.tips)
@@ -134,7 +137,7 @@ def test_with_all_landmarks_by_hand_none_is_looked_for(shape, true):
 
 
 def test_the_confidence_is_that_of_the_pose_rating(shape, true):
-    found = fit_frame(NumberedFrame(), oracle_model(shape, [true], best=0.4), true.pose)
+    found = fit_frame(NumberedFrame(), oracle_model(shape, [true], best=0.4), true.pose, FIT)
     assert 0.3 < found.confidence <= 0.4
 
 
@@ -144,5 +147,5 @@ def test_more_modes_than_the_model_has_are_refused(shape, true):
             NumberedFrame(),
             oracle_model(shape, [true]),
             true.pose,
-            replace(FitSettings(), modes=(10, 15, 12)),
+            replace(FIT, modes=(10, 15, 12)),
         )

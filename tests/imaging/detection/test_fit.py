@@ -85,6 +85,18 @@ def test_one_coefficient_shrinks_as_the_analytic_solution_says(shape, monkeypatc
     assert again[0] == pytest.approx(expected, abs=2e-3 * mode_std)
 
 
+def test_modes_grow_with_the_valve(shape):
+    # A valve half as large again: a pull is as many coefficients less, in a single step.
+    pose = poses(1, 5)
+    pose = Poses(pose.centre, pose.rotation, np.log([1.5]))
+    b = np.zeros(5)
+    b[0] = 0.3 * shape.std[0]
+    target = pose.world(shape.shape(b[None]))[0]
+    found_pose, found = fit_shape(shape, pose, 0 * b, to_all(shape, pose, 0 * b, target, 0.5))
+    same_pose(found_pose, pose, 0.05, 0.005)
+    np.testing.assert_allclose(found, b, atol=0.03 * b[0])
+
+
 def test_a_prior_keeps_what_is_not_seen_at_the_mean(shape):
     # Nothing but weak pulls: coefficients return towards zero.
     pose, b = poses(1, 5), 1.0 * shape.std[:6]

@@ -99,13 +99,12 @@ def test_a_grid_of_rotations_covers_all_orientations():
     np.testing.assert_allclose(np.linalg.det(grid), 1.0, atol=1e-9)
     np.testing.assert_allclose(grid @ np.swapaxes(grid, 1, 2), np.tile(np.eye(3), (300, 1, 1)),
                                atol=1e-9)  # fmt: skip
-    some = Rotation.random(300, rng=np.random.default_rng(5)).as_matrix()
+    some = Rotation.random(600, rng=np.random.default_rng(5)).as_matrix()
 
-    def gaps(of):
+    def gap(of):
         trace = np.einsum("aij,bij->ab", some, of)
-        return np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1))).min(axis=1)
+        return np.rad2deg(np.arccos(np.clip((trace - 1) / 2, -1, 1))).min(axis=1).max()
 
-    even, random = gaps(grid), gaps(Rotation.random(300, rng=np.random.default_rng(6)).as_matrix())
-    assert even.max() < 45
-    assert even.max() < random.max()
+    # Drawn at random as many leave gaps of 40 to 48 degrees.
+    assert gap(grid) < 34
     np.testing.assert_array_equal(grid, rotation_grid(300))

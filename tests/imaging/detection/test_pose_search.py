@@ -56,6 +56,14 @@ def test_the_search_finds_the_pose_from_places_nearby(shape, true):
     assert pose_error(again, true, shape)[0] < 1.0
 
 
+def test_the_coarse_rating_alone_is_near_already(shape, true):
+    # Without refinement what the grid of orientations has: the best rated, not the worst.
+    places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0]])
+    found, _ = search(shape, true, 0.0)(NumberedFrame(), places, 10)
+    assert np.all(pose_error(found, true, shape) < 16.0)
+    assert pose_error(found, true, shape)[0] < 8.0
+
+
 def test_refinement_takes_back_a_share_at_every_step(shape, true):
     # One step skipped, or a step applied in world axes, leaves more than this.
     start = true.pose.moved(np.array([[6.0, -4.0, 3.0, 0.3, -0.2, 0.3, 0.1]]))

@@ -62,6 +62,19 @@ def test_the_rim_moves_to_where_votes_say_it_is(shape, row, monkeypatch):
     np.testing.assert_allclose(axes, rim_axes(guess.vertices, LAYOUT, row % LAYOUT.rows))
 
 
+def test_a_second_round_takes_back_what_the_first_left(shape, monkeypatch):
+    # Votes that see three quarters of the way: one round leaves a quarter, two a sixteenth.
+    monkeypatch.setattr(rim_detector, "features", geometry)
+    guess = placed(shape, poses(1, 3), np.zeros(2))
+    axes = rim_axes(guess.vertices, LAYOUT, 0)
+    vertices = guess.vertices.copy()
+    vertices[LAYOUT.annulus] += 3.0 * axes[:, :, 1]
+    right = rim_oracle([TrueValve(vertices, guess.tips, guess.pose)], LAYOUT, 0)
+    short = RimDetector(0, Oracle(2, lambda x: 0.75 * right(x)))
+    _, offset, _ = short(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    np.testing.assert_allclose(offset[:, 0], 3.0, atol=3.0 / 16 + 0.05)
+
+
 def test_some_wrong_votes_are_outvoted_and_told_by_the_spread(shape, monkeypatch):
     monkeypatch.setattr(rim_detector, "features", geometry)
     guess = placed(shape, poses(1, 3), np.zeros(2))

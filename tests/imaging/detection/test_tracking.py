@@ -1,5 +1,7 @@
 """All frames together: the consistent path, smoothing in time, landmarks by hand, no valve."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from mvest.imaging.detection.tracking import (
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection.made_up import (
+    FIT,
     LAYOUT,
     NumberedFrame,
     oracle_model,
@@ -25,7 +28,8 @@ from tests.imaging.detection.made_up import (
 )
 
 TIMES = np.array([0.0, 0.03, 0.05, 0.09])
-UNSMOOTHED = TrackingSettings(smoothing_s=(0.0, 0.0, 0.0))
+TOLD = TrackingSettings(fit=FIT)
+UNSMOOTHED = replace(TOLD, smoothing_s=(0.0, 0.0, 0.0))
 
 
 @pytest.fixture
@@ -83,31 +87,31 @@ def test_the_valve_is_found_in_every_frame(shape, truths):
 def test_what_was_measured_of_a_model_goes_with_the_sequence(shape, truths):
     n = LAYOUT.size
     accuracy = Accuracy(np.linspace(1, 2, n), 7.5, np.zeros((1, 2, n, 3)), np.zeros((1, 2, 2, 3)))
-    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy))
+    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy), TOLD)
     np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
     assert found.correlation_length_mm == 7.5
 
 
 def test_smoothing_of_a_steady_motion_leaves_it_where_it_is(shape, truths):
-    found = detect_valve(volume(), oracle_model(shape, truths))
+    found = detect_valve(volume(), oracle_model(shape, truths), TOLD)
     for k, true in enumerate(truths):
         assert np.linalg.norm(found.vertices[k] - true.vertices, axis=1).mean() < 0.5
 
 
 def test_a_single_frame_is_enough(shape, truths):
-    found = detect_valve(volume(1), oracle_model(shape, truths))
+    found = detect_valve(volume(1), oracle_model(shape, truths), TOLD)
     assert np.linalg.norm(found.vertices[0] - truths[0].vertices, axis=1).mean() < 0.35
 
 
 def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     with pytest.raises(NoValveError, match="no valve") as told:
-        detect_valve(volume(), oracle_model(shape, truths, best=0.05))
+        detect_valve(volume(), oracle_model(shape, truths, best=0.05), TOLD)
     message = str(told.value)
     assert "made up.nrrd" in message
     assert "0.0" in message
     assert "\n" not in message
     detect_valve(volume(), oracle_model(shape, truths, best=0.05),
-                 TrackingSettings(least_confidence=0.01))  # fmt: skip
+                 replace(TOLD, least_confidence=0.01))  # fmt: skip
 
 
 # --- by hand ------------------------------------------------------------------------------------
@@ -126,7 +130,7 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
 )
 def test_landmarks_by_hand_are_checked(shape, truths, landmarks, message):
     with pytest.raises(tracking.InputError, match=message) as told:
-        detect_valve(volume(), oracle_model(shape, truths), landmarks=landmarks)
+        detect_valve(volume(), oracle_model(shape, truths), TOLD, landmarks=landmarks)
     assert "\n" not in str(told.value)
 
 
@@ -165,7 +169,7 @@ def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
     assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
     by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
     found = detect_valve(
-        volume(), model, TrackingSettings(smoothing_s=(0.0,) * 3, least_confidence=0.0),
+        volume(), model, replace(UNSMOOTHED, least_confidence=0.0),
         landmarks=by_hand,
     )  # fmt: skip
     np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)
