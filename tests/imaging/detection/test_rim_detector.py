@@ -6,6 +6,7 @@ import pytest
 from mvest.imaging.detection import rim_detector
 from mvest.imaging.detection.rim_detector import RimDetector, rim_axes, rim_samples
 from mvest.imaging.detection.truth import TrueValve
+from mvest.imaging.layout import ValveLayout
 from tests.imaging.detection.made_up import (
     LAYOUT,
     TIPS,
@@ -44,6 +45,15 @@ def test_the_annulus_side_away_from_the_leaflet_is_outside_the_orifice():
     assert axes[middle, 1, 1] > 0.2  # towards the anterior side
     edge = rim_axes(leaflets(LAYOUT, 0.0), LAYOUT, LAYOUT.rows - 1)
     assert edge[middle, 2, 1] < -0.2  # towards the ventricle
+
+
+def test_away_is_the_direction_in_which_the_leaflet_ends():
+    # Closed leaflets hang down where they touch, whatever their direction at the annulus.
+    fine = ValveLayout(64, 15)
+    edge = rim_axes(leaflets(fine, 1.0), fine, fine.rows - 1)
+    for phi in (90.0, 270.0):
+        assert edge[fine.column(phi), 2, 1] < -0.95
+        assert rim_axes(leaflets(fine, 1.0), fine, 0)[fine.column(phi), 2, 1] < 0.9
 
 
 @pytest.mark.parametrize("row", [0, -1])

@@ -32,6 +32,7 @@ def test_the_boundary_is_a_probability(trained, shape, seen_valve, settings):
     found = trained.boosters["boundary"](x * 3)
     assert found.min() >= 0
     assert found.max() <= 1
+    assert "objective=cross_entropy" in trained.boosters["boundary"].texts[0]
 
 
 def test_a_stage_learns_from_its_samples(shape, seen_valve, settings):
