@@ -141,7 +141,7 @@ class ImagingStore:
 
     def __init__(self, config: Values) -> None:
         imaging = config["imaging"]
-        self.folder = Path(config["paths"]["outputs"]) / "imaging"
+        self.folder = Path(config["paths"]["outputs"]) / "detectors"
         self.processes = int(imaging["processes"])
         self.seed = int(config["seed"])
         self.training = build(TrainingSettings, imaging["training"])

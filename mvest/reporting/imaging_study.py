@@ -100,11 +100,14 @@ def imaging_text(record: Record) -> str:
     if record["rows"]:
         table = imaging_table(record["rows"])
         for _, row in table.iterrows():
+            share = f"valve found in {row['valve found [%]']:.0f} % of {row['volumes']} volumes"
+            if not row["valve found [%]"] > 0:
+                lines.append(f"  {row['setting']}: {share}")
+                continue
             lines.append(
                 f"  {row['setting']}: surface {row['surface mean [mm]']:.2f} mm on average, "
                 f"{row['surface median [mm]']:.2f} median, {row['surface 90 % [mm]']:.2f} at 90 %; "
-                f"valve found in {row['valve found [%]']:.0f} % of {row['volumes']} volumes; "
-                f"{row['time per volume [s]']:.1f} s each"
+                f"{share}; {row['time per volume [s]']:.1f} s each"
             )
         lines += [f"  {line}" for line in imaging_words(table, record["targets"])]
     return "\n".join([*lines, *(f"  {line}" for line in study_words(record))])
