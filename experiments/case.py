@@ -149,9 +149,16 @@ def _told(frame: Frame) -> str:
 
 
 def run_case(
-    config: Values, config_hash: str, folder: Path, started: float
+    config: Values,
+    config_hash: str,
+    folder: Path,
+    started: float,
+    about: Values | None = None,
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Read a case and personalise it: its record; fields and report are written."""
+    """Read a case and personalise it: its record; fields and report are written.
+
+    ``about`` is added to the record, before the report is.
+    """
     fields = folder / "fields.npz"
     # Of an earlier run: there are none where nothing is found now.
     fields.unlink(missing_ok=True)
@@ -163,7 +170,7 @@ def run_case(
     store = Path(config["paths"]["outputs"]) / "meshes"
     with SolveBar(case.name, steps, TYPICAL_SOLVES) as bar:
         found = personalise(case, settings, store=store, on_step=bar.step)
-    record = case_record(config, found, config_hash, started)
+    record = {**case_record(config, found, config_hash, started), **(about or {})}
     files: list[Path] = []
     if found.distances:
         np.savez_compressed(fields, **fields_of(found))

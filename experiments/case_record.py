@@ -101,6 +101,7 @@ def case_record(
         else [v if np.isfinite(v) else None for v in result.filtered.objective.tolist()],
         "innovation": innovation,
         "narrow": _narrow(found),
+        "image_errors": _image_errors(found),
         "measurements": _measurements(found),
         "confirmed_mm": found.confirmed_mm,
         "gate": None
@@ -314,6 +315,21 @@ def _narrow(found: Personalised) -> list[dict[str, Any]]:
         if what != "now"
         for k, name in enumerate(moduli)
     ]
+
+
+def _image_errors(found: Personalised) -> dict[str, Any] | None:
+    """What errors of the frames that the model was built from do to the estimate."""
+    if found.geometry is None:
+        return None
+    moduli = [name for name in found.names if name.startswith("E_f.")]
+    share = found.image_share
+    return {
+        "samples": found.geometry.asked,
+        "failures": list(found.geometry.failures),
+        "share_of_variance": None
+        if share is None
+        else dict(zip(moduli, map(float, share), strict=True)),
+    }
 
 
 def _measurements(found: Personalised) -> dict[str, Any]:

@@ -96,6 +96,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.surface_observation",
     ),
     "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
+    "mvest.imaged_case": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.imaging",
+        "mvest.imaged_valve",
+        "mvest.cases",
+    ),
     "mvest.reporting": (
         *LEAVES,
         "mvest.provenance",

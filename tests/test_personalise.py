@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role, Uncertainty
-from mvest.errors import InputError
+from mvest.cases.case import ErrorSamples, Role, Uncertainty
+from mvest.errors import GeometryError, InputError
 from mvest.estimation import Prediction, observation_noise
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ClosureProtocol
+from mvest.observation_errors import SpatialCorrelation
 from mvest.personalise import (
     CaseMesh,
     PaperSettings,
@@ -29,6 +30,7 @@ from tests.made_up_closure import (
     MECHANICS,
     PRIORS,
     TRUE,
+    VALVE,
     MadeUpClosure,
     made_up_case,
     settings,
@@ -528,3 +530,97 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
     for distance in result.distances:
         assert distance.personalised.max() < 1e-3
         assert distance.generic.mean() > 0.1
+
+
+# --- errors of the geometry ---------------------------------------------------------------------
+
+
+def seen_in_error(case, count=12, std=0.4, seed=3):
+    """The case with samples of smooth errors, the same in both frames and in the tips."""
+    rng = np.random.default_rng(seed)
+    n, f = len(case.surface.vertices), len(case.frames)
+    L = SpatialCorrelation(case.surface.vertices, 12.0).factor
+    each = std * np.einsum("nk,skd->snd", L, rng.standard_normal((count, n, 3)))
+    tips = std * rng.standard_normal((count, 1, 2, 3))
+    return replace(
+        case,
+        error_samples=ErrorSamples(np.repeat(each[:, None], f, axis=1), np.repeat(tips, f, axis=1)),
+    )
+
+
+def use_geometry(monkeypatch, *, fails=()):
+    """The formula, moved along with the open shape twice as far as this is moved."""
+    use(monkeypatch)
+    rest = VALVE.surface.vertices
+
+    def build(case, wanted, store=None):
+        model = MadeUpClosure(MODULI)
+        call = model.__call__
+        moved = 2.0 * (case.surface.vertices - rest)
+
+        def predict(m):
+            if np.abs(moved).max() > 0 and next(numbers) in fails:
+                return Prediction.failed("no equilibrium")
+            found = call(m[:2])
+            y = found.y + np.concatenate([np.zeros(moved.size), moved.ravel()])
+            return Prediction(y, found.jacobian)
+
+        return predict
+
+    numbers = iter(range(10**6))
+    monkeypatch.setattr("mvest.personalise.geometry_errors.build_coarse", build)
+
+
+@pytest.mark.parametrize(("correspondence", "std"), [(True, 0.3), (False, 0.02)])
+def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence, std):
+    use_geometry(monkeypatch)
+    case = made_up_case(std, 8.0, np.random.default_rng(1), displaced=False)
+    wanted = settings(*right_nuisances(), correspondence=correspondence)
+    plain = personalise(case, wanted)
+    told = personalise(seen_in_error(case, std=4 * std), wanted)
+    assert plain.image_share is None
+    assert plain.geometry is None
+    assert told.result.converged
+    assert np.all(told.result.std > 1.5 * plain.result.std)
+    assert np.all((told.image_share > 0.5) & (told.image_share <= 1.0))
+    exact = told.narrower["geometry known exactly"]
+    np.testing.assert_allclose(exact, plain.narrower["now"], rtol=0.4)
+    np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
+
+
+def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
+    # Prediction and frame move as one: nothing is learnt or lost by it.
+    use_geometry(monkeypatch)
+    case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
+    chain = _Chain(case, settings(*right_nuisances()), None, None)
+    chain.sample_geometry(chain.shared(chain.shared.start).y)
+    each = case.error_samples.vertices[:, 1]
+    np.testing.assert_allclose(chain.geometry.predicted, 2.0 * each, atol=1e-9)
+    np.testing.assert_allclose(chain.errors.samples.T, each.reshape(len(each), -1), atol=1e-9)
+
+
+def test_samples_that_do_not_close_are_counted_and_too_many_of_them_are_an_error(monkeypatch):
+    case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
+    use_geometry(monkeypatch, fails=(1, 5, 7))
+    found = personalise(case, settings(*right_nuisances()))
+    assert [text.split(":")[0] for text in found.geometry.failures] == [
+        "sample 1", "sample 5", "sample 7"
+    ]  # fmt: skip
+    assert (found.geometry.asked, len(found.geometry.predicted)) == (12, 9)
+    use_geometry(monkeypatch, fails=(1, 5, 7, 8))
+    with pytest.raises(GeometryError, match=r"4 of 12 error samples do not close.*no equilibrium"):
+        personalise(case, settings(*right_nuisances()))
+
+
+def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
+    use_geometry(monkeypatch)
+    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    given = [
+        replace(u, treatment=Treatment.CONSIDERED) if u.name == "shift.z" else u
+        for u in (*right_nuisances(), Unknown("shift.z", 0.0, 1.0))
+    ]
+    found = personalise(case, settings(*given, moduli_only=True))
+    assert std_of(found, "shift.z") == pytest.approx(1.0)
+    assert found.result.estimate[2] == 0.0
+    assert found.moduli_only.parameters == MODULI
+    assert np.all(found.moduli_only.std > 0)

@@ -163,8 +163,8 @@ class ErrorSamples:
             if len(bad):
                 where = tuple(bad[0].tolist())
                 raise InputError(
-                    f"error samples, {name}: {values[where]} mm at {where}, expected a displacement "
-                    f"of at most {LARGEST_ERROR:g} mm"
+                    f"error samples, {name}: {values[where]} mm at {where}, expected a "
+                    f"displacement of at most {LARGEST_ERROR:g} mm"
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
@@ -259,6 +259,12 @@ class ValveCase:
         if samples is None:
             return
         f, t = len(self.frames), len(self.frame(Role.REFERENCE).papillary_tips)
+        names = self.surface.region_names
+        if self.chordae_follow and (len(names) != 2 or "anterior" not in names or t != 2):
+            raise InputError(
+                f"case {self.name}: chordae that follow error samples need two regions, one of "
+                f"them anterior, and two papillary tips (here: {', '.join(names)}; {t} tips)"
+            )
         for name, found, wanted in (
             ("vertices", samples.vertices.shape[1:3], (f, n)),
             ("tips", samples.tips.shape[1:3], (f, t)),

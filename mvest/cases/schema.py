@@ -134,8 +134,8 @@ class ChordaeEntry(_Model):
     follow: bool = Field(
         False,
         strict=True,
-        description="true or false: laid out by a program as in the template, so that they are laid "
-        "out anew for every error sample",
+        description="true or false: laid out by a program as in the template, so that they are "
+        "laid out anew for every error sample",
     )
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.errors import GeometryError
 from mvest.estimation import (
+    Estimate,
     Filter,
     Gaussian,
     IteratedFilter,
@@ -22,10 +24,17 @@ from mvest.estimation import (
     kalman_update,
     observation_noise,
 )
+from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation import Observation
 from mvest.observation_errors import SpatialCorrelation
+from mvest.personalise.geometry_errors import (
+    GeometryErrors,
+    WeighedObservation,
+    errors_of,
+    sample_geometry,
+)
 from mvest.personalise.model import build_model
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
@@ -62,7 +71,8 @@ def personalise(
 ) -> Personalised:
     """Estimate the unknowns of a case.
 
-    Numerical failure is part of the result, with its reason; only inadmissible input raises.
+    Numerical failure is part of the result, with its reason; only inadmissible input raises: among
+    it are error samples of which more than a quarter are no valve that closes.
 
     Parameters
     ----------
@@ -79,6 +89,10 @@ def personalise(
     start = chain.shared.start
     generic = chain.shared(start)
     seconds = {"generic": time.perf_counter() - started}
+    if case.error_samples is not None and generic.converged:
+        began = time.perf_counter()
+        chain.sample_geometry(generic.y)
+        seconds["geometry"] = time.perf_counter() - began
 
     def timed(part: str, began: float) -> None:
         seconds[part] = seconds.get(part, 0.0) + time.perf_counter() - began
@@ -127,6 +141,8 @@ def personalise(
         narrower,
         confirmed,
         seconds,
+        chain.geometry,
+        chain.image_share(result),
     )
 
 
@@ -169,8 +185,35 @@ class _Chain:
         inner = IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations)
         considered = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.filter: Filter = SchmidtFilter(inner, considered) if considered else inner
+        self.store = store
+        self.estimated = np.array([name not in considered for name in self.names])
+        self.geometry: GeometryErrors | None = None
+        self.errors: SampledErrors | None = None
+
+    def sample_geometry(self, generic: FloatArray) -> None:
+        """Find out what errors of the case's frames do to the observation.
+
+        Parameters
+        ----------
+        generic : array
+            Both frames as predicted at the start, stacked.
+        """
+        start = self.shared.start
+        self.geometry = found = sample_geometry(
+            self.case, self.settings, self.registered.mechanical(start), store=self.store
+        )
+        if found.too_few:
+            raise GeometryError(f"case {self.case.name}: {found.too_few}")
+        observation = self.plain_observation()
+        base = observation_noise(observation.R, len(observation.y))
+        self.errors = SampledErrors(base, errors_of(observation, self.closed, generic, found))
 
     def observation(self) -> Observed:
+        """The closed frame, with its uncertainty and what errors of the geometry add to it."""
+        plain = self.plain_observation()
+        return plain if self.errors is None else WeighedObservation(plain, self.errors.noise)
+
+    def plain_observation(self) -> Observed:
         """The closed frame, with the uncertainty that the case states."""
         told = self.case.uncertainty
         length, frame, std = told.correlation_length_mm, self.closed, told.typical_mm
@@ -212,7 +255,37 @@ class _Chain:
             self.transform,
             self.settings.mechanics.tissue,
         )
-        return estimate(case, observation)
+        return self._widened(estimate(case, observation), observation)
+
+    def _widened(self, result: StudyResult, observation: Observed) -> StudyResult:
+        """The result with the covariance that the error samples give it, if there are any."""
+        filtered = result.filtered
+        weighed = isinstance(observation, WeighedObservation)
+        if not weighed or filtered is None or filtered.prediction is None:
+            return result
+        covariances = np.array(filtered.transformed_iterate_covariances)
+        covariances[-1] = self.sampled_posterior(filtered).covariance
+        widened = replace(filtered, transformed_iterate_covariances=covariances)
+        return replace(result, filtered=widened)
+
+    def sampled_posterior(self, filtered: Estimate) -> SampledPosterior:
+        """Covariance of an estimate in filter coordinates, from the error samples."""
+        assert self.errors is not None
+        assert filtered.prediction is not None
+        z = filtered.transformed_iterates[-1]
+        H = filtered.prediction.jacobian * filtered.transform.derivative(z)
+        prior = to_filter(filtered.transform, filtered.prior)
+        estimated = np.isin(filtered.names, np.array(self.names)[self.estimated])
+        return self.errors.posterior(H, prior.covariance, estimated)
+
+    def image_share(self, result: StudyResult) -> FloatArray | None:
+        """Share of the variance of each modulus' logarithm that errors of the image account for."""
+        filtered = result.filtered
+        if self.errors is None or filtered is None or filtered.prediction is None:
+            return None
+        found = self.sampled_posterior(filtered)
+        share = np.diag(found.from_samples) / np.diag(found.covariance)
+        return share[[u.is_modulus for u in self.unknowns]]
 
     def estimate_moduli(
         self, filter_: Filter, observation: Observed, *, log: bool, variance: float | None = None
@@ -230,7 +303,7 @@ class _Chain:
             Log() if log else Log((False,) * len(moduli)),
             self.settings.mechanics.tissue,
         )
-        return estimate(case, observation)
+        return self._widened(estimate(case, observation), observation)
 
     def estimate_as_paper(self, paper: PaperSettings) -> StudyResult:
         """The moduli alone, with the paper's filter and its independent R."""
@@ -238,7 +311,7 @@ class _Chain:
         if self.corresponding:
             observation = Observation(("closed",), self.closed.vertices[None], np.array(paper.R))
         else:
-            seen = self.observation()
+            seen = self.plain_observation()
             assert isinstance(seen, SurfaceObservation)
             std = float(np.sqrt(paper.R))
             observation = replace(
@@ -325,8 +398,7 @@ class _Chain:
         prior = to_filter(self.transform, self.prior)
         z = filtered.transformed_iterates[-1]
         H = filtered.prediction.jacobian * self.transform.derivative(z)
-        R = self.observation().R
-        noise = observation_noise(R, len(H))
+        plain = observation_noise(self.plain_observation().R, len(H))
         groups = {
             "pressure known": ("pressure_scale",),
             "rest lengths known": ("chord_rest_length",),
@@ -335,9 +407,15 @@ class _Chain:
             "all nuisances known": tuple(n for n in self.names if not n.startswith("E_f.")),
         }
 
-        def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
-            update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, noise)
+        def linear(P: FloatArray, scale: float = 1.0) -> FloatArray:
+            update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
             return update.posterior.std[moduli]
+
+        def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
+            if self.errors is None:
+                return linear(P, scale)
+            found = self.errors.posterior(H * scale, P).covariance
+            return np.sqrt(np.diag(found))[moduli]
 
         found = {"now": std(prior.covariance)}
         for words, members in groups.items():
@@ -349,6 +427,8 @@ class _Chain:
                 found[words] = std(P)
         found["half the error of the image"] = std(prior.covariance, 2.0)
         found["a frame without error"] = std(prior.covariance, 1e3)
+        if self.errors is not None:
+            found["geometry known exactly"] = linear(prior.covariance)
         return found
 
     def confirm(self, result: StudyResult) -> float | None:

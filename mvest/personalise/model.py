@@ -9,7 +9,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.system import FACTORS
 from mvest.model import ClosureModel
-from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment
+from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
 from mvest.registration import REGISTRATION
 from mvest.valve.anatomy import Valve
 from mvest.valve.band import Band
@@ -18,7 +18,7 @@ from mvest.valve.structured import structured_mesh
 from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
 from mvest.valve.tetrahedralize import TetwildSettings
 
-__all__ = ["build_model"]
+__all__ = ["build_coarse", "build_model"]
 
 
 def build_model(
@@ -40,7 +40,54 @@ def build_model(
     GeometryError, MeshingError
         If the leaflets cannot be meshed.
     """
-    mechanical = [u for u in settings.unknowns if u.name not in REGISTRATION]
+    _check_unknowns(case, settings)
+    band = _band(case)
+    if band is None:
+        return build_coarse(case, settings, store)
+    solid = _solid(case.valve, band, settings.mesh, store)
+    coarse = build_coarse(case, settings, store)
+    return replace(coarse, mesh=solid, guide=coarse)
+
+
+def build_coarse(
+    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
+) -> ClosureModel:
+    """The same on the mesh of the guide alone, where there are two leaflets; see `build_model`."""
+    _check_unknowns(case, settings)
+    mechanical = _mechanical(settings)
+    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
+    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
+    protocol = replace(
+        settings.mechanics.protocol, pressure_mmHg=case.frame(Role.CLOSED).pressure_mmHg
+    )
+    mechanics = replace(settings.mechanics, protocol=protocol)
+    valve, mesh = case.valve, settings.mesh
+    band = _band(case)
+    if band is None:
+        contact, solid = valve, _solid(valve, band, mesh, store)
+    else:
+        contact = band.sampled(mesh.contact_columns, mesh.contact_rows)
+        cells = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
+        solid = _solid(valve, band, cells, store)
+    return ClosureModel(
+        valve,
+        contact,
+        solid,
+        mechanics,
+        free,
+        fixed,
+        continuation=True,
+        repeat=False,
+        largest_change=settings.largest_change,
+    )
+
+
+def _mechanical(settings: PersonaliseSettings) -> list[Unknown]:
+    return [u for u in settings.unknowns if u.name not in REGISTRATION]
+
+
+def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
+    mechanical = _mechanical(settings)
     strange = [u.name for u in mechanical if not u.is_modulus and u.name not in FACTORS]
     if strange:
         raise InputError(
@@ -55,31 +102,10 @@ def build_model(
             f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}, or "
             "leaflets named as the unknowns are"
         )
-    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
-    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
-    protocol = replace(
-        settings.mechanics.protocol, pressure_mmHg=case.frame(Role.CLOSED).pressure_mmHg
-    )
-    mechanics = replace(settings.mechanics, protocol=protocol)
-    valve, mesh = case.valve, settings.mesh
-    band = Band(valve) if len(case.surface.region_names) == 2 else None
-    contact = valve if band is None else band.sampled(mesh.contact_columns, mesh.contact_rows)
-    solid = _solid(valve, band, mesh, store)
-    model = ClosureModel(
-        valve,
-        contact,
-        solid,
-        mechanics,
-        free,
-        fixed,
-        continuation=True,
-        repeat=False,
-        largest_change=settings.largest_change,
-    )
-    if band is not None:
-        coarse = structured_mesh(band, "hex18", mesh.guide_columns, mesh.guide_rows)
-        model.guide = replace(model, mesh=coarse)
-    return model
+
+
+def _band(case: ValveCase) -> Band | None:
+    return Band(case.valve) if len(case.surface.region_names) == 2 else None
 
 
 def _solid(valve: Valve, band: Band | None, mesh: CaseMesh, store: Path | None) -> SolidMesh:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from mvest.cases.case import ValveCase
 from mvest.estimation import Gaussian
+from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
 from mvest.study import StudyResult
 from mvest.typing import FloatArray
@@ -66,6 +67,11 @@ class Personalised:
         Largest distance of the fitted closed valve from the one closed anew.
     seconds : mapping of str to float
         Wall-clock time of each part.
+    geometry : GeometryErrors or None
+        What the case's error samples do to the prediction; None if it has none.
+    image_share : (q,) or None
+        Share of the variance of the logarithm of each modulus that these account for; None where
+        they did not enter.
     """
 
     case: ValveCase
@@ -83,3 +89,5 @@ class Personalised:
     narrower: Mapping[str, FloatArray]
     confirmed_mm: float | None
     seconds: Mapping[str, float]
+    geometry: GeometryErrors | None = None
+    image_share: FloatArray | None = None

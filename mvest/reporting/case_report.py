@@ -25,6 +25,7 @@ from mvest.reporting.case_figures import (
     innovation_map_figure,
     shapes_figure,
 )
+from mvest.reporting.case_image_step import frame_rows, image_error_words
 from mvest.reporting.case_information import Information, information, where_words
 from mvest.reporting.case_plots import (
     distances_figure,
@@ -90,6 +91,13 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
         pictures[name] = embedded(paths[0], text) | {"percent": round(100 * share)}
         written += paths
+    step = record.get("image_step")
+    for name, shown in ((step or {}).get("pictures") or {}).items():
+        # Drawn with the volume at hand, and kept beside the page.
+        try:
+            pictures[name] = embedded(folder / shown["file"], shown["caption"]) | {"percent": 100}
+        except InputError as error:
+            missing[name] = f"Not shown: {error}."
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -186,9 +194,24 @@ def _content(
         "distances": words.distance_rows(record),
         "held_out": words.distance_words(record),
         "measurements": words.measurement_rows(record),
+        "image_step": _image_step(record),
+        "image_errors": image_error_words(record),
         "narrow": words.narrow_words(narrow) if narrow else "",
         "settings": words.setting_rows(record.get("settings") or {}),
         "provenance": words.provenance_rows(record),
+    }
+
+
+def _image_step(record: Record) -> dict[str, Any] | None:
+    """Sentences, names of pictures and the table of the image step; None where there was none."""
+    step = record.get("image_step")
+    if step is None:
+        return None
+    return {
+        "sentences": list(step.get("sentences") or []),
+        "pictures": list(step.get("pictures") or {}),
+        "frames": frame_rows(step.get("frames") or []),
+        "files": list(step.get("files") or []),
     }
 
 

@@ -1,0 +1,121 @@
+"""Errors of an observation that are known by samples: what they add to the noise and the intervals.
+
+Errors of what a model is built from are alike all over an observation, and known by a few samples
+only. K samples d₁ ... d_K of the error of the innovation y − h, which is all of it, could be added
+to the noise as R + 1/K Σ d dᵀ. But a filter that is told so avoids the K directions that it was
+shown, and is as sure as if there were no other: with twelve samples its intervals of 95 % held the
+truth in 70 % (simulated). So the noise is what the filter weighs with, and no more. The covariance
+of its estimate is taken from the samples themselves, through a gain K that has not seen them::
+
+    P⁺ = (I − K H) P (I − K H)ᵀ + c / K Σ (K₋ₖ dₖ)(K₋ₖ dₖ)ᵀ
+
+the form of Joseph, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes
+with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th. Of K samples
+the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 % point of Student's distribution
+with K degrees of freedom, so that an interval of ± 1.96 standard deviations is one of 95 %.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.special import ndtri
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
+from mvest.estimation.prediction import require_finite
+from mvest.typing import BoolArray, FloatArray
+
+__all__ = ["SampledErrors", "SampledPosterior"]
+
+LEVEL = 0.95
+"""Of the intervals that are to be right."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampledPosterior:
+    """Covariance of an estimate, and the part of it that the samples account for, ``(p, p)``."""
+
+    covariance: FloatArray
+    from_samples: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampledErrors:
+    """Samples of the error of an innovation, beside the noise that the filter weighs with.
+
+    Attributes
+    ----------
+    base : ObservationNoise
+        R of n observations: how errors of single observations are weighed.
+    samples : (n, K)
+        In units of the observation.
+    """
+
+    base: ObservationNoise
+    samples: FloatArray
+
+    def __post_init__(self) -> None:
+        samples = np.array(self.samples, dtype=np.float64)
+        if samples.ndim != 2 or len(samples) != self.base.size or samples.shape[1] < 2:
+            raise InputError(
+                f"samples of errors have shape {samples.shape}, expected ({self.base.size}, K) "
+                "with K at least 2"
+            )
+        require_finite(samples, "samples of errors")
+        samples.setflags(write=False)
+        object.__setattr__(self, "samples", samples)
+
+    @property
+    def count(self) -> int:
+        """K."""
+        return self.samples.shape[1]
+
+    @property
+    def noise(self) -> ObservationNoise:
+        """R + 1/K Σ d dᵀ."""
+        return low_rank_noise(self.base, self.samples / np.sqrt(self.count))
+
+    def posterior(
+        self, jacobian: FloatArray, prior: FloatArray, estimated: BoolArray | None = None
+    ) -> SampledPosterior:
+        """Covariance of the estimate of a linear model.
+
+        Parameters
+        ----------
+        jacobian : (n, p)
+            H at the estimate.
+        prior : (p, p)
+            Covariance P.
+        estimated : (p,), optional
+            Which parameters are estimated; the others keep their prior and are considered. They
+            must be independent of those in the prior. Default: all.
+        """
+        H = self.base.whiten(np.asarray(jacobian, dtype=np.float64))
+        D = self.base.whiten(self.samples)
+        P = Gaussian(np.zeros(len(prior)), prior).covariance
+        kept = np.ones(len(P), dtype=np.bool_) if estimated is None else estimated
+        white = observation_noise(1.0, len(H))
+
+        def gain(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+            """Whitening of the errors and the gain for what is whitened so, ``(p, n)``."""
+            noise = low_rank_noise(white, columns / np.sqrt(max(columns.shape[1], 1)))
+            A = noise.whiten(H)
+            K = np.linalg.solve(np.eye(len(P)) + P @ (A.T @ A), P @ A.T)
+            K[~kept] = 0.0
+            return noise.whiten(D), np.asarray(K, dtype=np.float64)
+
+        _, K = gain(D)
+        # W Wᵀ-whitened H is met by the same gain.
+        noise = low_rank_noise(white, D / np.sqrt(self.count))
+        rest = np.eye(len(P)) - K @ noise.whiten(H)
+        moved = np.empty((len(P), self.count))
+        for k in range(self.count):
+            whitened, without = gain(np.delete(D, k, axis=1))
+            moved[:, k] = without @ whitened[:, k]
+        widened = (stats.t.ppf(0.5 + 0.5 * LEVEL, self.count) / ndtri(0.5 + 0.5 * LEVEL)) ** 2
+        part = widened / self.count * moved @ moved.T
+        return SampledPosterior(rest @ P @ rest.T + part, part)

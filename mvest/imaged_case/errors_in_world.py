@@ -1,0 +1,65 @@
+"""Errors measured on other valves, in the axes of a valve that was found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvest.cases.case import ErrorSamples
+from mvest.errors import InputError
+from mvest.imaged_case.frames import CaseFrames
+from mvest.imaging.sequence import ValveSequence
+from mvest.typing import FloatArray
+
+__all__ = ["samples_in_world", "valve_axes"]
+
+
+def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Axes of the valve in a frame, the columns of ``(3, 3)``.
+
+    As of a moving valve: z is normal to the annulus, to the atrium; x points from phi = 180 to
+    phi = 0 within its plane, and y, which completes them, to the first leaflet.
+    """
+    layout, annulus = sequence.layout, sequence.annulus[frame]
+    about = annulus - annulus.mean(axis=0)
+    area = np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)
+    down = sequence.free_edge[frame].mean(axis=0) - annulus.mean(axis=0)
+    z = -area * np.sign(area @ down) / np.linalg.norm(area)
+    across = annulus[layout.column(0.0)] - annulus[layout.column(180.0)]
+    x = across - (across @ z) * z
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    return np.stack([x, y, z], axis=1)
+
+
+def samples_in_world(
+    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray, tip_errors: FloatArray
+) -> ErrorSamples:
+    """Errors measured on other valves, as displacements in the frames of a case.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frames : CaseFrames
+    errors : (K, 2, n, 3) mm
+        Found less true, in the axes of each valve, in its open and its closed frame.
+    tip_errors : (K, 2, 2, 3) mm
+
+    Raises
+    ------
+    InputError
+        They are not of this layout.
+    """
+    n = sequence.layout.size
+    if errors.shape[1:] != (2, n, 3) or tip_errors.shape[1:] != (2, 2, 3):
+        raise InputError(
+            f"errors of shape {errors.shape} and of tips {tip_errors.shape}, expected (samples, 2, "
+            f"{n}, 3) and (samples, 2, 2, 3)"
+        )
+    numbers = frames.in_order
+    which = [0 if number == frames.open else 1 for number in numbers]
+    axes = np.stack([valve_axes(sequence, number) for number in numbers])
+    # Where it may have been is where it was found less the error.
+    return ErrorSamples(
+        -np.einsum("fij,kfnj->kfni", axes, errors[:, which]),
+        -np.einsum("fij,kfnj->kfni", axes, tip_errors[:, which]),
+    )

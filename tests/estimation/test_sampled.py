@@ -1,0 +1,106 @@
+"""Errors known by samples: the linear filter with them, against Monte Carlo."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mvest.errors import InputError
+from mvest.estimation import Gaussian, kalman_update, observation_noise
+from mvest.estimation.sampled import SampledErrors
+
+N, P0 = 60, np.diag([0.25, 0.16, 0.01])
+RNG = np.random.default_rng(11)
+H = RNG.standard_normal((N, 3))
+MODES = 0.8 * RNG.standard_normal((N, 40))
+"""True errors of the innovation: many directions, more than samples."""
+
+
+def errors(count, rng):
+    return MODES @ rng.standard_normal((MODES.shape[1], count)) / np.sqrt(MODES.shape[1])
+
+
+def gain(noise, H=H):
+    W = noise.whiten(np.eye(noise.size))
+    R = np.linalg.inv(W.T @ W)
+    return P0 @ H.T @ np.linalg.inv(H @ P0 @ H.T + R)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say_and_those_of_the_filter_do_not():
+    base = observation_noise(0.2**2, N)
+    rng = np.random.default_rng(2)
+    hits, filters, tries = np.zeros(3), np.zeros(3), 0
+    for _ in range(60):
+        told = SampledErrors(base, errors(10, rng))
+        K = gain(told.noise)
+        std = np.sqrt(np.diag(told.posterior(H, P0).covariance))
+        own = np.sqrt(np.diag(P0 - K @ H @ P0))
+        for _ in range(20):
+            m = np.sqrt(np.diag(P0)) * rng.standard_normal(3)
+            error = K @ (H @ m + errors(1, rng)[:, 0]) - m
+            hits += np.abs(error) < 1.96 * std
+            filters += np.abs(error) < 1.96 * own
+            tries += 1
+    assert np.all(hits / tries > 0.9)
+    assert filters[0] / tries < 0.8
+
+
+def test_without_the_leave_one_out_the_formula_is_that_of_joseph():
+    # Where the base rules, leaving one out changes nothing.
+    base = observation_noise(20.0**2, N)
+    told = SampledErrors(base, errors(200, np.random.default_rng(3)))
+    K = gain(told.noise)
+    rest = np.eye(3) - K @ H
+    expected = rest @ P0 @ rest.T + K @ (told.samples @ told.samples.T / 200) @ K.T
+    expected += ((stats.t.ppf(0.975, 200) / 1.959964) ** 2 - 1) * (expected - rest @ P0 @ rest.T)
+    found = told.posterior(H, P0)
+    np.testing.assert_allclose(found.covariance, expected, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(
+        found.covariance - found.from_samples, rest @ P0 @ rest.T, rtol=1e-8, atol=1e-12
+    )
+
+
+def test_what_is_considered_keeps_its_prior_and_widens():
+    told = SampledErrors(observation_noise(0.3**2, N), errors(12, np.random.default_rng(4)))
+    found = told.posterior(H, P0, np.array([True, True, False])).covariance
+    assert found[2, 2] == pytest.approx(P0[2, 2])
+    whole = told.posterior(H, P0).covariance
+    assert np.all(np.diag(found)[:2] > 0.9 * np.diag(whole)[:2])
+
+
+def test_the_noise_is_that_of_the_base_and_the_mean_square_of_the_samples():
+    told = SampledErrors(observation_noise(0.3**2, N), errors(7, np.random.default_rng(5)))
+    W = told.noise.whiten(np.eye(N))
+    expected = 0.09 * np.eye(N) + told.samples @ told.samples.T / 7
+    np.testing.assert_allclose(np.linalg.inv(W.T @ W), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_tiny_samples_leave_the_filter_s_own_covariance_but_for_the_noise():
+    # Samples that vanish: no error reaches the estimate, only the prior is left through the gain.
+    base = observation_noise(0.3**2, N)
+    told = SampledErrors(base, 1e-9 * errors(5, np.random.default_rng(6)))
+    own = kalman_update(Gaussian(np.zeros(3), P0), np.zeros(N), H, base)
+    assert np.all(np.diag(told.posterior(H, P0).covariance) < own.posterior.std**2)
+
+
+def test_few_samples_widen_by_student_s_distribution():
+    base = observation_noise(1e6, N)
+    samples = errors(4, np.random.default_rng(7))
+    # So little weight that all gains are one: leaving one out changes nothing.
+    K = gain(base)
+    moved = K @ samples
+    expected = (stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)) ** 2 / 4 * moved @ moved.T
+    found = SampledErrors(base, samples).posterior(H, P0).from_samples
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (np.zeros((N, 1)), "K at least 2"),
+        (np.zeros((N + 1, 5)), "samples of errors have shape"),
+        (np.full((N, 5), np.nan), "samples of errors"),
+    ],
+)
+def test_samples_that_are_none_are_refused(samples, message):
+    with pytest.raises(InputError, match=message):
+        SampledErrors(observation_noise(1.0, N), samples)
