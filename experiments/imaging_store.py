@@ -34,6 +34,7 @@ from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.training import (
     Samples,
     TrainingSettings,
+    draft_of,
     train_stage,
     volume_samples,
 )
@@ -141,7 +142,7 @@ class ImagingStore:
 
     def __init__(self, config: Values) -> None:
         imaging = config["imaging"]
-        self.folder = Path(config["paths"]["outputs"]) / "imaging"
+        self.folder = Path(config["paths"]["outputs"]) / "detectors"
         self.processes = int(imaging["processes"])
         self.seed = int(config["seed"])
         self.training = build(TrainingSettings, imaging["training"])
@@ -207,7 +208,7 @@ class ImagingStore:
         settings = {
             key: value
             for key, value in asdict(self.training).items()
-            if key in ("modes", "samples", "acquisition")
+            if key in ("modes", "samples", "acquisition", "draft_volumes", "boosting")
         }
         described = {
             "valves": self.population_key("train"),
@@ -226,22 +227,37 @@ class ImagingStore:
 
     def samples(self, valves: Sequence[MovingValve], count: int) -> list[StoredSamples]:
         """Samples of the first ``count`` training volumes, simulated where they are missing."""
+        first = min(count, self.training.draft_volumes)
+        drafted = self._samples(valves, range(first), None)
+        if count == first:
+            return drafted
+        return [*drafted, *self._samples(valves, range(first, count), drafted)]
+
+    def _samples(
+        self,
+        valves: Sequence[MovingValve],
+        numbers: Sequence[int],
+        drafted: Sequence[StoredSamples] | None,
+    ) -> list[StoredSamples]:
+        """Samples of some volumes, with the mistakes of what is learned from those ``drafted``."""
         folder = self._place("samples", self.samples_key)
         folder.mkdir(parents=True, exist_ok=True)
-        places = [folder / f"{number:05d}.npz" for number in range(count)]
+        places = {number: folder / f"{number:05d}.npz" for number in numbers}
         with self._alone(folder):
-            missing = [number for number, place in enumerate(places) if not place.is_file()]
+            missing = [number for number, place in places.items() if not place.is_file()]
             if missing:
                 shape = self.shapes(valves)
+                draft = draft_of(drafted, self.training, self.seed) if drafted else None
                 calls = (
-                    (valves[k % len(valves)], k, shape, self.training, self.seed) for k in missing
+                    (valves[k % len(valves)], k, shape, self.training, self.seed, draft)
+                    for k in missing
                 )
                 with PartBar("training volumes", len(missing), "volume") as bar:
                     found = in_processes(volume_samples, calls, self.processes)
                     for number, (samples, cpu_s) in zip(missing, found, strict=True):
                         _write_samples(places[number], samples, cpu_s)
                         bar.step()
-        return [StoredSamples(place) for place in places]
+        return [StoredSamples(place) for place in places.values()]
 
     def shapes(self, valves: Sequence[MovingValve]) -> ShapeModel:
         """The shape model of all training valves."""

@@ -35,6 +35,16 @@ Record = Mapping[str, Any]
 NOT_KEPT: Final = ("volumes", "sequence_frames")
 """Of a record, what no table needs."""
 
+NO_VALVE: Final = ("walls only", "no tissue", "white noise")
+"""Kinds of volumes in which there is no valve."""
+
+SEQUENCES: Final = {
+    "calibration": "over time, in distribution, other valves",
+    "sequence": "over time, in distribution",
+    "shifted sequence": "over time, shifted",
+}
+"""What volumes over time are called here."""
+
 OVER_TIME: Final = (
     "Simulated transoesophageal echo (TEE) volumes over time, of simulated valves that no training "
     "saw, as the image step hands them on (joined and smoothed in time). Means over the frames of "
@@ -100,11 +110,14 @@ def imaging_text(record: Record) -> str:
     if record["rows"]:
         table = imaging_table(record["rows"])
         for _, row in table.iterrows():
+            share = f"valve found in {row['valve found [%]']:.0f} % of {row['volumes']} volumes"
+            if not row["valve found [%]"] > 0:
+                lines.append(f"  {row['setting']}: {share}")
+                continue
             lines.append(
                 f"  {row['setting']}: surface {row['surface mean [mm]']:.2f} mm on average, "
                 f"{row['surface median [mm]']:.2f} median, {row['surface 90 % [mm]']:.2f} at 90 %; "
-                f"valve found in {row['valve found [%]']:.0f} % of {row['volumes']} volumes; "
-                f"{row['time per volume [s]']:.1f} s each"
+                f"{share}; {row['time per volume [s]']:.1f} s each"
             )
         lines += [f"  {line}" for line in imaging_words(table, record["targets"])]
     return "\n".join([*lines, *(f"  {line}" for line in study_words(record))])
@@ -193,9 +206,16 @@ def _over_time(table: pd.DataFrame) -> list[dict[str, str]]:
     return rows
 
 
+def _called(kind: str) -> str:
+    return f"no valve: {kind}" if kind in NO_VALVE else SEQUENCES.get(kind, kind)
+
+
 def _rounded(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     return [
-        {key: value if isinstance(value, str) else number(value) for key, value in row.items()}
+        {
+            key: _called(value) if isinstance(value, str) else number(value)
+            for key, value in row.items()
+        }
         for row in rows
     ]
 
@@ -213,14 +233,13 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     axes = grid[0, 0]
     random = np.random.default_rng(0)
     labels = []
-    without = {row for row in values if row in ("walls only", "no tissue", "white noise")}
     for k, (kind, own) in enumerate(values.items()):
-        colour = 1 if kind in without else 0
-        places = k + random.uniform(-0.2, 0.2, len(own))
-        axes.plot(own, places, ls="none", marker=MARKERS[colour], ms=4, mew=0, alpha=0.75,
-                  color=COLOURS[colour])  # fmt: skip
-        words = f"no valve: {kind}" if kind in without else kind
-        labels.append(f"{words} ({len(own)})")
+        look = 1 if kind in NO_VALVE else 0
+        axes.plot(
+            own, k + random.uniform(-0.2, 0.2, len(own)), ls="none", marker=MARKERS[look], ms=4,
+            mew=0, alpha=0.75, color=COLOURS[look],
+        )  # fmt: skip
+        labels.append(f"{_called(kind)} ({len(own)})")
     axes.axvline(confidence["least_confidence"], color="0.25", lw=1.0, ls="--", zorder=0)
     axes.annotate(
         "called a valve from here", (confidence["least_confidence"], 1.0),
@@ -229,6 +248,7 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     )  # fmt: skip
     axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlim(0.0, max(1.0, *(max(own) for own in values.values())))
     axes.set_xlabel("confidence")
     axes.grid(visible=False, axis="y")
     headline(figure, "How sure the detectors are that there is a valve", "Simulated volumes.")

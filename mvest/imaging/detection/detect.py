@@ -12,14 +12,12 @@ from mvest.imaging.detection.fit import Pulls, fit_shape, relax
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.position import PLACES
 from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["FitSettings", "FrameValve", "fit_frame", "search_frame"]
-
-PLACES = 12
-"""Places at which orientations are tried."""
 
 LANDMARK_STD_MM = 1.2
 RIM_STD_MM = (0.8, 0.8)

@@ -20,12 +20,19 @@ from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.detection.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
-__all__ = ["REFINEMENTS", "PoseSearch", "pose_error", "rating_samples", "refinement_samples"]
+__all__ = [
+    "REFINEMENTS",
+    "PoseSearch",
+    "coarse_samples",
+    "fine_samples",
+    "pose_error",
+    "refinement_samples",
+]
 
 ORIENTATIONS = 700
 """Orientations tried at every place: neighbours are some 25 to 30 degrees apart."""
 
-REFINED = 24
+REFINED = 160
 """Hypotheses that are refined."""
 
 REFINEMENTS = (
@@ -39,10 +46,11 @@ SCALE_MM = 6.0
 """mm, a hypothesis' rating falls off over: exp(-error / SCALE)."""
 
 
-def _pattern(count: int, near: float, seed: int) -> Pattern:
+def _pattern(count: int, near: float, seed: int, reach: float = 1.0) -> Pattern:
     """Samples about the annulus' centre, denser near the leaflets."""
     rng = np.random.default_rng(seed)
-    offsets = rng.standard_normal((count, 3)) * np.array([15.0, 14.0, 13.0]) + [0, 0, -5.0]
+    spread = reach * np.array([15.0, 14.0, 13.0])
+    offsets = rng.standard_normal((count, 3)) * spread + [0, 0, -5.0]
     radius = np.linalg.norm(offsets / np.array([20.0, 18.0, 16.0]), axis=1)
     levels = np.where(radius > 1.6, 3, np.where(radius > near, 2, 1))
     return Pattern.paired(offsets, levels, count // 2, seed)
@@ -50,6 +58,8 @@ def _pattern(count: int, near: float, seed: int) -> Pattern:
 
 COARSE = _pattern(140, 0.3, 1)
 FINE = _pattern(220, 1.0, 2)
+WIDE = _pattern(280, 0.8, 7, 1.5)
+"""Of the final rating: it reaches to what tells the anterior side from the posterior one."""
 
 
 def pose_error(poses: Poses, true: TrueValve, model: ShapeModel) -> FloatArray:
@@ -59,39 +69,63 @@ def pose_error(poses: Poses, true: TrueValve, model: ShapeModel) -> FloatArray:
     return np.asarray(np.linalg.norm(gap, axis=2).mean(axis=1))
 
 
-def rating_samples(
+def coarse_samples(
+    frame: StandardFrame, true: TrueValve, model: ShapeModel, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """Hypotheses such as a grid of orientations at likely places gives, with ratings ``(P, 1)``."""
+    grid = rotation_grid(ORIENTATIONS)
+    kinds = (Misses(3.0, 10.0, 0.1), Misses(5.0, 22.0, 0.1))
+    parts = [missed_poses(true.pose, misses, count // 4, rng) for misses in kinds]
+    rest = count - sum(len(part) for part in parts)
+    far = missed_poses(true.pose, Misses(8.0, 0.0, 0.1), rest, rng)
+    parts.append(Poses(far.centre, grid[rng.integers(len(grid), size=rest)], far.log_scale))
+    poses = _strayed(Poses.joined(parts), rng)
+    rating = _rating(pose_error(poses, true, model))
+    return features(frame, COARSE, poses.centre, poses.axes), rating
+
+
+def fine_samples(
     frame: StandardFrame,
     true: TrueValve,
     model: ShapeModel,
     count: int,
     rng: np.random.Generator,
-    *,
-    fine: bool,
+    mistaken: Poses | None = None,
 ) -> tuple[NDArray[np.float32], FloatArray]:
-    """Hypotheses from good to bad with ratings ``(P, 1)``.
+    """Hypotheses such as remain after refinement, with ratings ``(P, 1)``.
 
-    With ``fine`` they are such as remain after refinement, else such as a grid of orientations at
-    likely places gives.
+    Half of those made up are about right; the others are turned about the valve's axis (front for
+    back, most often), tilted, or anywhere.
+
+    Parameters
+    ----------
+    mistaken : Poses, optional
+        What a search without this rating took for the valve: also learned from.
     """
-    grid = rotation_grid(ORIENTATIONS)
-    kinds: tuple[Misses, ...]
-    if fine:
-        kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
-        parts = [missed_poses(true.pose, m, count // 4, rng) for m in kinds]
-    else:
-        kinds = (Misses(3.0, 10.0, 0.1), Misses(5.0, 22.0, 0.1))
-        parts = [missed_poses(true.pose, m, count // 4, rng) for m in kinds]
-    rest = count - sum(len(p) for p in parts)
-    far = missed_poses(true.pose, Misses(8.0, 0.0, 0.1), rest, rng)
-    parts.append(Poses(far.centre, grid[rng.integers(len(grid), size=rest)], far.log_scale))
+    kinds = (Misses(1.0, 3.0, 0.03), Misses(2.5, 8.0, 0.06), Misses(6.0, 25.0, 0.12))
+    parts = [missed_poses(true.pose, misses, count // 6, rng) for misses in kinds]
+    turned = missed_poses(true.pose, Misses(3.0, 10.0, 0.08), count // 3, rng)
+    by = np.zeros((len(turned), 7))
+    by[:, 5] = np.where(rng.random(len(turned)) < 0.6, np.pi, rng.uniform(0.5, 5.8, len(turned)))
+    parts.append(turned.moved(by))
+    rest = count - sum(len(part) for part in parts)
+    parts.append(_strayed(missed_poses(true.pose, Misses(8.0, 60.0, 0.1), rest, rng), rng, 0.3))
+    if mistaken is not None:
+        parts.append(mistaken)
     poses = Poses.joined(parts)
-    # Some are where there is no valve at all.
-    stray = rng.random(len(poses)) < 0.1
+    rating = _rating(pose_error(poses, true, model))
+    return features(frame, WIDE, poses.centre, poses.axes), rating
+
+
+def _rating(error: FloatArray) -> FloatArray:
+    return np.asarray(np.exp(-error / SCALE_MM)[:, None])
+
+
+def _strayed(poses: Poses, rng: np.random.Generator, share: float = 0.1) -> Poses:
+    """Some of the poses moved to where there is no valve."""
+    stray = rng.random(len(poses)) < share
     centre = poses.centre + stray[:, None] * rng.standard_normal((len(poses), 3)) * 25.0
-    poses = Poses(centre, poses.rotation, poses.log_scale)
-    rating = np.exp(-pose_error(poses, true, model) / SCALE_MM)
-    pattern = FINE if fine else COARSE
-    return features(frame, pattern, poses.centre, poses.axes), rating[:, None]
+    return Poses(centre, poses.rotation, poses.log_scale)
 
 
 def refinement_samples(
@@ -137,6 +171,6 @@ class PoseSearch:
         """Refine some poses; the best ``count`` of them and their ratings."""
         for step in self.refine:
             poses = poses.moved(step(features(frame, FINE, poses.centre, poses.axes)))
-        rating = self.fine(features(frame, FINE, poses.centre, poses.axes))[:, 0]
+        rating = self.fine(features(frame, WIDE, poses.centre, poses.axes))[:, 0]
         best = np.argsort(-rating, kind="stable")[:count]
         return poses[best], rating[best]

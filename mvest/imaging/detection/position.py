@@ -13,7 +13,10 @@ from mvest.imaging.detection.sampling import Pattern, directions, features
 from mvest.imaging.detection.truth import TrueValve
 from mvest.typing import FloatArray
 
-__all__ = ["PositionDetector", "position_samples"]
+__all__ = ["PLACES", "PositionDetector", "position_samples"]
+
+PLACES = 24
+"""Places at which orientations are tried."""
 
 RADII_MM = (3.0, 7.0, 11.0, 15.0, 19.0, 24.0, 30.0, 38.0)
 """mm of the shells about a place."""
@@ -98,5 +101,5 @@ class PositionDetector:
             if not np.isfinite(left[k]):
                 break
             found.append(k)
-            left[np.linalg.norm(places - places[k], axis=1) < 1.2 * NEAR_MM] = -np.inf
+            left[np.linalg.norm(places - places[k], axis=1) < 0.8 * NEAR_MM] = -np.inf
         return places[found], rating[found]

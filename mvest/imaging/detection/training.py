@@ -20,8 +20,16 @@ from mvest.imaging.detection.boundary import boundary_samples
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.landmark_detector import landmark_samples
 from mvest.imaging.detection.model import STAGES, DetectionModel
-from mvest.imaging.detection.pose_search import REFINEMENTS, rating_samples, refinement_samples
-from mvest.imaging.detection.position import position_samples
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.pose_search import (
+    REFINED,
+    REFINEMENTS,
+    PoseSearch,
+    coarse_samples,
+    fine_samples,
+    refinement_samples,
+)
+from mvest.imaging.detection.position import PLACES, PositionDetector, position_samples
 from mvest.imaging.detection.rim_detector import rim_samples
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.shape_start import MODES, shape_start_samples
@@ -39,10 +47,12 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 
 __all__ = [
+    "Draft",
     "RenderedFrame",
     "SampleCounts",
     "Samples",
     "TrainingSettings",
+    "draft_of",
     "draw_samples",
     "render_frame",
     "train_model",
@@ -53,7 +63,7 @@ __all__ = [
 Setting: TypeAlias = Literal["training", "shifted"]
 """Within the ranges that detectors are trained in, or outside of them."""
 
-Samples: TypeAlias = dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
+Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
 
 
@@ -68,6 +78,7 @@ class SampleCounts:
     landmark: int = 50
     rim: int = 240
     boundary: int = 720
+    mistaken: int = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +95,9 @@ class TrainingSettings:
         For the boundary, which has the most samples.
     volumes : int
         Simulated: one frame each, of the valves in turn.
+    draft_volumes : int
+        So many of them, the first ones, make a draft of the search for poses; from the others what
+        it mistakes for a valve is learned too.
     acquisition : Acquisition
         About which the renderings vary.
     """
@@ -92,8 +106,41 @@ class TrainingSettings:
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
     boundary_trees: int = 120
-    volumes: int = 240
+    volumes: int = 480
+    draft_volumes: int = 60
     acquisition: Acquisition = field(default_factory=Acquisition)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draft:
+    """A first search for poses, whose mistakes the final rating learns from."""
+
+    position: PositionDetector
+    poses: PoseSearch
+
+    def taken_for_valves(self, frame: StandardFrame, count: int, rng: np.random.Generator) -> Poses:
+        """Half of ``count`` poses are those rated best, the others some of the rest."""
+        places, _ = self.position(frame, PLACES)
+        poses, _ = self.poses(frame, places, REFINED)
+        best = count // 2
+        others = best + rng.choice(len(poses) - best, count - best, replace=False)
+        return poses[np.concatenate([np.arange(best), others])]
+
+
+def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Draft:
+    """The search that is learned from the first volumes alone."""
+
+    def grown(name: str) -> Boosters:
+        x = np.concatenate([part[name][0] for part in samples])
+        return train_stage(
+            name, x, np.concatenate([part[name][1] for part in samples]), settings, seed
+        )
+
+    refine = tuple(grown(f"pose_refine_{k}") for k in range(len(REFINEMENTS)))
+    return Draft(
+        PositionDetector(grown("position")),
+        PoseSearch(grown("pose_coarse"), grown("pose_fine"), refine),
+    )
 
 
 def draw_samples(
@@ -102,13 +149,15 @@ def draw_samples(
     model: ShapeModel,
     counts: SampleCounts,
     rng: np.random.Generator,
+    draft: Draft | None = None,
 ) -> Samples:
-    """Samples of all stages from one frame."""
+    """Samples of all stages from one frame; a draft's mistakes are among them."""
     layout = model.layout
+    mistaken = None if draft is None else draft.taken_for_valves(frame, counts.mistaken, rng)
     found: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
         "position": position_samples(frame, true, counts.position, rng),
-        "pose_coarse": rating_samples(frame, true, model, counts.pose_rating, rng, fine=False),
-        "pose_fine": rating_samples(frame, true, model, counts.pose_rating, rng, fine=True),
+        "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
+        "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
         "shape": shape_start_samples(frame, true, model, counts.shape, rng),
         "annulus": rim_samples(frame, true, model, 0, counts.rim, rng),
         "free_edge": rim_samples(frame, true, model, -1, counts.rim, rng),
@@ -158,7 +207,12 @@ def render_frame(
 
 
 def volume_samples(
-    valve: MovingValve, number: int, shape: ShapeModel, settings: TrainingSettings, seed: int
+    valve: MovingValve,
+    number: int,
+    shape: ShapeModel,
+    settings: TrainingSettings,
+    seed: int,
+    draft: Draft | None = None,
 ) -> Samples:
     """Simulate one training volume and sample it for all stages.
 
@@ -172,14 +226,15 @@ def volume_samples(
     settings : TrainingSettings
     seed : int
         Of the training.
+    draft : Draft, optional
+        For all but the first volumes.
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
     seen = render_frame(valve, which, settings.acquisition, "training", render)
     true = TrueValve.of(seen.vertices, seen.tips, shape)
-    return draw_samples(
-        seen.frame, true, shape, settings.samples, np.random.default_rng(sample.spawn(1)[0])
-    )
+    rng = np.random.default_rng(sample.spawn(1)[0])
+    return draw_samples(seen.frame, true, shape, settings.samples, rng, draft)
 
 
 def train_stage(
@@ -244,14 +299,19 @@ def train_model(
     shape = fit_shape_model(valves, settings.modes)
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
-        drawn = parallel(
-            joblib.delayed(volume_samples)(valves[k % len(valves)], k, shape, settings, seed)
-            for k in range(settings.volumes)
-        )
         samples: list[Samples] = []
-        for k, found in enumerate(drawn):
-            samples.append(found)
-            tell("volumes", k + 1, settings.volumes)
+        first = min(settings.draft_volumes, settings.volumes)
+        for numbers in (range(first), range(first, settings.volumes)):
+            draft = draft_of(samples, settings, seed) if samples and len(numbers) else None
+            drawn = parallel(
+                joblib.delayed(volume_samples)(
+                    valves[k % len(valves)], k, shape, settings, seed, draft
+                )
+                for k in numbers
+            )
+            for found in drawn:
+                samples.append(found)
+                tell("volumes", len(samples), settings.volumes)
         grown = parallel(
             joblib.delayed(train_stage)(
                 name,
