@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,21 +76,24 @@ class Boosters:
     """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
-        import lightgbm  # here, as it takes a second that studies without images need not wait
-
         checked = [checked_trees(text, source) for text in texts]
-        self.texts, self._source = tuple(text for text, _ in checked), source
         counts = {features for _, features in checked}
         if len(counts) != 1:
             raise InputError(f"{source}: trees of {sorted(counts)} features, expected one number")
-        self.features = counts.pop()
+        self._begin(tuple(text for text, _ in checked), counts.pop(), source)
+
+    def _begin(self, texts: tuple[str, ...], features: int, source: str) -> None:
+        import lightgbm  # here, as it takes a second that studies without images need not wait
+
+        self.texts, self.features, self._source = texts, features, source
         try:
             self._boosters = [lightgbm.Booster(model_str=text) for text in self.texts]
         except lightgbm.basic.LightGBMError as fault:
             raise InputError(f"{source}: no trees that LightGBM reads ({fault})") from fault
 
-    def __reduce__(self) -> tuple[type[Boosters], tuple[tuple[str, ...]]]:
-        return Boosters, (self.texts,)
+    def __reduce__(self) -> tuple[Callable[..., Boosters], tuple[tuple[str, ...], int, str]]:
+        # Between processes of one program: what was checked once is not checked again.
+        return _as_checked, (self.texts, self.features, self._source)
 
     @property
     def outputs(self) -> int:
@@ -107,6 +111,12 @@ class Boosters:
             return np.zeros((0, self.outputs))
         found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
         return np.stack(found, axis=1)
+
+
+def _as_checked(texts: tuple[str, ...], features: int, source: str) -> Boosters:
+    found = Boosters.__new__(Boosters)
+    found._begin(texts, features, source)
+    return found
 
 
 def train_boosters(

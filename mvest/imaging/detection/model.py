@@ -204,7 +204,8 @@ def load_model(path: Path | str) -> DetectionModel:
     except UNREADABLE as fault:
         if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
-        raise InputError(f"{source}: {fault}; expected a {FORMAT} of version {VERSION}") from fault
+        what = " ".join(str(fault).split())[:160]
+        raise InputError(f"{source}: {what}; expected a {FORMAT} of version {VERSION}") from fault
 
 
 def default_model() -> DetectionModel:

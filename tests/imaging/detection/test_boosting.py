@@ -47,7 +47,11 @@ def test_texts_and_pickles_are_the_same_trees(trained):
     copy = Boosters(trained.texts)
     assert copy.texts == trained.texts
     np.testing.assert_array_equal(copy(x), expected)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(trained))(x), expected)
+    other = pickle.loads(pickle.dumps(trained))
+    np.testing.assert_array_equal(other(x), expected)
+    assert other.texts == trained.texts
+    with pytest.raises(InputError, match="6 features, found 5"):
+        other(x[:, :5])
 
 
 def test_probabilities_lie_between_0_and_1():

@@ -68,6 +68,7 @@ def test_a_loaded_model_is_saved_as_the_same_file(loaded, path, tmp_path):
     with np.load(path) as a, np.load(tmp_path / "again.npz") as b:
         assert a.files == b.files
         assert all(np.array_equal(a[name], b[name]) for name in a.files)
+    assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
 
 
 def test_the_digest_is_that_of_the_file(loaded, trained, path):

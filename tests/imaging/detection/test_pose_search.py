@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection import pose_search
+from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     REFINEMENTS,
     PoseSearch,
+    coarse_samples,
+    fine_samples,
     pose_error,
-    rating_samples,
     refinement_samples,
 )
 from tests.imaging.detection.made_up import (
@@ -93,22 +95,46 @@ def test_no_places_give_no_poses(shape, true):
 def test_what_samples_of_refinement_say_takes_them_back(true, step):
     x, y = refinement_samples(NumberedFrame(), true, step, 30, np.random.default_rng(step))
     centre, rotation, log_scale, _ = seen(x)
-    back = type(true.pose)(centre, rotation, log_scale).moved(y)
+    back = Poses(centre, rotation, log_scale).moved(y)
     np.testing.assert_allclose(back.centre, np.tile(true.pose.centre, (30, 1)), atol=1e-9)
     np.testing.assert_allclose(back.rotation, np.tile(true.pose.rotation, (30, 1, 1)), atol=1e-9)
     shift = np.linalg.norm(y[:, :3], axis=1)
     assert shift.mean() == pytest.approx(1.6 * REFINEMENTS[step].shift_mm, rel=0.3)
 
 
-@pytest.mark.parametrize("fine", [False, True])
-def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, fine):
-    x, y = rating_samples(NumberedFrame(), true, shape, 120, np.random.default_rng(0), fine=fine)
+@pytest.mark.parametrize("samples", [coarse_samples, fine_samples])
+def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, samples):
+    x, y = samples(NumberedFrame(), true, shape, 120, np.random.default_rng(0))
     assert y.shape == (120, 1)
     centre, rotation, log_scale, _ = seen(x)
-    error = pose_error(type(true.pose)(centre, rotation, log_scale), true, shape)
+    error = pose_error(Poses(centre, rotation, log_scale), true, shape)
     assert np.all(np.diff(y[np.argsort(error), 0]) <= 1e-9)
     assert y.max() > 0.5
     assert y.min() < 0.1
+
+
+def test_the_final_rating_learns_to_tell_front_from_back(shape, true):
+    # Poses in place but turned half about the valve's axis: there must be some, and rated low.
+    x, y = fine_samples(NumberedFrame(), true, shape, 240, np.random.default_rng(0))
+    centre, rotation, log_scale, _ = seen(x)
+    by = true.pose.repeated(240).towards(Poses(centre, rotation, log_scale))
+    back = (np.linalg.norm(by[:, :3], axis=1) < 8) & (np.abs(by[:, 5]) > 2.5)
+    right = (np.linalg.norm(by[:, :3], axis=1) < 3) & (np.linalg.norm(by[:, 3:6], axis=1) < 0.15)
+    assert back.sum() > 20
+    assert right.sum() > 20
+    assert y[back].max() < 0.15
+    assert y[right].min() > 0.3
+
+
+def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
+    # A search's mistakes rated as it rated them would be learned as right.
+    away = np.zeros((3, 7))
+    away[:, 0] = [0.0, 6.0, 60.0]
+    mistaken = true.pose.repeated(3).moved(away)
+    x, y = fine_samples(NumberedFrame(), true, shape, 60, np.random.default_rng(0), mistaken)
+    assert len(x) == len(y) == 63
+    np.testing.assert_allclose(seen(x)[0][-3:], mistaken.centre)
+    np.testing.assert_allclose(y[-3:, 0], np.exp(-np.array([0.0, 6.0, 60.0]) / 6.0), atol=1e-9)
 
 
 def test_an_oracle_of_nothing_rates_nothing():

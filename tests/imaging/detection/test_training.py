@@ -7,8 +7,16 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection import training
+from mvest.imaging.detection.detect import search_frame
 from mvest.imaging.detection.model import STAGES
-from mvest.imaging.detection.training import RenderedFrame, draw_samples, train_model, train_stage
+from mvest.imaging.detection.pose_search import PoseSearch
+from mvest.imaging.detection.training import (
+    Draft,
+    RenderedFrame,
+    draw_samples,
+    train_model,
+    train_stage,
+)
 from tests.imaging.detection.made_up import moving_valve
 
 
@@ -81,6 +89,50 @@ def test_a_model_is_trained_from_valves_in_turn(rendered, settings):
     assert len({which for _, which, *_ in rendered}) > 1
     assert told[:6] == [("volumes", k + 1, 6) for k in range(6)]
     assert told[-1] == ("stages", len(STAGES), len(STAGES))
+
+
+def test_a_draft_of_the_first_volumes_is_searched_with_in_the_others(
+    rendered, settings, monkeypatch
+):
+    # Mistakes of nothing, or of a search that saw the very volume, would be easy ones.
+    given = []
+    whole = training.volume_samples
+
+    def sampled(valve, number, shape, settings, seed, draft):
+        given.append((number, draft is not None))
+        return whole(valve, number, shape, settings, seed, draft)
+
+    monkeypatch.setattr(training, "volume_samples", sampled)
+    stages = []
+    stage = training.train_stage
+
+    def one_tree(name, x, y, settings, seed):
+        stages.append((name, len(x)))
+        return stage(name, x, y, settings, seed)
+
+    monkeypatch.setattr(training, "train_stage", one_tree)
+    told = replace(settings, volumes=3, draft_volumes=1)
+    train_model([moving_valve(k) for k in range(5)], told, 11)
+    assert given == [(0, False), (1, True), (2, True)]
+    assert {name for name, _ in stages[: -len(STAGES)]} == {
+        name for name in STAGES if name.startswith("po")
+    }
+    rows = dict(stages[-len(STAGES) :])
+    once = dict(stages[: -len(STAGES)])
+    assert rows["pose_coarse"] == 3 * once["pose_coarse"]
+    assert rows["pose_fine"] == 3 * once["pose_fine"] + 2 * settings.samples.mistaken
+
+
+def test_a_drafts_mistakes_are_its_best_and_some_others(trained, seen_valve):
+    draft = Draft(trained.position, trained.poses)
+    frame = seen_valve[0]
+    found = draft.taken_for_valves(frame, 10, np.random.default_rng(0))
+    assert len(found) == 10
+    best, ratings = search_frame(frame, trained, 5)
+    np.testing.assert_allclose(found.centre[:5], best.centre)
+    _, rated = PoseSearch(trained.poses.coarse, trained.poses.fine, ()).refined(frame, found, 10)
+    assert rated.max() == pytest.approx(ratings[0])
+    assert len(np.unique(found.centre.round(9), axis=0)) > 5
 
 
 def test_training_depends_on_its_seed_alone(rendered, settings):
