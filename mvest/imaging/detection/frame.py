@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 
 from mvest.errors import InputError
 from mvest.imaging.volume import VolumeSequence
@@ -19,6 +20,12 @@ VOXEL_MM = 0.8
 
 LEVELS = 4
 """Scales: cubes of 1, 2, 4 and 8 voxels."""
+
+SPARSE = 25
+"""Of 255: share of voxels with an echo below which a cell of 4 x 4 x 4 voxels counts as without."""
+
+FEWEST_CELLS = 20
+"""Such cells with an echo, below which there is no image."""
 
 LEAST_GREY_VALUES = 8
 """Different values below which a frame holds no image."""
@@ -111,11 +118,11 @@ def _ranks(grey: NDArray[np.float32], source: str, frame: int) -> NDArray[np.uin
         raise InputError(f"{source}, frame {frame}: all voxels are {low:g}, expected an image")
     # A byte's worth of levels: what more there is, ranks cannot show.
     binned = np.rint((grey - low) * (255 / (high - low))).astype(np.uint8)
-    # Outside the field of view there is nothing but the lowest value.
-    coarse = _halved(_halved(((binned > 0) * np.uint8(255)).astype(np.uint8)))
-    inside = ndimage.binary_dilation(coarse > 25, iterations=1)
-    inside = np.repeat(np.repeat(np.repeat(inside, 4, 0), 4, 1), 4, 2)
-    inside = inside[tuple(slice(0, k) for k in grey.shape)]
+    inside = _field_of_view(binned > 0)
+    if inside is None:
+        raise InputError(
+            f"{source}, frame {frame}: hardly any voxel is brighter than {low:g}, expected an image"
+        )
     count = np.bincount(binned[inside], minlength=256)
     if np.count_nonzero(count) < LEAST_GREY_VALUES:
         raise InputError(
@@ -125,6 +132,30 @@ def _ranks(grey: NDArray[np.float32], source: str, frame: int) -> NDArray[np.uin
     middle = (np.cumsum(count) - 0.5 * count) / count.sum()
     table = np.maximum(1, np.rint(255 * middle)).astype(np.uint8)
     return np.where(inside, table[binned], 0).astype(np.uint8)
+
+
+def _field_of_view(echo: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """The convex hull of all voxels with an echo: a pyramid, or the whole volume.
+
+    Blood that is as dark as what lies outside (low gain) is thereby inside. None if there is hardly
+    any echo.
+    """
+    coarse = _halved(_halved(np.where(echo, np.uint8(255), np.uint8(0)))) > SPARSE
+    points = np.argwhere(coarse).astype(np.float64)
+    if len(points) < FEWEST_CELLS:
+        return None
+    try:
+        planes = ConvexHull(points).equations
+    except QhullError:  # all in one plane
+        return None
+    cells = np.indices(coarse.shape).reshape(3, -1)
+    within = np.ones(cells.shape[1], dtype=np.bool_)
+    for plane in planes:
+        within &= plane[:3] @ cells + plane[3] < 1.0
+    whole: NDArray[np.bool_] = within.reshape(coarse.shape)
+    for axis in range(3):
+        whole = np.repeat(whole, 4, axis)
+    return whole[tuple(slice(0, size) for size in echo.shape)]
 
 
 def _halved(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
