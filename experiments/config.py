@@ -147,6 +147,31 @@ class PersonalConfig:
 
 
 @dataclass
+class ImagedConfig:
+    """From a volume over time to a case: what the file does not say."""
+
+    model: str | None = None  # file of the detection model
+    modality: str | None = None  # ultrasound, ct or mr, where the file does not say
+    frame_interval_s: float | None = None  # where the file states no times
+    time_unit: str | None = None  # s or ms, where the file states times without a unit
+    # Frame -> .mrk.json with landmarks placed by hand, where the automatic ones fail.
+    landmarks: dict[int, str] = field(default_factory=dict)
+    open_frame: int | None = None  # null: the one with the largest orifice
+    closed_frame: int | None = None  # null: the one whose leaflets touch most
+    pressure_mmHg: float | None = None  # transmitral, in the closed frame
+    pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
+    held_out: dict[int, float] = field(default_factory=dict)  # frame -> mmHg
+    thickness_mm: dict[str, float] = field(default_factory=dict)  # leaflet -> mm; empty: generic
+    least_confidence: float = 0.5  # of the frames that are chosen
+    error_samples: int = 12  # with which the valve is closed anew
+    name: str | None = None  # null: the name of the file
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False  # does the volume come from a simulation
+
+
+@dataclass
 class PatientConfig:
     """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
 
@@ -223,7 +248,9 @@ class Config:
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
     case: str | None = None  # folder of a case
-    check: bool = False  # only check the case and draw it
+    volume: str | None = None  # file of a volume over time
+    imaged: ImagedConfig = field(default_factory=ImagedConfig)
+    check: bool = False  # only check the case, or the image step of a volume, and draw it
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
     continuation: bool = True  # later closures start from the last closed state

@@ -28,6 +28,7 @@ from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
+from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
@@ -71,7 +72,8 @@ def run_job(config: DictConfig) -> None:
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["check"]:
-        print(check_case(values, folder))
+        check = check_volume if values["study"] == "volume" else check_case
+        print(check(values, folder))
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
@@ -198,6 +200,12 @@ STUDIES: dict[str, Study] = {
     ),
     "case": Study(
         run_case,
+        case_text,
+        write_case_tables,
+        lambda _results, _name, _record, _folder: [],
+    ),
+    "volume": Study(
+        run_volume,
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
