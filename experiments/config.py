@@ -154,14 +154,14 @@ class ImagedConfig:
     modality: str | None = None  # ultrasound, ct or mr, where the file does not say
     frame_interval_s: float | None = None  # where the file states no times
     time_unit: str | None = None  # s or ms, where the file states times without a unit
-    # Frame -> .mrk.json with landmarks placed by hand, where the automatic ones fail.
-    landmarks: dict[int, str] = field(default_factory=dict)
+    # [frame, .mrk.json] with landmarks placed by hand, where the automatic ones fail.
+    landmarks: list[Any] = field(default_factory=list)
     open_frame: int | None = None  # null: the one with the largest orifice
     closed_frame: int | None = None  # null: the one whose leaflets touch most
     pressure_mmHg: float | None = None  # transmitral, in the closed frame
     pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
-    held_out: dict[int, float] = field(default_factory=dict)  # frame -> mmHg
-    thickness_mm: dict[str, float] = field(default_factory=dict)  # leaflet -> mm; empty: generic
+    held_out: list[Any] = field(default_factory=list)  # [frame, mmHg]: closed frames not shown
+    thickness_mm: list[float] = field(default_factory=list)  # anterior, posterior; empty: generic
     least_confidence: float = 0.5  # of the frames that are chosen
     error_samples: int = 12  # with which the valve is closed anew
     name: str | None = None  # null: the name of the file

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,9 +122,11 @@ def find_valve(config: Values) -> FoundValve:
         raise InputError(
             f"{told['model']}: its accuracy was never measured, expected a model whose was"
         )
-    valve = detect_valve(volume, model, landmarks=_landmarks(told["landmarks"]))
-    thickness = dict(told["thickness_mm"]) or GENERIC_THICKNESS
-    rows = measure_sequence(valve, float(np.mean(list(thickness.values()))))
+    valve = detect_valve(
+        volume, model, landmarks=_landmarks(_pairs("landmarks", told["landmarks"], str))
+    )
+    thickness = _thickness(told["thickness_mm"], valve)
+    rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = _frames(told, volume, valve, rows)
     texts = CaseTexts(
         told["name"] or Path(config["volume"]).name.partition(".")[0],
@@ -137,7 +139,7 @@ def find_valve(config: Values) -> FoundValve:
         valve,
         frames,
         texts,
-        thickness_mm=dict(told["thickness_mm"]) or None,
+        thickness_mm=thickness,
         error_samples=samples_in_world(
             valve, frames, *_thinned(model.accuracy, told["error_samples"])
         ),
@@ -221,7 +223,31 @@ def _modality(name: str | None) -> Modality | None:
     return None if name is None else Modality(name)
 
 
-def _landmarks(files: Mapping[Any, str]) -> dict[int, dict[str, FloatArray]] | None:
+def _thickness(given: Sequence[float], valve: ValveSequence) -> dict[str, float] | None:
+    names = valve.layout.region_names
+    if given and len(given) != len(names):
+        raise ConfigurationError(
+            f"imaged.thickness_mm = {list(given)}, expected one number for each of "
+            f"{', '.join(names)}, or none"
+        )
+    return dict(zip(names, given, strict=True)) if given else None
+
+
+def _pairs(setting: str, given: Sequence[Any], kind: type) -> dict[int, Any]:
+    """Frame -> value of a setting that is a list of pairs."""
+    found: dict[int, Any] = {}
+    for pair in given:
+        whole = isinstance(pair, Sequence) and len(pair) == 2 and isinstance(pair[0], int)
+        if not whole or not isinstance(pair[1], (kind, int) if kind is float else kind):
+            raise ConfigurationError(
+                f"imaged.{setting} has {pair!r}, expected [frame, "
+                f"{'mmHg' if kind is float else 'FILE'}]"
+            )
+        found[pair[0]] = kind(pair[1])
+    return found
+
+
+def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | None:
     """Frame -> name -> position, of the files that a configuration names."""
     found: dict[int, dict[str, FloatArray]] = {}
     for frame, file in files.items():
@@ -237,7 +263,7 @@ def _landmarks(files: Mapping[Any, str]) -> dict[int, dict[str, FloatArray]] | N
                 f"{file}: points {', '.join(strange) or 'none'}, expected some of "
                 f"{', '.join(LANDMARKS)}"
             )
-        found[int(frame)] = points
+        found[frame] = points
     return found or None
 
 
@@ -245,7 +271,7 @@ def _frames(
     told: Values, volume: VolumeSequence, valve: ValveSequence, rows: list[Row]
 ) -> CaseFrames:
     pressure, closed = told["pressure_mmHg"], told["closed_frame"]
-    held = {int(frame): float(value) for frame, value in told["held_out"].items()}
+    held = _pairs("held_out", told["held_out"], float)
     if (pressure is None) == (told["pressure_curve"] is None):
         raise ConfigurationError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
