@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.build import build_filter, mechanics_of
+from experiments.imaging import require_imaging
 from experiments.job import require_study
 from experiments.tracking import require_no_password
 from mvest.errors import ConfigurationError, InputError, MvestError
@@ -30,6 +31,8 @@ def require_admissible(values: Mapping[str, Any]) -> None:
         if values.get(name) is not None and not values[name] > 0:
             raise ConfigurationError(f"{name} = {values[name]}, expected > 0")
     mechanics_of(values)
+    if values["study"] == "imaging":
+        require_imaging(values)
     if values["study"] != "twin":
         return
     build_filter(values["filter"], tuple(values["parameters"]))

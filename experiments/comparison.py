@@ -53,7 +53,8 @@ def parameters(config: Values, record: Values) -> dict[str, str]:
         The contents of ``result.json``.
     """
     names = short_names(record["parameters"])
-    left_out = {*NOT_COMPARED, *({"donor"} if config["study"] != "donor" else ())}
+    others = {"donor", "imaging"} - {config["study"]}
+    left_out = {*NOT_COMPARED, *others}
     found: dict[str, Any] = {}
     for name, value in _leaves({k: v for k, v in config.items() if k not in left_out}):
         if name in BY_PARAMETER:
@@ -127,6 +128,7 @@ def metrics(record: Values) -> list[tuple[str, float, int]]:
         (key, math.fsum(run.get(key) or 0 for run in runs), 0)
         for key in ("forward_solves", "seconds")
     ]
+    found += [(name, value, 0) for name, value in (record.get("measures") or {}).items()]
     return [(name, float(value), step) for name, value, step in found if value is not None]
 
 

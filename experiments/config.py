@@ -14,9 +14,12 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
+from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.detection.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.personalise import CaseMesh, PaperSettings
 from mvest.provenance import config_hash
+from mvest.simulated_motion import PopulationSettings
 from mvest.valve.template import TemplateParameters
 from mvest.virtual_patient import Deviations, Simulation
 
@@ -35,14 +38,20 @@ NOT_THE_RESULT = (
     "time_limit_s",
     "isolate",
     "check",
+    "imaging.processes",
+    "imaging.publish_model",
 )
-"""Parts of a configuration that change no number of the result, left out of its hash."""
+"""What in a configuration changes no number of the result, left out of its hash."""
 
 
+TemplateConfig = schema(TemplateParameters)
 CaseMeshConfig = schema(CaseMesh)
 PaperSettingsConfig = schema(PaperSettings)
 SimulationConfig = schema(Simulation)
 DeviationsConfig = schema(Deviations)
+PopulationSettingsConfig = schema(PopulationSettings)
+TrainingSettingsConfig = schema(TrainingSettings)
+DetectionSettingsConfig = schema(TrackingSettings)
 
 
 @dataclass
@@ -187,6 +196,45 @@ class PatientConfig:
 
 
 @dataclass
+class DrawnValvesConfig:
+    """A population of simulated valves."""
+
+    count: int = MISSING
+    seed: int = MISSING
+
+
+@dataclass
+class HeldOutConfig:
+    """What detectors are tested on: numbers of simulated volumes of valves that no training saw."""
+
+    volumes: int = MISSING  # of one frame, drawn as those of training are
+    shifted: int = MISSING  # of one frame, outside the ranges of training
+    curve_volumes: int = MISSING  # of each of these two, for detectors trained on fewer volumes
+    sequences: int = MISSING  # of all frames of a valve, drawn as those of training are
+    shifted_sequences: int = MISSING
+    without_valve: int = MISSING  # of each kind of volume in which there is none
+
+
+@dataclass
+class ImagingConfig:
+    """Detectors for valves in volumes: their training, and how well they do."""
+
+    bases: dict[str, TemplateConfig] = field(default_factory=dict)  # type: ignore[valid-type]
+    population: PopulationSettingsConfig = field(default_factory=PopulationSettingsConfig)  # type: ignore[valid-type]
+    train: DrawnValvesConfig = field(default_factory=DrawnValvesConfig)
+    calibration: DrawnValvesConfig = field(default_factory=DrawnValvesConfig)  # for the errors told
+    test: DrawnValvesConfig = field(default_factory=DrawnValvesConfig)
+    training: TrainingSettingsConfig = field(default_factory=TrainingSettingsConfig)  # type: ignore[valid-type]
+    curve: list[int] = field(default_factory=list)  # volumes of further, smaller trainings
+    detection: DetectionSettingsConfig = field(default_factory=DetectionSettingsConfig)  # type: ignore[valid-type]
+    evaluate: bool = True
+    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    targets: dict[str, Any] = field(default_factory=dict)  # setting -> column of the table -> limit
+    processes: int = 1
+    publish_model: bool = False  # make the model the one that comes with the package
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -224,7 +272,6 @@ class DiscretisationConfig:
 
 
 MechanicsConfig = schema(MechanicsSettings, DiscretisationConfig)
-TemplateConfig = schema(TemplateParameters)
 
 
 @dataclass
@@ -253,6 +300,7 @@ class Config:
     check: bool = False  # only check the case, or the image step of a volume, and draw it
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
+    imaging: ImagingConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes
@@ -287,7 +335,12 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
 
 def hash_of(config: DictConfig) -> str:
     """SHA-256 of everything in a configuration that can change the result."""
-    return config_hash(plain(config, NOT_THE_RESULT))
+    values = plain(config, NOT_THE_RESULT)
+    for name in NOT_THE_RESULT:
+        part, _, key = name.partition(".")
+        if key and values.get(part) is not None:
+            del values[part][key]
+    return config_hash(values)
 
 
 def register() -> None:

@@ -24,6 +24,7 @@ from experiments.folder import (
 )
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.imaging import publish_model, run_imaging
 from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
@@ -34,6 +35,7 @@ from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
+from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -95,6 +97,7 @@ def run_job(config: DictConfig) -> None:
         f"{folder}; force=true runs it again"
     )
     _publish(request, done)
+    study.finish(values, done, folder)
 
 
 def compute(request: Request) -> dict[str, Any]:
@@ -122,6 +125,7 @@ def compute(request: Request) -> dict[str, Any]:
     _publish(request, record)
     if record["status"] == "converged":
         mark_done(folder)
+    study.finish(values, record, folder)
     track_job(folder, values)
     _raise_failure(record, folder)
     return record
@@ -147,6 +151,10 @@ def _raise_failure(record: Mapping[str, Any], folder: Path) -> None:
         raise FailedRunError(record["reason"] + detail, folder)
 
 
+def _leave(values: Mapping[str, Any], record: Mapping[str, Any], folder: Path) -> None:
+    """Nothing more is done with a finished run."""
+
+
 @dataclass(frozen=True, slots=True)
 class Study:
     """A kind of study: how it is run, told, tabulated and published.
@@ -164,6 +172,9 @@ class Study:
     keeps_failures : bool
         Whether the results also take over a run that found no estimate: where a share of runs is
         counted, those must count that failed.
+    finish : callable
+        (configuration, record, output folder): what is done with a run that is on disk, also with
+        one that was done before.
     """
 
     run: Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]]
@@ -171,6 +182,7 @@ class Study:
     tables: Callable[[Path, Mapping[str, Any]], list[Path]]
     publish: Callable[[Path, str, Mapping[str, Any], Path], list[Path]]
     keeps_failures: bool = False
+    finish: Callable[[Mapping[str, Any], Mapping[str, Any], Path], None] = _leave
 
 
 STUDIES: dict[str, Study] = {
@@ -218,6 +230,13 @@ STUDIES: dict[str, Study] = {
             results, name, record, folder / "fields.npz"
         ),
         keeps_failures=True,
+    ),
+    "imaging": Study(
+        run_imaging,
+        imaging_text,
+        write_imaging_study,
+        lambda results, _name, record, _folder: publish_imaging(results, record),
+        finish=publish_model,
     ),
 }
 """Kinds of studies that a configuration can name."""

@@ -48,10 +48,21 @@ def _field(kind: Any, plain: Any) -> Any:
     if isinstance(plain, list):
         return dataclasses.field(default_factory=lambda: list(plain))
     if dataclasses.is_dataclass(kind):
-        return dataclasses.field(default_factory=lambda: typing.cast(type, kind)(**plain))
+        return dataclasses.field(default_factory=lambda: _instance(kind, plain))
     if isinstance(plain, dict):
         return dataclasses.field(default_factory=lambda: dict(plain))
     return dataclasses.field(default=plain)
+
+
+def _instance(kind: Any, plain: Mapping[str, Any]) -> Any:
+    """A schema with values from plain data, schemas within it included."""
+    kinds = {field.name: field.type for field in dataclasses.fields(kind)}
+    return kind(
+        **{
+            name: _instance(kinds[name], value) if dataclasses.is_dataclass(kinds[name]) else value
+            for name, value in plain.items()
+        }
+    )
 
 
 def _config_type(hint: Any) -> Any:
@@ -62,7 +73,7 @@ def _config_type(hint: Any) -> Any:
         # OmegaConf takes 1 for a float, but not within a list of lists.
         nested = typing.get_origin(arguments[0]) is tuple
         return list[Any] if nested else list[_config_type(arguments[0])]  # type: ignore[misc]
-    if origin is dict:
+    if origin in (dict, Mapping):
         return dict[str, _config_type(arguments[1])]  # type: ignore[misc]
     if origin in (types.UnionType, typing.Union):
         return typing.Optional[_config_type(arguments[0])]  # noqa: UP045
@@ -101,7 +112,7 @@ def _value(hint: Any, value: Any) -> Any:
         return build(typing.cast(type, hint), value)
     if origin is tuple and isinstance(value, Sequence):
         return tuple(_value(arguments[0], item) for item in value)
-    if origin is dict and isinstance(value, Mapping):
+    if origin in (dict, Mapping) and isinstance(value, Mapping):
         return {key: _value(arguments[1], item) for key, item in value.items()}
     if origin in (types.UnionType, typing.Union):
         return _value(arguments[0], value)

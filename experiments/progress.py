@@ -15,7 +15,7 @@ from experiments.folder import last_record, result_time
 from experiments.plan import Plan, PlannedJob
 from mvest.mechanics.solid import kernels_are_compiled
 
-__all__ = ["SolveBar", "SweepBar", "announce_compilation"]
+__all__ = ["PartBar", "SolveBar", "SweepBar", "announce_compilation"]
 
 LOOK = 0.5
 """Seconds between two looks at the folders of a sweep."""
@@ -75,6 +75,41 @@ class SolveBar:
         if self._bar.total is not None and self._bar.n >= self._bar.total:
             self._bar.total += self._steps
         self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
+        self._bar.update(1)
+
+
+class PartBar:
+    """A bar over the equal pieces of one part of a study, and a line when the part is done.
+
+    Parameters
+    ----------
+    title : str
+    total : int
+        Pieces.
+    unit : str
+    """
+
+    def __init__(self, title: str, total: int, unit: str) -> None:
+        self._title = title
+        self._began = time.monotonic()
+        self._bar = tqdm(total=total, desc=title, unit=unit, disable=None, leave=False)
+
+    def __enter__(self) -> PartBar:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.close()
+        if kind is None:
+            spent = tqdm.format_interval(time.monotonic() - self._began)
+            print(f"{self._title}: done in {spent}", file=sys.stderr, flush=True)
+
+    def step(self) -> None:
+        """One more piece is done."""
         self._bar.update(1)
 
 

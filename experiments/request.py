@@ -81,8 +81,8 @@ def model_settings(values: Mapping[str, Any]) -> dict[str, Any]:
 def as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
     """Whether a run is its experiment as configured: nothing overridden that changes the result."""
     allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
-    keys = (re.split(r"[=.]", override.lstrip("+~"), maxsplit=1)[0] for override in overrides)
-    return all(key in allowed for key in keys)
+    keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
+    return all(key in allowed or key.partition(".")[0] in allowed for key in keys)
 
 
 def _slug(values: Mapping[str, Any], hydra: Any) -> str:

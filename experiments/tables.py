@@ -11,7 +11,8 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
-from mvest.reporting.imaging_tables import write_imaging_tables, write_volume_tables
+from mvest.reporting.imaging_study import write_imaging_study
+from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
 from mvest.reporting.publish import RECORDS, regenerate
@@ -24,7 +25,7 @@ OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
     "donor": write_donor_tables,
-    "imaging": write_imaging_tables,
+    "imaging": write_imaging_study,
     "volume": write_volume_tables,
 }
 """Tables of studies with records of their own."""

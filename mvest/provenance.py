@@ -28,6 +28,7 @@ KEY_PACKAGES = (
     "ipctk",
     "pytetwild",
     "meshio",
+    "lightgbm",
     "hydra-core",
     "mlflow",
 )

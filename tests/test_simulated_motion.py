@@ -209,18 +209,25 @@ def test_a_valve_that_stays_open_leaks():
     assert reason_of(still(), MotionLimits()) is Refusal.LEAKS
 
 
+def test_free_edges_that_do_not_lie_at_each_other_are_apart():
+    assert reason_of(still(), MotionLimits(orifice=2.0)) is Refusal.APART
+
+
 def test_a_free_edge_above_the_annulus_flails():
     rest = still().vertices[0]
     up = rest * np.array([1, 1, -1.0])
-    limits = MotionLimits(orifice=2.0, stretch=10.0)
+    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
     assert reason_of(still(vertices=up), limits) is Refusal.FLAILS
     check_motion(still(), 1, limits)
 
 
 def test_a_leaflet_that_is_much_longer_is_stretched():
     rest = still().vertices[0]
-    assert reason_of(still(vertices=1.7 * rest), MotionLimits(orifice=5.0)) is Refusal.STRETCHED
-    check_motion(still(vertices=1.5 * rest), 1, MotionLimits(orifice=5.0))
+    assert (
+        reason_of(still(vertices=1.7 * rest), MotionLimits(orifice=5.0, edge_gap=50.0))
+        is Refusal.STRETCHED
+    )
+    check_motion(still(vertices=1.5 * rest), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
 
 
 def test_leaflets_that_have_changed_sides_have_crossed():
@@ -228,11 +235,13 @@ def test_leaflets_that_have_changed_sides_have_crossed():
     s = LAYOUT.s[:, None]
     # Free edges beyond the opposite ones.
     x[:, 1:2] -= 2.0 * s * (x[:, 1:2] - 1.8)
-    limits = MotionLimits(orifice=2.0, stretch=10.0)
+    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
     assert reason_of(still(vertices=x), limits) is Refusal.CROSSED
 
 
-@pytest.mark.parametrize("change", [{"orifice": 0.0}, {"stretch": 1.0}, {"crossings": -1}])
+@pytest.mark.parametrize(
+    "change", [{"orifice": 0.0}, {"edge_gap": 0.0}, {"stretch": 1.0}, {"crossings": -1}]
+)
 def test_limits_are_checked(change):
     with pytest.raises(InputError, match="limits of a motion"):
         MotionLimits(**change)
@@ -508,7 +517,7 @@ def made(monkeypatch):
 
     monkeypatch.setattr(patients, "closing_frames", close)
     monkeypatch.setattr(patients, "patient_model", model)
-    wide = MotionLimits(2.0, 50.0, 10.0, 100_000)
+    wide = MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000)
     displaced = dict.fromkeys(REGISTRATION, 3.0)
     simulation = replace(SIMULATION, contact_columns=32, contact_rows=9)
     return simulate_imaged_patient(

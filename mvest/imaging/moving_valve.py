@@ -61,5 +61,5 @@ class MovingValve:
             found = np.shape(getattr(self, name))
             if found != shape:
                 raise InputError(f"moving valve {self.name}, {name}: shape {found}, not {shape}")
-        if t < 1 or np.any(np.diff(self.times) <= 0):
+        if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
             raise InputError(f"moving valve {self.name}: times {self.times} s do not increase")

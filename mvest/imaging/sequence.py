@@ -58,7 +58,7 @@ class ValveSequence:
             found = np.shape(getattr(self, name))
             if found != shape:
                 raise InputError(f"valve sequence {name}: shape {found}, expected {shape}")
-        if t < 1 or np.any(np.diff(self.times) <= 0):
+        if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
             raise InputError(f"valve sequence times {self.times} s, expected increasing ones")
 
     @property

@@ -163,8 +163,8 @@ def write_imaging_tables(results: Path, record: Record) -> list[Path]:
     results : Path
     record : mapping
         ``rows`` as for `imaging_table`, ``targets`` as for `imaging_words` (may be missing),
-        ``training`` rows as for `training_figure` (may be missing), ``experiment`` and
-        ``provenance``.
+        ``training`` rows as for `training_figure` (may be missing), ``notes`` (sentences, may be
+        missing), ``experiment`` and ``provenance``.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def write_imaging_tables(results: Path, record: Record) -> list[Path]:
             for name, limit in own.items():
                 goal[name] = f"{'≥' if name in AT_LEAST else '≤'} {number(limit)}"
             readable.append(goal)
-    notes = [TRUTH_OF_VALVES, *imaging_words(table, targets)]
+    notes = [TRUTH_OF_VALVES, *imaging_words(table, targets), *record.get("notes", ())]
     line = provenance_line(record)
     written = write_table(results / "imaging", table, readable, line, notes)
     figure = distance_figure(record["rows"])

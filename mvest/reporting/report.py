@@ -53,6 +53,11 @@ OTHERS = (
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
+    (
+        "imaging",
+        "Leaflets found in simulated echo volumes",
+        ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
+    ),
     ("donor", "A recorded donor valve", ("donor",)),
     ("benchmark", "How fast", ("benchmark",)),
 )
@@ -65,6 +70,10 @@ CAPTIONS = {
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",
     "population": "Estimates with their 95 % intervals against the hidden truth. Simulated.",
+    "imaging_distance": "Distance of found leaflets from true ones, volume by volume. Simulated.",
+    "imaging_training": "Errors of each stage against the number of training volumes. Simulated.",
+    "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
+    "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "benchmark": "Where the time goes.",
 }

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import lightgbm
 import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
+from mvest.imaging.detection.tree_text import checked_trees
 from mvest.typing import FloatArray
 
 __all__ = ["BoostSettings", "Boosters", "train_boosters"]
@@ -59,12 +59,32 @@ class BoostSettings:
 
 
 class Boosters:
-    """Trees for each of several outputs of the same features."""
+    """Trees for each of several outputs of the same features.
+
+    Parameters
+    ----------
+    texts : tuple of str
+        As LightGBM writes trees, one for each output.
+    source : str
+        Named in errors.
+
+    Raises
+    ------
+    InputError
+        If there is no text, one is malformed, or they look at different features.
+    """
 
     def __init__(self, texts: tuple[str, ...], source: str = "model") -> None:
-        self.texts = texts
+        import lightgbm  # here, as it takes a second that studies without images need not wait
+
+        checked = [checked_trees(text, source) for text in texts]
+        self.texts, self._source = tuple(text for text, _ in checked), source
+        counts = {features for _, features in checked}
+        if len(counts) != 1:
+            raise InputError(f"{source}: trees of {sorted(counts)} features, expected one number")
+        self.features = counts.pop()
         try:
-            self._boosters = [lightgbm.Booster(model_str=text) for text in texts]
+            self._boosters = [lightgbm.Booster(model_str=text) for text in self.texts]
         except lightgbm.basic.LightGBMError as fault:
             raise InputError(f"{source}: no trees that LightGBM reads ({fault})") from fault
 
@@ -78,6 +98,11 @@ class Boosters:
 
     def __call__(self, x: NDArray[np.float32]) -> FloatArray:
         """Outputs ``(P, outputs)`` for features ``(P, F)``."""
+        if x.shape[1] != self.features:
+            raise InputError(
+                f"{self._source}: trees look at {self.features} features, found {x.shape[1]}; the "
+                "model is of another version"
+            )
         if not len(x):
             return np.zeros((0, self.outputs))
         found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
@@ -97,18 +122,20 @@ def train_boosters(
     Parameters
     ----------
     objective : str
-        ``regression`` (least squares) or ``binary`` (probability).
+        ``regression`` (least squares), or ``cross_entropy`` (probability; labels from 0 to 1).
     """
+    import lightgbm
+
     data = lightgbm.Dataset(
         x,
-        label=y[:, 0],
+        label=np.ascontiguousarray(y[:, 0]),
         weight=weight,
         free_raw_data=False,
         params={"max_bin": 63, "verbosity": -1},
     )
     texts = []
     for k in range(y.shape[1]):
-        data.set_label(y[:, k])
+        data.set_label(np.ascontiguousarray(y[:, k]))
         booster = lightgbm.train(
             settings.parameters(objective, seed + k), data, num_boost_round=settings.trees
         )

@@ -145,7 +145,8 @@ class BoundaryDetector:
         """
         axes = leaflet_axes(vertices, layout)
         normals = axes[:, :, 2]
-        off = np.arange(-reach_mm, reach_mm + 1e-9, STEP_MM)
+        steps = int(reach_mm / STEP_MM + 1e-9)
+        off = STEP_MM * np.arange(-steps, steps + 1)
         points = vertices[:, None] + off[:, None] * normals[:, None]
         which = np.repeat(np.arange(layout.size), len(off))
         values = features(frame, PATTERN, points.reshape(-1, 3), np.repeat(axes, len(off), 0))

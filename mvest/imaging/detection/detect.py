@@ -13,7 +13,7 @@ from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.landmarks import landmark_vertices
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 
 __all__ = ["FitSettings", "FrameValve", "fit_frame", "search_frame"]
 
@@ -24,6 +24,10 @@ LANDMARK_STD_MM = 1.2
 RIM_STD_MM = (0.8, 0.8)
 """mm, least standard deviation of a landmark's, a rim's and the boundary's pull: what the spread of
 votes does not tell."""
+
+HAND_STD_MM = (0.2, 0.03)
+"""mm, of landmarks placed by hand: while the shape is fitted, and for the free displacement, which
+is to end there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class FitSettings:
         Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
     """
 
-    modes: tuple[int, ...] = (10, 12, 12)
+    modes: tuple[int, ...] = (14, 25, 40)
     reach_mm: tuple[float, ...] = (6.0, 4.0, 3.0)
     alike: float = 8.0
     stiffness: float = 4.0
@@ -128,7 +132,8 @@ def fit_frame(
         points[k] = point
     tips = points[len(at) :]
     std = np.hypot(
-        np.where(np.isin(np.arange(len(at)), free), LANDMARK_STD_MM, 0.2), spread[: len(at)]
+        np.where(np.isin(np.arange(len(at)), free), LANDMARK_STD_MM, HAND_STD_MM[0]),
+        spread[: len(at)],
     )
     stages["landmarks"] = points
     pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
@@ -140,20 +145,22 @@ def fit_frame(
         pulls, confidence = _seen(
             frame, model, vertices, float(pose.log_scale[0]), reach, told.alike
         )
-        if len(manual):
-            hand = Pulls.to_points(
-                at[manual], vertices[at[manual]], points[manual], np.full(len(manual), 0.2)
-            )
-            pulls = Pulls.joined([pulls, hand])
+        hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[0])
+        pulls = Pulls.joined([pulls, hand])
         pose, b = fit_shape(shape, pose, b, pulls)
         stages[f"shape fit {modes}"] = pose.world(shape.shape(b[None]))[0]
     vertices = pose.world(shape.shape(b[None]))[0]
     pulls, confidence = _seen(
         frame, model, vertices, float(pose.log_scale[0]), told.reach_mm[-1], told.alike
     )
-    vertices = relax(vertices, layout, pulls, told.stiffness, told.hold)
+    hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
+    vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), told.stiffness, told.hold)
     rating = float(model.poses.refined(frame, pose, 1)[1][0])
     return FrameValve(begin, pose, b, vertices, tips, rating, confidence, stages)
+
+
+def _by_hand(at: IntArray, vertices: FloatArray, points: FloatArray, std: float) -> Pulls:
+    return Pulls.to_points(at, vertices[at], points, np.full(len(at), std))
 
 
 def _seen(

@@ -28,7 +28,10 @@ from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
-__all__ = ["Accuracy", "DetectionModel", "load_model", "save_model"]
+__all__ = ["MODEL_FILE", "Accuracy", "DetectionModel", "default_model", "load_model", "save_model"]
+
+MODEL_FILE = Path(__file__).resolve().parent.parent / "models" / "tee.npz"
+"""The trained model that comes with the package."""
 
 FORMAT = "mvest detection model"
 VERSION = 1
@@ -178,6 +181,22 @@ def load_model(path: Path | str) -> DetectionModel:
         if isinstance(fault, InputError):
             raise
         raise InputError(f"{source}: {fault}; expected a {FORMAT} of version {VERSION}") from fault
+
+
+def default_model() -> DetectionModel:
+    """The model that comes with the package, trained on simulated transoesophageal echo.
+
+    Raises
+    ------
+    InputError
+        If the package holds none, or it cannot be read.
+    """
+    if not MODEL_FILE.is_file():
+        raise InputError(
+            f"{MODEL_FILE}: no trained detectors come with this installation; expected what "
+            "python -m experiments.run experiment=imaging imaging.publish_model=true makes"
+        )
+    return load_model(MODEL_FILE)
 
 
 def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:

@@ -130,20 +130,25 @@ def _sample(
             y = (y + 0.5) * scale - 0.5
             z = (z + 0.5) * scale - 0.5
             nx, ny, nz = shapes[level, 0], shapes[level, 1], shapes[level, 2]
-            if x < -0.5 or y < -0.5 or z < -0.5 or x > nx - 0.5 or y > ny - 0.5 or z > nz - 0.5:
+            # Asked so that a place that is no number is outside.
+            if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5 and -0.5 <= z <= nz - 0.5):
                 out[p, f] = 0.0
                 continue
-            x = min(max(x, 0.0), nx - 1.001)
-            y = min(max(y, 0.0), ny - 1.001)
-            z = min(max(z, 0.0), nz - 1.001)
+            x = min(max(x, 0.0), nx - 1.0)
+            y = min(max(y, 0.0), ny - 1.0)
+            z = min(max(z, 0.0), nz - 1.0)
             i, j, k = int(x), int(y), int(z)
             u, v, w = x - i, y - j, z - k
+            # From each last voxel there is no step to a neighbour.
+            di = ny * nz if i + 1 < nx else 0
+            dj = nz if j + 1 < ny else 0
+            dk = 1 if k + 1 < nz else 0
             a = starts[level] + (i * ny + j) * nz + k
-            b = a + ny * nz
-            low = (data[a] * (1 - w) + data[a + 1] * w) * (1 - v) + (
-                data[a + nz] * (1 - w) + data[a + nz + 1] * w
+            b = a + di
+            low = (data[a] * (1 - w) + data[a + dk] * w) * (1 - v) + (
+                data[a + dj] * (1 - w) + data[a + dj + dk] * w
             ) * v
-            high = (data[b] * (1 - w) + data[b + 1] * w) * (1 - v) + (
-                data[b + nz] * (1 - w) + data[b + nz + 1] * w
+            high = (data[b] * (1 - w) + data[b + dk] * w) * (1 - v) + (
+                data[b + dj] * (1 - w) + data[b + dj + dk] * w
             ) * v
             out[p, f] = low * (1 - u) + high * u

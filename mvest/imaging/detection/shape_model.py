@@ -77,18 +77,18 @@ def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
     ]
     if len(shapes) <= modes:
         raise InputError(f"shape model: {len(shapes)} shapes, expected more than {modes} modes")
-    sizes = [float(np.exp(pose_of(v, t, layout).log_scale[0])) for v, t in shapes]
-    size = float(np.exp(np.mean(np.log(sizes))))
+    # Every valve counts alike, however many frames it has.
+    weight = np.concatenate([np.full(len(v.vertices), 1 / len(v.vertices)) for v in valves])
+    weight /= weight.sum()
+    size = float(np.exp(weight @ [pose_of(v, t, layout).log_scale[0] for v, t in shapes]))
     local, tips = [], []
     for vertices, tip in shapes:
         pose = pose_of(vertices, tip, layout, size)
         local.append(pose.local(vertices[None])[0])
         tips.append(pose.local(tip[None])[0])
     stacked = np.stack(local).reshape(len(local), -1)
-    mean = stacked.mean(axis=0)
-    # Every valve counts alike, however many frames it has.
-    weight = np.concatenate([np.full(len(v.vertices), 1 / len(v.vertices)) for v in valves])
-    root = np.sqrt(weight / weight.sum())[:, None]
+    mean = weight @ stacked
+    root = np.sqrt(weight)[:, None]
     _, values, vectors = np.linalg.svd(root * (stacked - mean), full_matrices=False)
     return ShapeModel(
         layout,
@@ -96,5 +96,5 @@ def fit_shape_model(valves: Sequence[MovingValve], modes: int) -> ShapeModel:
         mean.reshape(-1, 3),
         vectors[:modes].reshape(modes, -1, 3),
         values[:modes],
-        np.stack(tips).mean(axis=0),
+        np.tensordot(weight, np.stack(tips), axes=1),
     )

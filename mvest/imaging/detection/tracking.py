@@ -144,6 +144,12 @@ def _checked(
                 f"{', '.join(known)}"
             )
         found[frame] = {known[name]: np.asarray(point, float) for name, point in points.items()}
+        for name, point in points.items():
+            if np.shape(point) != (3,) or not np.isfinite(point).all():
+                raise InputError(
+                    f"landmarks of frame {frame}, {name}: {np.asarray(point).tolist()}, expected "
+                    "three finite coordinates"
+                )
     return found
 
 

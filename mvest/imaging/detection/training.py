@@ -35,6 +35,7 @@ from mvest.imaging.simulator import (
     simulate_volume,
     true_sequence,
 )
+from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -45,6 +46,8 @@ __all__ = [
     "draw_samples",
     "render_frame",
     "train_model",
+    "train_stage",
+    "volume_samples",
 ]
 
 Setting: TypeAlias = Literal["training", "shifted"]
@@ -129,12 +132,15 @@ class RenderedFrame:
         In world coordinates, as are the tips.
     tips : (2, 3) mm
     acquisition : Acquisition
+    volume : VolumeSequence
+        Of this frame alone.
     """
 
     frame: StandardFrame
     vertices: FloatArray
     tips: FloatArray
     acquisition: Acquisition
+    volume: VolumeSequence
 
 
 def render_frame(
@@ -146,13 +152,28 @@ def render_frame(
     probe = draw_probe(rng, acquisition)
     volume = simulate_volume(valve, acquisition, probe, int(rng.integers(2**31)), frames=[which])
     true = true_sequence(valve, probe, [which])
-    return RenderedFrame(standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition)
+    return RenderedFrame(
+        standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition, volume
+    )
 
 
-def _job(
-    valve: MovingValve, seed: np.random.SeedSequence, shape: ShapeModel, settings: TrainingSettings
+def volume_samples(
+    valve: MovingValve, number: int, shape: ShapeModel, settings: TrainingSettings, seed: int
 ) -> Samples:
-    render, sample = seed.spawn(2)
+    """Simulate one training volume and sample it for all stages.
+
+    Parameters
+    ----------
+    valve : MovingValve
+        Of N valves the one with the number ``number % N``.
+    number : int
+        Of the volume, from 0 on. It does not depend on how many others there are.
+    shape : ShapeModel
+    settings : TrainingSettings
+    seed : int
+        Of the training.
+    """
+    render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
     seen = render_frame(valve, which, settings.acquisition, "training", render)
     true = TrueValve.of(seen.vertices, seen.tips, shape)
@@ -168,8 +189,18 @@ def train_stage(
     settings: TrainingSettings,
     seed: int,
 ) -> Boosters:
-    """Trees of one stage from its samples."""
-    boosting = settings.boosting
+    """Trees of one stage from its samples, those of all volumes one after another.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`mvest.imaging.detection.model.STAGES`.
+    x, y : (P, F), (P, outputs)
+    settings : TrainingSettings
+    seed : int
+        Of the training.
+    """
+    boosting, seed = settings.boosting, seed + 1000 * STAGES.index(name)
     if name == "boundary":
         boosting = replace(boosting, trees=settings.boundary_trees)
         return train_boosters(x, y.astype(np.float64), boosting, seed, "cross_entropy")
@@ -209,11 +240,10 @@ def train_model(
         raise InputError("training: no valves")
     tell = progress or (lambda what, done, all_: None)
     shape = fit_shape_model(valves, settings.modes)
-    seeds = np.random.SeedSequence(seed).spawn(settings.volumes)
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
         drawn = parallel(
-            joblib.delayed(_job)(valves[k % len(valves)], seeds[k], shape, settings)
+            joblib.delayed(volume_samples)(valves[k % len(valves)], k, shape, settings, seed)
             for k in range(settings.volumes)
         )
         samples: list[Samples] = []
@@ -226,9 +256,9 @@ def train_model(
                 np.concatenate([part[name][0] for part in samples]),
                 np.concatenate([part[name][1] for part in samples]),
                 settings,
-                seed + 1000 * number,
+                seed,
             )
-            for number, name in enumerate(STAGES)
+            for name in STAGES
         )
         boosters = {}
         for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):

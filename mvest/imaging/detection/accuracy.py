@@ -1,0 +1,164 @@
+"""How far detectors are off on held-out sequences, and over what distance alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.spatial.distance import cdist
+
+from mvest.errors import InputError
+from mvest.imaging.detection.model import Accuracy
+from mvest.typing import FloatArray
+
+__all__ = [
+    "Correlogram",
+    "correlogram",
+    "fitted_length",
+    "matern",
+    "measure_accuracy",
+    "share_within",
+]
+
+BIN_MM = 1.0
+"""mm, width of the bins of distances."""
+
+FARTHEST_MM = 30.0
+"""mm, pairs farther apart say nothing about the length over which neighbours are alike."""
+
+LENGTHS_MM = (0.5, 60.0)
+"""mm, between which the length is looked for."""
+
+NORMAL_95 = 1.959963984540054
+"""Standard deviations on either side that hold 95 % of a normal distribution."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlogram:
+    """Correlation of errors against distance.
+
+    Attributes
+    ----------
+    distance : (B,) mm
+        Mean distance of each bin's pairs.
+    correlation : (B,)
+    pairs : (B,)
+    """
+
+    distance: FloatArray
+    correlation: FloatArray
+    pairs: FloatArray
+
+
+def matern(distance: FloatArray, length: float) -> FloatArray:
+    """Matérn correlation of smoothness 3/2, which estimators take errors to have.
+
+    ``(1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` (Rasmussen and Williams, Gaussian Processes for
+    Machine Learning, 2006, eq. 4.17).
+    """
+    d = np.sqrt(3.0) * np.asarray(distance) / length
+    return np.asarray((1.0 + d) * np.exp(-d))
+
+
+def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
+    """How alike errors are at two vertices, by the vertices' straight distance.
+
+    Parameters
+    ----------
+    errors : (m, n)
+        Of m independent fields, each about zero.
+    points : (n, 3) mm
+        Where the vertices are at rest.
+
+    Returns
+    -------
+    Correlogram
+        Bins up to 30 mm; each value is a mean over pairs, errors over their standard deviations.
+    """
+    size = np.sqrt((errors**2).mean(axis=0))
+    if not (np.isfinite(size).all() and (size > 0).all()):
+        raise InputError("errors of detectors: none at some vertex, expected finite ones > 0")
+    scaled = errors / size
+    product = scaled.T @ scaled / len(scaled)
+    first, second = np.triu_indices(len(points), 1)
+    distance = cdist(points, points)[first, second]
+    number = (distance / BIN_MM).astype(np.int64)
+    near = distance < FARTHEST_MM
+    pairs = np.bincount(number[near]).astype(np.float64)
+    some = pairs > 0
+
+    def mean(values: FloatArray) -> FloatArray:
+        total = np.bincount(number[near], weights=values[near])
+        return np.asarray(total[some] / pairs[some])
+
+    return Correlogram(mean(distance), mean(product[first, second]), pairs[some])
+
+
+def fitted_length(found: Correlogram) -> float:
+    """The length (mm) of the Matérn correlation that is nearest to a correlogram, bin by bin."""
+
+    def miss(log_length: float) -> float:
+        gap = matern(found.distance, np.exp(log_length)) - found.correlation
+        return float((gap**2).sum())
+
+    low, high = np.log(LENGTHS_MM)
+    best = minimize_scalar(miss, bounds=(low, high), method="bounded")
+    return float(np.exp(best.x))
+
+
+def measure_accuracy(
+    samples: FloatArray, tip_samples: FloatArray, rest: FloatArray
+) -> tuple[Accuracy, Correlogram]:
+    """What held-out sequences say of the detectors' errors.
+
+    Parameters
+    ----------
+    samples : (S, F, n, 3) mm
+        Found minus true in the valve's axes, of S sequences in F frames.
+    tip_samples : (S, F, 2, 3) mm
+    rest : (n, 3) mm
+        The mean valve at rest.
+
+    Returns
+    -------
+    Accuracy
+        The standard deviation of a vertex is the root mean square over sequences, frames and
+        coordinates of its errors about their mean over the sequences (in each frame and coordinate,
+        so that S - 1 of S are free).
+    Correlogram
+        From which its length was fitted.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two sequences, shapes do not fit, or an error is not finite.
+    """
+    count, frames, n = samples.shape[:3]
+    if count < 2:
+        raise InputError(f"accuracy of detectors: {count} sequences, expected two or more")
+    if samples.shape != (count, frames, len(rest), 3) or tip_samples.shape != (count, frames, 2, 3):
+        raise InputError(
+            f"accuracy of detectors: errors {samples.shape} and {tip_samples.shape} of {len(rest)} "
+            "vertices, expected (S, F, n, 3) and (S, F, 2, 3)"
+        )
+    if not (np.isfinite(samples).all() and np.isfinite(tip_samples).all()):
+        raise InputError("accuracy of detectors: errors that are not finite")
+    about = samples - samples.mean(axis=0)
+    std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
+    found = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
+    return Accuracy(std, fitted_length(found), samples, tip_samples), found
+
+
+def share_within(errors: FloatArray, std_mm: FloatArray, mean: FloatArray | None = None) -> float:
+    """Share of coordinates of held-out errors that lie within 1.96 standard deviations.
+
+    Parameters
+    ----------
+    errors : (S, F, n, 3) mm
+    std_mm : (n,)
+    mean : (F, n, 3) mm, optional
+        Taken off first.
+    """
+    off = errors if mean is None else errors - mean
+    return float((np.abs(off) <= NORMAL_95 * std_mm[:, None]).mean())

@@ -1,0 +1,108 @@
+"""Orientations are rated at places and refined: with ratings that are right, to the true pose."""
+
+import numpy as np
+import pytest
+
+from mvest.imaging.detection import pose_search
+from mvest.imaging.detection.pose_search import (
+    REFINEMENTS,
+    PoseSearch,
+    pose_error,
+    rating_samples,
+    refinement_samples,
+)
+from tests.imaging.detection.made_up import (
+    NumberedFrame,
+    Oracle,
+    geometry,
+    placed,
+    poses,
+    rating_oracle,
+    refinement_oracle,
+    seen,
+)
+
+
+@pytest.fixture
+def true(shape, monkeypatch):
+    monkeypatch.setattr(pose_search, "features", geometry)
+    return placed(shape, poses(1, 2), np.zeros(2))
+
+
+def search(shape, true, share=0.8):
+    rating = rating_oracle([true], shape)
+    return PoseSearch(rating, rating, (refinement_oracle([true], share),) * 3)
+
+
+def test_the_error_of_a_pose_is_how_far_it_lays_points_astray(shape, true):
+    assert pose_error(true.pose, true, shape)[0] == pytest.approx(0.0, abs=1e-9)
+    shifted = true.pose.moved(np.array([[3.0, 4.0, 0, 0, 0, 0, 0]]))
+    assert pose_error(shifted, true, shape)[0] == pytest.approx(5.0)
+    # Turned half about z it is wrong by more than its size: such a pose must not look good.
+    about = true.pose.moved(np.array([[0.0, 0, 0, 0, 0, np.pi, 0]]))
+    assert pose_error(about, true, shape)[0] > 20.0
+
+
+def test_the_search_finds_the_pose_from_places_nearby(shape, true):
+    # Orientations tied to the wrong places, or the coarse rating taken upside down.
+    rng = np.random.default_rng(0)
+    places = true.pose.centre + np.array([[30.0, 0, 0], [3.0, -2.0, 2.0], [0, -25.0, 9.0]])
+    found, ratings = search(shape, true)(NumberedFrame(), places, 4)
+    assert len(found) == 4
+    assert np.all(np.diff(ratings) <= 0)
+    assert pose_error(found, true, shape)[0] < 1.0
+    order = rng.permutation(3)
+    again, _ = search(shape, true)(NumberedFrame(), places[order], 1)
+    assert pose_error(again, true, shape)[0] < 1.0
+
+
+def test_refinement_takes_back_a_share_at_every_step(shape, true):
+    # One step skipped, or a step applied in world axes, leaves more than this.
+    start = true.pose.moved(np.array([[6.0, -4.0, 3.0, 0.3, -0.2, 0.3, 0.1]]))
+    before = start.towards(true.pose)[0]
+    found, _ = search(shape, true, 0.5).refined(NumberedFrame(), start, 1)
+    after = found.towards(true.pose)[0]
+    np.testing.assert_allclose(after[6], before[6] / 8, atol=1e-9)
+    assert np.linalg.norm(after[:3]) == pytest.approx(np.linalg.norm(before[:3]) / 8, rel=0.05)
+
+
+def test_ratings_belong_to_the_poses_they_come_with(shape, true):
+    start = true.pose.repeated(3).moved(np.diag([9.0, 1.0, 4.0]) @ np.eye(3, 7))
+    rating = rating_oracle([true], shape)
+    still = PoseSearch(rating, rating, ())
+    found, ratings = still.refined(NumberedFrame(), start, 3)
+    np.testing.assert_allclose(found.centre, start.centre[[1, 2, 0]])
+    np.testing.assert_allclose(ratings, np.exp(-np.array([1.0, 4.0, 9.0]) / 6.0))
+    assert len(still.refined(NumberedFrame(), start, 1)[0]) == 1
+
+
+def test_no_places_give_no_poses(shape, true):
+    found, ratings = search(shape, true)(NumberedFrame(), np.zeros((0, 3)), 3)
+    assert len(found) == len(ratings) == 0
+
+
+@pytest.mark.parametrize("step", range(len(REFINEMENTS)))
+def test_what_samples_of_refinement_say_takes_them_back(true, step):
+    x, y = refinement_samples(NumberedFrame(), true, step, 30, np.random.default_rng(step))
+    centre, rotation, log_scale, _ = seen(x)
+    back = type(true.pose)(centre, rotation, log_scale).moved(y)
+    np.testing.assert_allclose(back.centre, np.tile(true.pose.centre, (30, 1)), atol=1e-9)
+    np.testing.assert_allclose(back.rotation, np.tile(true.pose.rotation, (30, 1, 1)), atol=1e-9)
+    shift = np.linalg.norm(y[:, :3], axis=1)
+    assert shift.mean() == pytest.approx(1.6 * REFINEMENTS[step].shift_mm, rel=0.3)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_samples_of_rating_are_good_and_bad_and_rated_by_their_error(shape, true, fine):
+    x, y = rating_samples(NumberedFrame(), true, shape, 120, np.random.default_rng(0), fine=fine)
+    assert y.shape == (120, 1)
+    centre, rotation, log_scale, _ = seen(x)
+    error = pose_error(type(true.pose)(centre, rotation, log_scale), true, shape)
+    assert np.all(np.diff(y[np.argsort(error), 0]) <= 1e-9)
+    assert y.max() > 0.5
+    assert y.min() < 0.1
+
+
+def test_an_oracle_of_nothing_rates_nothing():
+    # The stand-in itself: as trees do, it answers no rows with no rows.
+    assert Oracle(7, None)(np.zeros((0, 3))).shape == (0, 7)

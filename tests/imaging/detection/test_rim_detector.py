@@ -1,0 +1,110 @@
+"""Rims: axes on a known valve, and candidates that vote for the true rim."""
+
+import numpy as np
+import pytest
+
+from mvest.imaging.detection import rim_detector
+from mvest.imaging.detection.rim_detector import RimDetector, rim_axes, rim_samples
+from mvest.imaging.detection.truth import TrueValve
+from tests.imaging.detection.made_up import (
+    LAYOUT,
+    TIPS,
+    NumberedFrame,
+    Oracle,
+    geometry,
+    placed,
+    poses,
+    rim_oracle,
+    seen,
+)
+from tests.made_up_sequence import leaflets
+
+
+@pytest.mark.parametrize("row", [0, -1])
+@pytest.mark.parametrize("closure", [0.0, 0.5])
+def test_axes_run_along_the_rim_and_away_from_the_leaflet(row, closure):
+    # Towards the leaflet at one of the rims, or against phi, is seen here.
+    x = leaflets(LAYOUT, closure)
+    grid = x.reshape(LAYOUT.rows, LAYOUT.columns, 3)
+    axes = rim_axes(x, LAYOUT, row % LAYOUT.rows)
+    np.testing.assert_allclose(
+        np.swapaxes(axes, 1, 2) @ axes, np.tile(np.eye(3), (LAYOUT.columns, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0)
+    rim = grid[row]
+    onwards = np.roll(rim, -1, 0) - rim
+    assert np.all((axes[:, :, 0] * onwards).sum(axis=1) > 0)
+    into = grid[1 if row == 0 else -2] - rim
+    assert np.all((axes[:, :, 1] * into).sum(axis=1) < 0)
+
+
+def test_the_annulus_side_away_from_the_leaflet_is_outside_the_orifice():
+    axes = rim_axes(leaflets(LAYOUT, 0.0), LAYOUT, 0)
+    middle = LAYOUT.column(90.0)
+    assert axes[middle, 1, 1] > 0.2  # towards the anterior side
+    edge = rim_axes(leaflets(LAYOUT, 0.0), LAYOUT, LAYOUT.rows - 1)
+    assert edge[middle, 2, 1] < -0.2  # towards the ventricle
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_the_rim_moves_to_where_votes_say_it_is(shape, row, monkeypatch):
+    # Offsets taken along the wrong axes, or added twice in the second round, miss it.
+    monkeypatch.setattr(rim_detector, "features", geometry)
+    guess = placed(shape, poses(1, 3), np.zeros(2))
+    by = 2.0 * np.random.default_rng(0).standard_normal((LAYOUT.size, 3))
+    true = TrueValve(guess.vertices + by, guess.tips, guess.pose)
+    detector = RimDetector(row, rim_oracle([true], LAYOUT, row))
+    axes, offset, spread = detector(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    at = LAYOUT.annulus if row == 0 else LAYOUT.free_edge
+    expected = np.einsum("cij,ci->cj", axes[:, :, 1:], by[at])
+    np.testing.assert_allclose(offset, expected, atol=1e-6)
+    np.testing.assert_allclose(spread, 0, atol=1e-6)
+    np.testing.assert_allclose(axes, rim_axes(guess.vertices, LAYOUT, row % LAYOUT.rows))
+
+
+def test_some_wrong_votes_are_outvoted_and_told_by_the_spread(shape, monkeypatch):
+    monkeypatch.setattr(rim_detector, "features", geometry)
+    guess = placed(shape, poses(1, 3), np.zeros(2))
+    right = rim_oracle([guess], LAYOUT, 0)
+    rng = np.random.default_rng(1)
+
+    def answer(x):
+        said = right(x)
+        wrong = rng.random(len(x)) < 0.2
+        return said + wrong[:, None] * np.array([9.0, 9.0])
+
+    detector = RimDetector(0, Oracle(2, answer))
+    _, offset, spread = detector(NumberedFrame(), guess.vertices, LAYOUT, 0.0)
+    assert np.linalg.norm(offset, axis=1).mean() < 0.35
+    assert np.all(spread > 0.2)
+
+
+@pytest.mark.parametrize("row", [0, -1])
+def test_samples_say_where_the_true_rim_is(shape, row, monkeypatch):
+    # Learning from candidates of one rim towards the other, or in world axes, is seen here.
+    monkeypatch.setattr(rim_detector, "features", geometry)
+    true = placed(shape, poses(1, 5), 0.5 * shape.std[:6])
+    rng = np.random.default_rng(0)
+    x, y = rim_samples(NumberedFrame(), true, shape, row, 240, rng)
+    assert y.shape == (len(x), 2)
+    points, rotation, _, _ = seen(x)
+    aim = points + np.einsum("pij,pj->pi", rotation[:, :, 1:], y)
+    rim = true.vertices.reshape(LAYOUT.rows, LAYOUT.columns, 3)[row]
+    # The aim is abreast of the true rim's vertex: off it along the rim only.
+    gap = rim - aim[:, None]
+    off = np.linalg.norm(np.einsum("pij,pci->pcj", rotation[:, :, 1:], gap), axis=2).min(axis=1)
+    assert np.all(np.abs(y) <= 8.0)
+    free = np.abs(y).max(axis=1) < 8.0
+    assert off[free].max() < 1e-6
+    assert np.linalg.norm(points[:, None] - rim, axis=2).min(axis=1).mean() < 6.0
+
+
+def test_the_valves_own_tips_play_no_part(shape, monkeypatch):
+    monkeypatch.setattr(rim_detector, "features", geometry)
+    x = leaflets(LAYOUT, 0.3)
+    a, b = TrueValve.of(x, TIPS, shape), TrueValve.of(x, TIPS - np.array([0, 0, 1.0]), shape)
+    found = [
+        rim_samples(NumberedFrame(), true, shape, 0, 60, np.random.default_rng(2))[1]
+        for true in (a, b)
+    ]
+    np.testing.assert_allclose(found[0], found[1], atol=1e-9)

@@ -1,0 +1,311 @@
+"""All frames together: the consistent path, smoothing in time, landmarks by hand, no valve."""
+
+import numpy as np
+import pytest
+
+from mvest.imaging.detection import tracking
+from mvest.imaging.detection.landmark_detector import landmark_points
+from mvest.imaging.detection.model import Accuracy
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.tracking import (
+    NoValveError,
+    TrackingSettings,
+    detect_valve,
+    smooth_in_time,
+)
+from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
+from mvest.imaging.volume import VolumeSequence
+from tests.imaging.detection.made_up import (
+    LAYOUT,
+    NumberedFrame,
+    oracle_model,
+    placed,
+    poses,
+    use_geometry,
+)
+
+TIMES = np.array([0.0, 0.03, 0.05, 0.09])
+UNSMOOTHED = TrackingSettings(smoothing_s=(0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def truths(shape, monkeypatch):
+    """A valve that moves and closes a little over four frames, which oracles know."""
+    rng = np.random.default_rng(3)
+    pose, b = poses(1, 2), rng.standard_normal(8) * 0.5 * shape.std[:8]
+    found = []
+    for k in range(len(TIMES)):
+        moved = pose.moved(np.array([[0.4 * k, -0.3 * k, 0.5 * k, 0, 0.01 * k, 0, 0.0]]))
+        b = b.copy()
+        b[0] = (0.3 * k - 0.4) * shape.std[0]
+        found.append(placed(shape, moved, b))
+    use_geometry(monkeypatch, found)
+    monkeypatch.setattr(tracking, "standard_frame", lambda volume, k: NumberedFrame(k))
+    return found
+
+
+def volume(count=4):
+    return VolumeSequence(
+        np.zeros((count, 1, 1, 1), np.uint8),
+        np.ones(3),
+        np.eye(3),
+        np.zeros(3),
+        TIMES[:count],
+        source="made up.nrrd",
+    )
+
+
+# --- whole sequences ----------------------------------------------------------------------------
+
+
+def test_the_valve_is_found_in_every_frame(shape, truths):
+    # Frames or their confidences in the wrong order are seen here.
+    told = []
+    found = detect_valve(
+        volume(),
+        oracle_model(shape, truths),
+        UNSMOOTHED,
+        progress=lambda done, all_: told.append((done, all_)),
+    )
+    for k, true in enumerate(truths):
+        gaps = [np.linalg.norm(found.vertices[k] - t.vertices, axis=1).mean() for t in truths]
+        assert gaps[k] < 0.35
+        assert np.argmin(gaps) == k
+        np.testing.assert_allclose(found.tips[k], true.tips, atol=0.05)
+    np.testing.assert_array_equal(found.times, TIMES)
+    assert np.all(found.frame_confidence > 0.9)
+    assert found.vertex_confidence.shape == (4, LAYOUT.size)
+    assert told == [(k + 1, 4) for k in range(4)]
+    assert np.all(np.isnan(found.std_mm))
+    assert np.isnan(found.correlation_length_mm)
+
+
+def test_what_was_measured_of_a_model_goes_with_the_sequence(shape, truths):
+    n = LAYOUT.size
+    accuracy = Accuracy(np.linspace(1, 2, n), 7.5, np.zeros((1, 2, n, 3)), np.zeros((1, 2, 2, 3)))
+    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy))
+    np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
+    assert found.correlation_length_mm == 7.5
+
+
+def test_smoothing_of_a_steady_motion_leaves_it_where_it_is(shape, truths):
+    found = detect_valve(volume(), oracle_model(shape, truths))
+    for k, true in enumerate(truths):
+        assert np.linalg.norm(found.vertices[k] - true.vertices, axis=1).mean() < 0.5
+
+
+def test_a_single_frame_is_enough(shape, truths):
+    found = detect_valve(volume(1), oracle_model(shape, truths))
+    assert np.linalg.norm(found.vertices[0] - truths[0].vertices, axis=1).mean() < 0.35
+
+
+def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
+    with pytest.raises(NoValveError, match="no valve") as told:
+        detect_valve(volume(), oracle_model(shape, truths, best=0.05))
+    message = str(told.value)
+    assert "made up.nrrd" in message
+    assert "0.0" in message
+    assert "\n" not in message
+    detect_valve(volume(), oracle_model(shape, truths, best=0.05),
+                 TrackingSettings(least_confidence=0.01))  # fmt: skip
+
+
+# --- by hand ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("landmarks", "message"),
+    [
+        ({4: {"tip_0": np.zeros(3)}}, "frame 4.*frames 0 to 3"),
+        ({-1: {"tip_0": np.zeros(3)}}, "frame -1"),
+        ({1: {"tip_0": np.zeros(3), "apex": np.zeros(3)}}, "frame 1.*apex.*commissure_0"),
+        ({1: {"tip_0": np.array([0.0, np.nan, 0.0])}}, "frame 1.*tip_0"),
+        ({1: {"tip_0": np.zeros(2)}}, "frame 1.*tip_0"),
+    ],
+    ids=["no such frame", "negative", "no such name", "no number", "two coordinates"],
+)
+def test_landmarks_by_hand_are_checked(shape, truths, landmarks, message):
+    with pytest.raises(tracking.InputError, match=message) as told:
+        detect_valve(volume(), oracle_model(shape, truths), landmarks=landmarks)
+    assert "\n" not in str(told.value)
+
+
+def test_four_landmarks_by_hand_lay_the_mean_valve_on_them(shape, truths):
+    # The pose is a similarity: a shear, a mirror image, or scale left out miss the points.
+    model = oracle_model(shape, truths)
+    pose = poses(1, 9, 40.0)
+    at = list(landmark_vertices(LAYOUT).values())
+    points = pose.world(np.concatenate([shape.mean[at], shape.tips]))[0]
+    by_hand = {k: points[k] for k in (11, 3, 0, 6, 9)}
+    found = tracking._pose_by_hand(by_hand, model)
+    np.testing.assert_allclose(found.centre, pose.centre, atol=1e-6)
+    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-8)
+    np.testing.assert_allclose(found.log_scale, pose.log_scale, atol=1e-9)
+    assert tracking._pose_by_hand({k: points[k] for k in (11, 3, 0)}, model) is None
+    assert tracking._pose_by_hand({}, model) is None
+
+
+def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
+    # The trees rate highest a valve that lies elsewhere; hands in every frame decide otherwise.
+    elsewhere = [
+        placed(shape, t.pose.moved(np.array([[25.0, 0, 0, 0.6, 0, 0, 0]])), np.zeros(4))
+        for t in truths
+    ]
+    model = oracle_model(shape, truths)
+    astray = oracle_model(shape, elsewhere)
+    model.poses, model.position = astray.poses, astray.position
+    frames = [NumberedFrame(k) for k in range(4)]
+    lost = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
+    expected = np.concatenate([t.pose.centre for t in truths])
+    assert np.linalg.norm(lost.centre - expected, axis=1).min() > 15.0
+    points = [landmark_points(t, LAYOUT) for t in truths]
+    led = tracking._trajectory(
+        frames, TIMES, model, UNSMOOTHED, {k: dict(enumerate(p)) for k, p in enumerate(points)}
+    )
+    assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
+    by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
+    found = detect_valve(
+        volume(), model, TrackingSettings(smoothing_s=(0.0,) * 3, least_confidence=0.0),
+        landmarks=by_hand,
+    )  # fmt: skip
+    np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)
+    gap = np.linalg.norm(found.vertices - np.stack([t.vertices for t in truths]), axis=2)
+    assert gap.mean() < 0.5
+
+
+# --- the path -----------------------------------------------------------------------------------
+
+
+def hypotheses(shape, centres, ratings):
+    count = len(centres)
+    return (
+        Poses(np.asarray(centres, float), np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)),
+        np.asarray(ratings),
+    )
+
+
+def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_higher(shape, truths):
+    # Each frame by itself would jump 20 mm away and back.
+    model = oracle_model(shape, truths)
+    here, there = [0.0, 0, 0], [20.0, 0, 0]
+    frames = [
+        hypotheses(shape, [here, there], [0.9, 0.5]),
+        hypotheses(shape, [here, there], [0.6, 0.8]),
+        hypotheses(shape, [here, there], [0.9, 0.5]),
+    ]
+    times = np.array([0.0, 0.02, 0.04])
+    assert tracking._best_path(frames, times, model, TrackingSettings()) == [0, 0, 0]
+    # Were there minutes in between, it could have moved.
+    assert tracking._best_path(frames, 1e3 * times, model, TrackingSettings()) == [0, 1, 0]
+
+
+def test_one_frame_gone_wrong_does_not_drag_the_others_along(shape, truths):
+    # The middle frame offers nothing but a place far away: an unbounded cost would take all there.
+    model = oracle_model(shape, truths)
+    here, there = [0.0, 0, 0], [200.0, 0, 0]
+    frames = [hypotheses(shape, [here, there], [0.9, 0.1]) for _ in range(2)]
+    frames += [hypotheses(shape, [there], [0.9])]
+    frames += [hypotheses(shape, [there, here], [0.1, 0.9]) for _ in range(2)]
+    times = 0.02 * np.arange(5)
+    path = tracking._best_path(frames, times, model, TrackingSettings())
+    assert path == [0, 0, 0, 1, 1]
+
+
+def test_hypotheses_that_are_about_the_same_count_once():
+    base = poses(1, 3)
+    by = np.zeros((5, 7))
+    by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
+    some = base.repeated(5).moved(by)
+    kept = tracking._apart(some, np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 5)
+    # 1 is best; 0 and 2 lie upon it; 3 is turned by 57 degrees and 4 is 12 mm away.
+    np.testing.assert_array_equal(kept, [1, 3, 4])
+    np.testing.assert_array_equal(
+        tracking._apart(some, np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3]
+    )
+
+
+# --- smoothing ----------------------------------------------------------------------------------
+
+UNEVEN = np.array([0.0, 0.02, 0.03, 0.07, 0.08, 0.13, 0.15])
+S = np.array([0.0, 0.5, 1.0])
+
+
+def smooth(vertices, tips=None, weight=None, frame_weight=None, times=(0.06, 0.06, 0.06)):
+    count = len(UNEVEN)
+    return smooth_in_time(
+        UNEVEN,
+        vertices,
+        np.zeros((count, 2, 3)) if tips is None else tips,
+        np.ones(vertices.shape[:2]) if weight is None else weight,
+        np.ones(count) if frame_weight is None else frame_weight,
+        S,
+        times,
+    )
+
+
+def test_motion_linear_in_time_is_kept_exactly_at_uneven_times():
+    # Second differences over frames instead of seconds bend it.
+    rng = np.random.default_rng(0)
+    start, speed = rng.standard_normal((2, 3, 3)) * 10
+    line = start + UNEVEN[:, None, None] * speed * 10
+    weight = rng.uniform(0.05, 1.0, (len(UNEVEN), 3))
+    vertices, tips = smooth(line, line[:, :2], weight, weight[:, 0])
+    np.testing.assert_allclose(vertices, line, atol=1e-7)
+    np.testing.assert_allclose(tips, line[:, :2], atol=1e-7)
+
+
+def test_no_smoothing_is_none_at_all():
+    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
+    vertices, tips = smooth(x, x[:, :2], times=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(vertices, x)
+    np.testing.assert_array_equal(tips, x[:, :2])
+    # The annulus alone: the free edge stays as it is, what is in between moves a little.
+    x = np.repeat(x[:, :1], 3, 1)
+    vertices, _ = smooth(x, times=(0.06, 0.0, 0.0))
+    np.testing.assert_allclose(vertices[:, 2], x[:, 2], atol=1e-9)
+    moved = np.abs(vertices - x).mean(axis=(0, 2))
+    assert moved[0] > moved[1] > 0.01
+
+
+def test_an_unsure_frame_is_drawn_to_its_neighbours_and_a_sure_one_less():
+    # Weights that do not count, or count the other way round, are seen here.
+    x = np.zeros((len(UNEVEN), 3, 3))
+    x[3] = 5.0
+    weight = np.ones((len(UNEVEN), 3))
+    weight[3] = [1.0, 1.0, 0.01]
+    vertices, _ = smooth(x, weight=weight, times=(0.02, 0.02, 0.02))
+    assert vertices[3, 2, 0] < 0.5
+    assert vertices[3, 0, 0] > 2 * vertices[3, 2, 0]
+    assert np.abs(vertices[[0, 6], 2]).max() < 0.3
+
+
+def test_weights_count_relative_to_the_others():
+    x = np.random.default_rng(0).standard_normal((len(UNEVEN), 3, 3))
+    rng = np.random.default_rng(1)
+    weight = rng.uniform(0.2, 1.0, (len(UNEVEN), 3))
+    np.testing.assert_allclose(
+        smooth(x, weight=weight)[0], smooth(x, weight=0.3 * weight)[0], atol=1e-9
+    )
+
+
+def test_fast_changes_go_and_slow_ones_stay():
+    # Smoothing over 0.06 s: a wave of 0.03 s goes, one of 1.5 s stays.
+    times = 0.01 * np.arange(60)
+    slow, fast = (np.sin(2 * np.pi * times / period) for period in (1.5, 0.03))
+    x = np.stack([slow, fast, slow + fast], axis=1)[..., None] * np.ones(3)
+    found, _ = smooth_in_time(
+        times, x, np.zeros((60, 2, 3)), np.ones((60, 3)), np.ones(60), S, (0.06, 0.06, 0.0)
+    )
+    inner = slice(10, -10)
+    np.testing.assert_allclose(found[inner, 0], x[inner, 0], atol=0.06)
+    assert np.abs(found[inner, 1]).max() < 0.05
+    np.testing.assert_allclose(found[:, 2], found[:, 0] + found[:, 1], atol=1e-9)
+
+
+def test_two_frames_are_left_as_they_are():
+    x = np.random.default_rng(0).standard_normal((2, 3, 3))
+    found, tips = smooth_in_time(
+        np.array([0.0, 0.1]), x, x[:, :2], np.ones((2, 3)), np.ones(2), S, (0.1, 0.1, 0.1)
+    )
+    np.testing.assert_array_equal(found, x)
+    np.testing.assert_array_equal(tips, x[:, :2])

@@ -1,0 +1,71 @@
+"""The band of two leaflets: vertices, triangles and regions where other code takes them to be."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.valve.template import Template
+
+
+def normals(x, triangles):
+    a, b, c = (x[triangles[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(16, 7), (20, 9), (64, 15)])
+def test_vertices_and_triangles_are_those_of_the_template(columns, rows):
+    layout = ValveLayout(columns, rows)
+    surface = Template().valve(columns, rows).surface
+    np.testing.assert_allclose(
+        Template().position(layout.phi, layout.s), surface.vertices, rtol=0, atol=1e-9
+    )
+    np.testing.assert_array_equal(layout.triangles, surface.triangles)
+    np.testing.assert_array_equal(layout.region, surface.region)
+
+
+def test_normals_point_to_the_ventricle():
+    # A triangle listed the other way round would turn the leaflet inside out.
+    layout = ValveLayout(16, 7)
+    x = Template().valve(16, 7).surface.vertices
+    found = normals(x, layout.triangles)
+    for leaflet in (0, 1):
+        assert found[layout.region == leaflet].mean(axis=0)[2] < 0
+    # The anterior leaflet hangs at y > 0, its ventricular side looks outwards.
+    assert found[layout.region == 0].mean(axis=0)[1] > 0
+    assert found[layout.region == 1].mean(axis=0)[1] < 0
+
+
+def test_regions_are_the_halves_around_the_middles():
+    # A line between the leaflets one column off is seen here.
+    layout = ValveLayout(16, 7)
+    y = Template().valve(16, 7).surface.vertices[:, 1]
+    annulus = layout.triangles[np.isin(layout.triangles, layout.annulus).sum(axis=1) == 2]
+    side = layout.region[np.isin(layout.triangles, layout.annulus).sum(axis=1) == 2]
+    middle = layout.phi[annulus[:, 0]] + 0.5 * 360 / layout.columns
+    assert np.array_equal(side == 0, middle < 180)
+    assert y[layout.vertex(90.0, 0)] > 0 > y[layout.vertex(270.0, 0)]
+
+
+def test_rims_are_the_first_and_the_last_row():
+    layout = ValveLayout(16, 7)
+    assert np.all(layout.s[layout.annulus] == 0)
+    assert np.all(layout.s[layout.free_edge] == 1)
+    np.testing.assert_allclose(layout.phi[layout.annulus], 22.5 * np.arange(16))
+    np.testing.assert_allclose(layout.phi[layout.free_edge], 22.5 * np.arange(16))
+
+
+def test_a_vertex_is_found_by_angle_and_row():
+    layout = ValveLayout(16, 7)
+    for phi, row in ((0.0, 0), (90.0, 3), (270.0, -1), (360.0, -1), (-90.0, 0)):
+        vertex = layout.vertex(phi, row)
+        assert layout.phi[vertex] == phi % 360
+        assert layout.s[vertex] == pytest.approx((row % 7) / 6)
+    with pytest.raises(InputError, match="at 10 degrees"):
+        layout.vertex(10.0, 0)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(4, 7), (18, 7), (16, 2)])
+def test_a_layout_without_middles_is_refused(columns, rows):
+    with pytest.raises(InputError, match="multiple of 4"):
+        ValveLayout(columns, rows)
