@@ -159,7 +159,7 @@ class PersonalConfig:
 class ImagedConfig:
     """From a volume over time to a case: what the file does not say."""
 
-    model: str | None = None  # file of the detection model
+    model: str | None = None  # file of the detection model; null: the one for ultrasound
     modality: str | None = None  # ultrasound, ct or mr, where the file does not say
     frame_interval_s: float | None = None  # where the file states no times
     time_unit: str | None = None  # s or ms, where the file states times without a unit
@@ -235,6 +235,14 @@ class ImagingConfig:
 
 
 @dataclass
+class EchoConfig:
+    """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
+
+    spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
+    tip_motion_mm: list[float] = field(default_factory=lambda: [1.0, 3.0])  # of papillary tips
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -300,6 +308,7 @@ class Config:
     check: bool = False  # only check the case, or the image step of a volume, and draw it
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
+    echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more

@@ -24,6 +24,7 @@ from experiments.folder import (
 )
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.patient import run_patient
 from experiments.request import Request
@@ -36,6 +37,7 @@ from mvest.reporting.closure import closure_text, publish_closure, write_closure
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
+from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -221,6 +223,13 @@ STUDIES: dict[str, Study] = {
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+    ),
+    "imaged_patient": Study(
+        run_imaged_patient,
+        case_text,
+        write_case_tables,
+        lambda results, name, record, _folder: publish_volume(results, name, record),
+        keeps_failures=True,
     ),
     "patient": Study(
         run_patient,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+import mvest.imaging
 from experiments.case import run_case
 from mvest.cases.case import ValveCase
 from mvest.cases.csv_files import read_numbers
@@ -48,6 +49,9 @@ from mvest.typing import FloatArray
 __all__ = ["FoundValve", "check_volume", "find_valve", "run_volume", "write_image_step"]
 
 Values = Mapping[str, Any]
+
+TEE_MODEL = Path(mvest.imaging.__file__).parent / "models" / "tee.npz"
+"""Detectors for transoesophageal echo, trained on simulated volumes."""
 
 IMAGES, CASE = "images", "case"
 """Folders of what the image step writes, and of the case."""
@@ -109,19 +113,21 @@ def find_valve(config: Values) -> FoundValve:
     told = config["imaged"]
     if config["volume"] is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
-    if told["model"] is None:
-        raise ConfigurationError("imaged.model is not given; expected a detection model's file")
     volume = read_volume(
         Path(config["volume"]),
         modality=_modality(told["modality"]),
         frame_interval_s=told["frame_interval_s"],
         time_unit=told["time_unit"],
     )
-    model = load_model(Path(told["model"]))
-    if model.accuracy is None:
-        raise InputError(
-            f"{told['model']}: its accuracy was never measured, expected a model whose was"
+    if told["model"] is None and volume.modality is not Modality.ULTRASOUND:
+        raise ConfigurationError(
+            f"imaged.model is not given; for {volume.modality.value} no model comes with the "
+            "package: expected a detection model's file"
         )
+    file = TEE_MODEL if told["model"] is None else Path(told["model"])
+    model = load_model(file)
+    if model.accuracy is None:
+        raise InputError(f"{file}: its accuracy was never measured, expected a model whose was")
     valve = detect_valve(
         volume, model, landmarks=_landmarks(_pairs("landmarks", told["landmarks"], str))
     )

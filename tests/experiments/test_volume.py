@@ -143,7 +143,7 @@ def test_landmarks_placed_by_hand_are_handed_on(run, tmp_path):
         (("imaged.modality=xray",), True, "imaged.modality = 'xray'"),
         (("volume=null",), True, "volume is not given"),
         (("volume=nowhere.nrrd",), True, "nowhere.nrrd: no such file"),
-        (("imaged.model=null",), True, "imaged.model is not given"),
+        (("imaged.model=nowhere.npz", "imaged.modality=ct"), True, "modality"),
     ],
 )
 def test_what_is_missing_or_wrong_is_one_line(run, arguments, pressure, message):
