@@ -74,7 +74,7 @@ def estimate_blindly(
     InputError
         If the process left no record; the message ends with its last words.
     """
-    given = {"case": str(case)} if case.is_dir() else {"volume": str(case)}
+    given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
         "values": {k: v for k, v in values.items() if k not in SECRET} | given,
         "config_hash": config_hash,

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.imaged_patient import ImagedPlace, volume_rows
 from mvest.reporting.imaging_volumes import publish_volume
-from tests.reporting.test_tables import record as a_record
+from tests.reporting.records import record as a_record
 
 
 def estimated(anterior, posterior, status="converged"):
@@ -22,7 +22,10 @@ TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
 
 def test_rows_put_volume_and_known_geometry_side_by_side():
     rows = volume_rows("one", estimated(5.0, 2.5), estimated(5.8, 2.1), TRUTH)
-    assert [(row["modulus"], row["truth"]) for row in rows] == [("anterior", 6.0), ("posterior", 2.0)]
+    assert [(row["modulus"], row["truth"]) for row in rows] == [
+        ("anterior", 6.0),
+        ("posterior", 2.0),
+    ]
     assert rows[0] == {
         "patient": "one", "modulus": "anterior", "truth": 6.0, "estimate": 5.0, "low": 4.0,
         "high": 6.0, "known_geometry": 5.8,
