@@ -7,6 +7,7 @@ from mvest.imaging.detection import pose_search
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     REFINEMENTS,
+    SCALE_MM,
     PoseSearch,
     coarse_samples,
     fine_samples,
@@ -140,3 +141,22 @@ def test_mistakes_are_learned_from_with_the_rating_they_deserve(shape, true):
 def test_an_oracle_of_nothing_rates_nothing():
     # The stand-in itself: as trees do, it answers no rows with no rows.
     assert Oracle(7, None)(np.zeros((0, 3))).shape == (0, 7)
+
+
+def test_valves_turned_front_to_back_are_among_the_samples_and_rated_low(shape, true):
+    x, y = fine_samples(NumberedFrame(), true, shape, 300, np.random.default_rng(1))
+    rotation = seen(x)[1]
+    about = np.einsum("pij,ij->pj", rotation, true.pose.rotation[0])  # cosines of x, y and z axes
+    turned = (about[:, 0] < -0.9) & (about[:, 2] > 0.9)
+    assert turned.sum() > 20
+    assert y[turned].max() < 0.1
+
+
+def test_mistakes_are_learned_from_with_their_rating(shape, true):
+    by = np.zeros((2, 7))
+    by[:, 0] = [3.0, 30.0]
+    x, y = fine_samples(
+        NumberedFrame(), true, shape, 60, np.random.default_rng(1), true.pose.repeated(2).moved(by)
+    )
+    assert len(x) == 62
+    np.testing.assert_allclose(y[-2:, 0], np.exp(-by[:, 0] / SCALE_MM))
