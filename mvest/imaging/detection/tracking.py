@@ -19,15 +19,23 @@ from mvest.imaging.detection.detect import FitSettings, FrameValve, fit_frame, s
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.smoothing import smooth_in_time
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve", "smooth_in_time"]
+__all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve"]
 
 Landmarks = Mapping[int, Mapping[str, FloatArray]]
 """Placed by hand: frame -> name -> world position (3,) mm."""
+
+
+POSE_LANDMARKS = 4
+"""Landmarks by hand that give the pose of a frame."""
+
+LINE_MM = 2.0
+"""mm, root sum of squares across the best line: below it a pose does not follow from points."""
 
 
 class NoValveError(InputError):
@@ -108,7 +116,7 @@ def detect_valve(
             "valve whole within the field of view, or landmarks placed by hand)"
         )
     sure = np.stack([valve.vertex_confidence for valve in found])
-    smooth = smooth_in_time(
+    vertices, tips = smooth_in_time(
         np.asarray(volume.times),
         np.stack([valve.vertices for valve in found]),
         np.stack([valve.tips for valve in found]),
@@ -117,11 +125,18 @@ def detect_valve(
         model.shape.layout.s,
         told.smoothing_s,
     )
+    # Tips have no neighbours along the leaflets that would have to come along.
+    first = len(LANDMARKS) - tips.shape[1]
+    for k, points in by_hand.items():
+        for number, point in points.items():
+            if number >= first:
+                tips[k, number - first] = point
     accuracy, layout = model.accuracy, model.shape.layout
     return ValveSequence(
         layout,
         np.asarray(volume.times),
-        *smooth,
+        vertices,
+        tips,
         confidence,
         sure,
         np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
@@ -150,6 +165,14 @@ def _checked(
                     f"landmarks of frame {frame}, {name}: {np.asarray(point).tolist()}, expected "
                     "three finite coordinates"
                 )
+        if len(points) >= POSE_LANDMARKS:
+            about = np.stack(list(found[frame].values()))
+            size = np.linalg.svd(about - about.mean(axis=0), compute_uv=False)
+            if size[1] < LINE_MM:
+                raise InputError(
+                    f"landmarks of frame {frame} lie within {size[1]:.2g} mm of one line, expected "
+                    "them about the valve"
+                )
     return found
 
 
@@ -170,6 +193,8 @@ def _trajectory(
             own.append((placed, np.ones(1)))
     ratings = np.concatenate([rating for _, rating in own])
     pool = Poses.joined([poses for poses, _ in own])
+    if not len(pool):
+        raise NoValveError("no valve found; there is no place in any frame to look for one at")
     best = pool[_apart(pool, ratings, told.shared)]
     candidates = []
     for k, frame in enumerate(frames):
@@ -192,7 +217,7 @@ def _apart(poses: Poses, ratings: FloatArray, count: int) -> IntArray:
             kept.append(int(k))
         if len(kept) == count:
             break
-    return np.array(kept)
+    return np.array(kept, dtype=np.int64)
 
 
 def _best_path(
@@ -222,7 +247,7 @@ def _best_path(
 
 def _pose_by_hand(points: Mapping[int, FloatArray], model: DetectionModel) -> Poses | None:
     """The pose that lays the mean valve on landmarks, if there are four or more."""
-    if len(points) < 4:
+    if len(points) < POSE_LANDMARKS:
         return None
     shape = model.shape
     at = list(landmark_vertices(shape.layout).values())
@@ -234,60 +259,3 @@ def _pose_by_hand(points: Mapping[int, FloatArray], model: DetectionModel) -> Po
     scale = float((b * (a @ rotation.T)).sum() / (a * a).sum())
     centre = to.mean(axis=0) - scale * rotation @ from_.mean(axis=0)
     return Poses(centre[None], rotation[None], np.log([max(scale, 0.3)]))
-
-
-def smooth_in_time(
-    times: FloatArray,
-    vertices: FloatArray,
-    tips: FloatArray,
-    vertex_weight: FloatArray,
-    frame_weight: FloatArray,
-    s: FloatArray,
-    smoothing_s: tuple[float, float, float],
-) -> tuple[FloatArray, FloatArray]:
-    """Positions with little acceleration where they were not sure.
-
-    Parameters
-    ----------
-    times : (T,) s
-    vertices, tips : (T, n, 3), (T, 2, 3) mm
-    vertex_weight, frame_weight : (T, n), (T,)
-        How much each counts, relative to the others.
-    s : (n,)
-        0 at the annulus, 1 at the free edge.
-    smoothing_s : (float, float, float)
-        Times for annulus, free edge (in between: linear in s) and tips.
-
-    Returns
-    -------
-    vertices, tips
-    """
-    annulus, edge, tip = (max(float(t), 0.0) for t in smoothing_s)
-    length = (1 - s) * annulus + s * edge
-    smooth = _whittaker(times, vertices, vertex_weight, length)
-    weight = np.repeat(frame_weight[:, None], tips.shape[1], 1)
-    return smooth, _whittaker(times, tips, weight, np.full(tips.shape[1], tip))
-
-
-def _whittaker(
-    times: FloatArray, values: FloatArray, weight: FloatArray, length: FloatArray
-) -> FloatArray:
-    """Penalised least squares on second divided differences, for each column ``(T, m, 3)``.
-
-    Minimises sum w (z - y)^2 dt + length^4 int z''^2 dt (Whittaker, Proc. Edinburgh Math. Soc.
-    41:63, 1923), so that what varies over much less than ``length`` (s) goes.
-    """
-    count = len(times)
-    if count < 3 or not np.any(length > 0):
-        return values
-    step = np.diff(times)
-    second = np.zeros((count - 2, count))
-    for k in range(count - 2):
-        a, b = step[k], step[k + 1]
-        second[k, k : k + 3] = np.array([1 / a, -1 / a - 1 / b, 1 / b]) * 2 / (a + b)
-    share = 0.5 * (np.concatenate([step, step[-1:]]) + np.concatenate([step[:1], step]))
-    bend = second.T @ (0.5 * (step[1:] + step[:-1])[:, None] * second)
-    weight = np.maximum(weight, 1e-3) / np.maximum(weight.mean(axis=0), 1e-3) * share[:, None]
-    matrix = length[:, None, None] ** 4 * bend + np.einsum("tm,tu->mtu", weight, np.eye(count))
-    right = np.swapaxes(weight[..., None] * values, 0, 1)
-    return np.asarray(np.swapaxes(np.linalg.solve(matrix, right), 0, 1))
