@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection import position, tracking
+from mvest.imaging.detection.detect import search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.model import Accuracy
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.pose_search import PoseSearch
+from mvest.imaging.detection.position import PositionDetector
 from mvest.imaging.detection.tracking import (
     NoValveError,
     TrackingSettings,
@@ -20,9 +23,12 @@ from tests.imaging.detection.made_up import (
     FIT,
     LAYOUT,
     NumberedFrame,
+    Oracle,
     oracle_model,
     placed,
     poses,
+    position_oracle,
+    rating_oracle,
     use_geometry,
 )
 
@@ -224,6 +230,23 @@ def test_the_consistent_hypothesis_is_taken_though_one_frame_rates_another_highe
     assert tracking._best_path(frames, times, model, TrackingSettings()) == [0, 0, 0]
     # Were there minutes in between, it could have moved.
     assert tracking._best_path(frames, 1e3 * times, model, TrackingSettings()) == [0, 1, 0]
+
+
+def test_a_frame_that_rates_another_place_higher_is_led_by_the_others(shape, truths):
+    # Every frame by itself, or without the hypotheses of the others, would lose one of them.
+    far = placed(shape, truths[2].pose.moved(np.array([[0, 30.0, 0, 0, 0, 0, 0]])), np.zeros(2))
+    right = rating_oracle(truths, shape, 0.6)
+    wrong = rating_oracle([*truths[:2], far, truths[3]], shape, 0.9)
+    rating = Oracle(1, lambda x: np.maximum(right(x), wrong(x)))
+    model = oracle_model(shape, truths)
+    model.poses = PoseSearch(rating, rating, ())
+    frames = [NumberedFrame(k) for k in range(4)]
+    model.position = PositionDetector(position_oracle([*truths[:2], far, truths[3]]))
+    alone = search_frame(frames[2], model, 1)[0]
+    assert np.linalg.norm(alone.centre - far.pose.centre) < 6
+    found = tracking._trajectory(frames, TIMES, model, UNSMOOTHED, {})
+    expected = np.concatenate([t.pose.centre for t in truths])
+    assert np.linalg.norm(found.centre - expected, axis=1).max() < 10.0
 
 
 def test_one_frame_gone_wrong_does_not_drag_the_others_along(shape, truths):
