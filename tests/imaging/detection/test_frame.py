@@ -87,6 +87,40 @@ def test_outside_the_field_of_view_ranks_are_zero_and_do_not_count():
         assert np.all(frame.level(number)[: 12 // side] == 0)
 
 
+def test_dark_blood_is_within_the_field_of_view_and_what_lies_beyond_is_not():
+    # A pyramid of echo with a black pool in it: the pool is dark, the corners are nothing.
+    volume = cube(shape=(48, 48, 48))
+    i, j, k = np.indices((48, 48, 48))
+    wide = np.hypot(i - 24, j - 24) < 4 + 0.4 * k
+    pool = (i - 24) ** 2 + (j - 24) ** 2 + (k - 34) ** 2 < 7**2
+    frames = np.where(wide & ~pool, np.maximum(volume.frames[0], 1), 0)[None]
+    ranks = standard_frame(with_grey(volume, frames.astype(np.uint8)), 0).level(0)
+    core = (i - 24) ** 2 + (j - 24) ** 2 + (k - 34) ** 2 < 5**2
+    assert np.all(ranks[core] > 0)
+    assert np.all(ranks[core] == ranks[ranks > 0].min())
+    far = np.hypot(i - 24, j - 24) > 16 + 0.4 * k
+    assert np.all(ranks[far] == 0)
+    assert np.all(ranks[wide] > 0)
+
+
+def test_wide_ranges_of_grey_values_are_ranked_like_narrow_ones():
+    # Tables over all values for 32-bit numbers would not fit; comparing some voxels must do.
+    volume = cube(width_mm=4.0)
+    narrow = standard_frame(volume, 0)
+    for factor, dtype in ((3_000_000, np.int32), (100, np.int16), (1e-6, np.float32)):
+        scaled = (volume.frames.astype(np.float64) * factor).astype(dtype)
+        found = standard_frame(with_grey(volume, scaled), 0)
+        assert np.abs(found.data.astype(int) - narrow.data).max() <= 2
+
+
+def test_values_that_are_no_numbers_are_refused():
+    volume = cube()
+    frames = volume.frames.astype(np.float32)
+    frames[0, 3, 3, 3] = np.nan
+    with pytest.raises(InputError, match="made up, frame 0"):
+        standard_frame(with_grey(volume, frames), 0)
+
+
 @pytest.mark.parametrize("value", [0, 7])
 def test_a_blank_frame_is_refused(value):
     volume = cube()
