@@ -20,6 +20,7 @@ from typing import Any
 
 from experiments.case import run_case
 from experiments.config import register
+from experiments.volume import run_volume
 from mvest.errors import InputError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
 
@@ -28,7 +29,7 @@ __all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
 
-SECRET = ("patient", "truth", "valve", "seed", "parameters", "row", "factors")
+SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
 """Parts of a configuration that describe the patient, and that the estimator is not given."""
 
 
@@ -54,7 +55,7 @@ def seal(folder: Path) -> None:
 def estimate_blindly(
     values: Mapping[str, Any], config_hash: str, folder: Path, case: Path, sealed: Path
 ) -> dict[str, Any]:
-    """Personalise a case in a process apart: its record.
+    """Personalise a case, or what is found in a volume, in a process apart: its record.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def estimate_blindly(
     folder : Path
         Output folder of the job, which exists.
     case : Path
-        Folder of the case.
+        Folder of the case, or the file of a volume over time.
     sealed : Path
         Folder that the process cannot open.
 
@@ -73,8 +74,9 @@ def estimate_blindly(
     InputError
         If the process left no record; the message ends with its last words.
     """
+    given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
-        "values": {k: v for k, v in values.items() if k not in SECRET} | {"case": str(case)},
+        "values": {k: v for k, v in values.items() if k not in SECRET} | given,
         "config_hash": config_hash,
         "folder": str(folder),
         "sealed": str(sealed),
@@ -109,7 +111,8 @@ def main() -> int:
     # The case says what it is; nothing here does.
     values = request["values"] | {"seed": None, "parameters": [], "row": None}
     try:
-        record, _ = run_case(values, request["config_hash"], folder, time.time())
+        run = run_case if values.get("volume") is None else run_volume
+        record, _ = run(values, request["config_hash"], folder, time.time())
         write_json(folder / ESTIMATE, record)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)

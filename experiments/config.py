@@ -156,6 +156,31 @@ class PersonalConfig:
 
 
 @dataclass
+class ImagedConfig:
+    """From a volume over time to a case: what the file does not say."""
+
+    model: str | None = None  # file of the detection model; null: the one for ultrasound
+    modality: str | None = None  # ultrasound, ct or mr, where the file does not say
+    frame_interval_s: float | None = None  # where the file states no times
+    time_unit: str | None = None  # s or ms, where the file states times without a unit
+    # [frame, .mrk.json] with landmarks placed by hand, where the automatic ones fail.
+    landmarks: list[Any] = field(default_factory=list)
+    open_frame: int | None = None  # null: the one with the largest orifice
+    closed_frame: int | None = None  # null: the one whose leaflets touch most
+    pressure_mmHg: float | None = None  # transmitral, in the closed frame
+    pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
+    held_out: list[Any] = field(default_factory=list)  # [frame, mmHg]: closed frames not shown
+    thickness_mm: list[float] = field(default_factory=list)  # anterior, posterior; empty: generic
+    least_confidence: float = 0.5  # of the frames that are chosen
+    error_samples: int = 12  # with which the valve is closed anew
+    name: str | None = None  # null: the name of the file
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False  # does the volume come from a simulation
+
+
+@dataclass
 class PatientConfig:
     """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
 
@@ -207,6 +232,14 @@ class ImagingConfig:
     targets: dict[str, Any] = field(default_factory=dict)  # setting -> column of the table -> limit
     processes: int = 1
     publish_model: bool = False  # make the model the one that comes with the package
+
+
+@dataclass
+class EchoConfig:
+    """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
+
+    spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
+    tip_motion_mm: list[float] = field(default_factory=lambda: [1.0, 3.0])  # of papillary tips
 
 
 @dataclass
@@ -270,9 +303,12 @@ class Config:
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
     case: str | None = None  # folder of a case
-    check: bool = False  # only check the case and draw it
+    volume: str | None = None  # file of a volume over time
+    imaged: ImagedConfig = field(default_factory=ImagedConfig)
+    check: bool = False  # only check the case, or the image step of a volume, and draw it
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
+    echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more

@@ -24,17 +24,20 @@ from experiments.folder import (
 )
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
+from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
+from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -73,7 +76,8 @@ def run_job(config: DictConfig) -> None:
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["check"]:
-        print(check_case(values, folder))
+        check = check_volume if values["study"] == "volume" else check_case
+        print(check(values, folder))
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
@@ -213,6 +217,19 @@ STUDIES: dict[str, Study] = {
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+    ),
+    "volume": Study(
+        run_volume,
+        case_text,
+        write_case_tables,
+        lambda _results, _name, _record, _folder: [],
+    ),
+    "imaged_patient": Study(
+        run_imaged_patient,
+        case_text,
+        write_case_tables,
+        lambda results, name, record, _folder: publish_volume(results, name, record),
+        keeps_failures=True,
     ),
     "patient": Study(
         run_patient,

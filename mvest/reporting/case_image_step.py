@@ -38,15 +38,13 @@ def image_error_words(record: Mapping[str, Any]) -> list[str]:
     if not found:
         return []
     out = [
-        f"The valve was closed anew with {found['samples']} samples of the errors of its images, of "
-        "the open shape, annulus, tips and chordae as well as of the closed frame."
+        f"The valve was closed anew with {found['samples']} samples of the errors of its images: "
+        "of the open shape, annulus, tips and chordae as well as of the closed frame."
     ]
     failures = found.get("failures") or []
     if failures:
         out.append(f"{len(failures)} of them did not close and were left out: {failures[0]}.")
     labels = {row["name"]: row.get("label", row["name"]) for row in record.get("unknowns") or []}
     for name, share in (found.get("share_of_variance") or {}).items():
-        out.append(
-            f"Of the variance of {labels.get(name, name)} {percent(share)} are errors of the images."
-        )
+        out.append(f"Of the variance of {labels.get(name, name)} they make {percent(share)}.")
     return out
