@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,12 @@ SPARSE = 25
 
 FEWEST_CELLS = 20
 """Such cells with an echo, below which there is no image."""
+
+MOST_LEVELS = 65536
+"""Range of whole grey values up to which each is counted."""
+
+MOST_COMPARED = 200_000
+"""Voxels of a frame in floating-point numbers that ranks are taken among."""
 
 LEAST_GREY_VALUES = 8
 """Different values below which a frame holds no image."""
@@ -82,22 +89,13 @@ def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
     InputError
         If the frame holds no image: hardly any different values.
     """
-    grey = np.asarray(volume.frames[frame], dtype=np.float32)
+    ranks = _ranks(np.asarray(volume.frames[frame]), volume.source, frame)
     spacing = np.asarray(volume.spacing, dtype=np.float64)
+    origin = np.asarray(volume.origin, dtype=np.float64)
     if np.any(np.abs(spacing / VOXEL_MM - 1) > 0.2):
-        shape = np.maximum(1, np.rint(np.array(grey.shape) * spacing / VOXEL_MM)).astype(int)
-        zoom = shape / np.array(grey.shape)
-        smooth = np.where(zoom < 1, 0.5 / zoom, 0.0)
-        grey = ndimage.zoom(
-            ndimage.gaussian_filter(grey, smooth), zoom, order=1, grid_mode=True, mode="nearest"
-        )
-        new = spacing / zoom
-        first = 0.5 * (new / spacing - 1)  # voxels of the old grid
-        origin = volume.world(first)
-        spacing = new
-    else:
-        origin = np.asarray(volume.origin, dtype=np.float64)
-    ranks = _ranks(grey, volume.source, frame)
+        ranks, zoom = _resampled(ranks, spacing)
+        origin = volume.world(0.5 * (1 / zoom - 1))  # the first voxel's centre in the old grid
+        spacing = spacing / zoom
     levels = [ranks]
     for _ in range(LEVELS - 1):
         levels.append(_halved(levels[-1]))
@@ -112,26 +110,41 @@ def standard_frame(volume: VolumeSequence, frame: int) -> StandardFrame:
     )
 
 
-def _ranks(grey: NDArray[np.float32], source: str, frame: int) -> NDArray[np.uint8]:
-    low, high = float(grey.min()), float(grey.max())
+def _resampled(
+    ranks: NDArray[np.uint8], spacing: FloatArray
+) -> tuple[NDArray[np.uint8], FloatArray]:
+    """At about ``VOXEL_MM``, and how many new voxels there are for each old one ``(3,)``."""
+    shape = np.maximum(1, np.rint(np.array(ranks.shape) * spacing / VOXEL_MM)).astype(int)
+    zoom = shape / np.array(ranks.shape)
+    smooth = ndimage.gaussian_filter(ranks.astype(np.float32), np.where(zoom < 1, 0.5 / zoom, 0.0))
+    finer = ndimage.zoom(smooth, zoom, order=1, grid_mode=True, mode="nearest")
+    return np.rint(finer).astype(np.uint8), zoom
+
+
+def _ranks(grey: NDArray[Any], source: str, frame: int) -> NDArray[np.uint8]:
+    low, high = grey.min(), grey.max()
     if not high > low:
         raise InputError(f"{source}, frame {frame}: all voxels are {low:g}, expected an image")
-    # A byte's worth of levels: what more there is, ranks cannot show.
-    binned = np.rint((grey - low) * (255 / (high - low))).astype(np.uint8)
-    inside = _field_of_view(binned > 0)
+    inside = _field_of_view(np.asarray(grey > low))
     if inside is None:
         raise InputError(
             f"{source}, frame {frame}: hardly any voxel is brighter than {low:g}, expected an image"
         )
-    count = np.bincount(binned[inside], minlength=256)
-    if np.count_nonzero(count) < LEAST_GREY_VALUES:
+    seen = grey[inside]
+    if np.issubdtype(grey.dtype, np.integer) and int(high) - int(low) < MOST_LEVELS:
+        count = np.bincount(seen.astype(np.int64) - int(low), minlength=int(high) - int(low) + 1)
+        different = int(np.count_nonzero(count))
+        middle = ((np.cumsum(count) - 0.5 * count) / count.sum())[grey.astype(np.int64) - int(low)]
+    else:
+        ordered = np.sort(seen[:: -(-len(seen) // MOST_COMPARED)])
+        different = len(np.unique(ordered))
+        left, right = (np.searchsorted(ordered, grey, side) for side in ("left", "right"))
+        middle = 0.5 * (left + right) / len(ordered)
+    if different < LEAST_GREY_VALUES:
         raise InputError(
-            f"{source}, frame {frame}: {np.count_nonzero(count)} different grey values, expected "
-            "an image"
+            f"{source}, frame {frame}: {different} different grey values, expected an image"
         )
-    middle = (np.cumsum(count) - 0.5 * count) / count.sum()
-    table = np.maximum(1, np.rint(255 * middle)).astype(np.uint8)
-    return np.where(inside, table[binned], 0).astype(np.uint8)
+    return np.where(inside, np.maximum(1, np.rint(255 * middle)), 0).astype(np.uint8)
 
 
 def _field_of_view(echo: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

@@ -65,6 +65,10 @@ UNREADABLE = (
 """What a file that is no model, or a damaged one, raises when it is read."""
 
 
+LONGEST_REASON = 200
+"""Characters of another library's message that are passed on; some quote the file."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
     """How the detectors err on simulated volumes that they have not seen.
@@ -204,7 +208,8 @@ def load_model(path: Path | str) -> DetectionModel:
     except UNREADABLE as fault:
         if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
-        raise InputError(f"{source}: {fault}; expected a {FORMAT} of version {VERSION}") from fault
+        why = str(fault)[:LONGEST_REASON]
+        raise InputError(f"{source}: {why}; expected a {FORMAT} of version {VERSION}") from fault
 
 
 def default_model() -> DetectionModel:
