@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -88,8 +90,8 @@ class Boosters:
         except lightgbm.basic.LightGBMError as fault:
             raise InputError(f"{source}: no trees that LightGBM reads ({fault})") from fault
 
-    def __reduce__(self) -> tuple[type[Boosters], tuple[tuple[str, ...]]]:
-        return Boosters, (self.texts,)
+    def __reduce__(self) -> tuple[Callable[[tuple[str, ...]], Boosters], tuple[tuple[str, ...]]]:
+        return _received, (self.texts,)
 
     @property
     def outputs(self) -> int:
@@ -107,6 +109,12 @@ class Boosters:
             return np.zeros((0, self.outputs))
         found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
         return np.stack(found, axis=1)
+
+
+@lru_cache(maxsize=64)
+def _received(texts: tuple[str, ...]) -> Boosters:
+    """Trees that another process sent: those of one call after another are read once."""
+    return Boosters(texts)
 
 
 def train_boosters(
