@@ -213,6 +213,7 @@ class HeldOutConfig:
     sequences: int = MISSING  # of all frames of a valve, drawn as those of training are
     shifted_sequences: int = MISSING
     without_valve: int = MISSING  # of each kind of volume in which there is none
+    wrong_mm: float = 5.0  # mean distance of a valve's points from which on it is not the valve
 
 
 @dataclass

@@ -71,11 +71,7 @@ def run_imaging(
         for volumes in imaging["curve"]:
             train(volumes)
         held_out = hold_out(store, config, *apart)
-        samples = held_out.errors("calibration")
-        accuracy = measure_accuracy(
-            samples, held_out.errors("calibration", tips=True), held_out.rest("calibration")
-        )
-        trained_on["calibrated_on"] = [valve.name for valve in apart[0]]
+        accuracy, trained_on["calibrated_on"] = _calibrated(config, held_out)
     final = DetectionModel(
         model.shape,
         model.boosters,
@@ -87,6 +83,30 @@ def run_imaging(
     raw = (folder / MODEL).read_bytes()
     record["model_file"] = {"sha256": hashlib.sha256(raw).hexdigest(), "bytes": len(raw)}
     return record, [folder / MODEL]
+
+
+def _calibrated(
+    config: Values, held_out: HeldOut
+) -> tuple[tuple[Accuracy, Correlogram], list[str]]:
+    """Errors in the volumes in which the valve was found, and the names of these valves.
+
+    Where it was not, or where something else was taken for it, no standard deviation tells how far.
+    """
+    kind = "calibration"
+    least, wrong = (
+        config["imaging"]["detection"]["least_confidence"],
+        config["imaging"]["held_out"]["wrong_mm"],
+    )
+    found = held_out.found(kind, least, wrong)
+    rows = found.sequences[kind]
+    if len(rows) < 2:
+        raise InputError(
+            f"imaging.calibration: in {len(rows)} of {len(held_out.sequences[kind])} volumes the "
+            f"valve was found (confidence at least {least:g}, points nearer than {wrong:g} mm), "
+            "expected two or more: more volumes to train on"
+        )
+    samples, tips, rest = (found.stacked(kind, name) for name in ("errors", "tip_errors", "rest"))
+    return measure_accuracy(samples, tips, rest.mean(axis=0)), [row["valve"] for row, _ in rows]
 
 
 def publish_model(config: Values, record: Values, folder: Path) -> None:
@@ -175,6 +195,10 @@ def require_imaging(config: Values) -> None:
         raise ConfigurationError(
             f"imaging.held_out.curve_volumes = {held_out['curve_volumes']}, expected at most "
             f"{most}: all held-out volumes"
+        )
+    if not held_out["wrong_mm"] > 0:
+        raise ConfigurationError(
+            f"imaging.held_out.wrong_mm = {held_out['wrong_mm']}, expected a distance > 0"
         )
     settings = build(TrackingSettings, imaging["detection"])
     modes = max(MODES, *settings.fit.modes)

@@ -46,14 +46,28 @@ class HeldOut:
     volumes: dict[int, list[dict[str, Any]]]
     sequences: dict[str, list[tuple[dict[str, Any], dict[str, FloatArray]]]]
 
-    def errors(self, kind: str, *, tips: bool = False) -> FloatArray:
-        """``(S, 2, n, 3)``, or of the tips ``(S, 2, 2, 3)`` mm, in the valve's axes."""
-        name = "tip_errors" if tips else "errors"
-        return np.stack([arrays[name] for _, arrays in self.sequences[kind]])
+    def found(self, kind: str, least_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
+        """Only volumes over time of a kind whose valve is believed in, and is not a wrong one.
 
-    def rest(self, kind: str) -> FloatArray:
-        """``(n, 3)`` mm: the mean true open valve."""
-        return np.mean([arrays["rest"] for _, arrays in self.sequences[kind]], axis=0)
+        Parameters
+        ----------
+        kind : str
+        least_confidence : float
+            Of the best frame.
+        wrong_mm : float
+            Mean distance of points over all frames from which on it is a wrong one.
+        """
+        kept = [
+            (row, arrays)
+            for row, arrays in self.sequences[kind]
+            if max(frame["confidence"] for frame in row["frames"]) >= least_confidence
+            and np.mean([frame["points"] for frame in row["frames"]]) < wrong_mm
+        ]
+        return HeldOut(self.volumes, {kind: kept})
+
+    def stacked(self, kind: str, name: str) -> FloatArray:
+        """Arrays of all volumes over time: ``errors (S, 2, n, 3)``, ``tip_errors``, ``rest`` mm."""
+        return np.stack([arrays[name] for _, arrays in self.sequences[kind]])
 
 
 def hold_out(

@@ -106,18 +106,22 @@ def _tested(
     correlogram: Correlogram,
 ) -> dict[str, Any]:
     least = float(config["imaging"]["detection"]["least_confidence"])
+    wrong = float(config["imaging"]["held_out"]["wrong_mm"])
     own = held_out.volumes[store.training.volumes]
     sequences = {kind: [row for row, _ in held_out.sequences[kind]] for kind in SEQUENCES}
     return {
         "rows": [table_row(row, least) for row in own if row["kind"] in VOLUMES],
         "training": learning_rows(held_out.volumes),
-        "confidence": _confidences(own, sequences, least),
-        "sequences": [_sequence_row(row, least) for kind in SETTING for row in sequences[kind]],
+        "confidence": _confidences(own, sequences, least, wrong),
+        "sequences": [
+            _sequence_row(row, least, wrong) for kind in SETTING for row in sequences[kind]
+        ],
         "accuracy": {
             "std_mm": [round(float(v), 4) for v in accuracy.std_mm],
             "median_std_mm": float(np.median(accuracy.std_mm)),
             "correlation_length_mm": accuracy.correlation_length_mm,
             "sequences": len(accuracy.samples),
+            "left_out": len(sequences["calibration"]) - len(accuracy.samples),
             "mean_error_mm": float(np.linalg.norm(accuracy.samples.mean(axis=0), axis=2).mean()),
             "correlogram": {
                 key: [round(float(v), 4) for v in values]
@@ -126,8 +130,7 @@ def _tested(
             "within_95": [
                 row
                 for kind, setting in SETTING.items()
-                if held_out.sequences[kind]
-                for row in _coverage(held_out, kind, setting, accuracy)
+                for row in _coverage(held_out.found(kind, least), kind, setting, accuracy)
             ],
         },
         "volumes": {str(size): rows for size, rows in held_out.volumes.items()},
@@ -204,37 +207,49 @@ def _state_right(row: Row) -> bool | None:
 
 
 def _confidences(
-    volumes: Sequence[Row], sequences: Mapping[str, Sequence[Row]], least: float
+    volumes: Sequence[Row], sequences: Mapping[str, Sequence[Row]], least: float, wrong_mm: float
 ) -> dict[str, Any]:
-    """Confidence of every volume, by kind; of one over time that of its best frame."""
-    values: dict[str, list[float]] = {
-        kind: [float(row["confidence"]) for row in volumes if row["kind"] == kind]
-        for kind in (*VOLUMES, *WITHOUT_VALVE)
-    }
+    """Confidence of every volume and how far it is off, by kind; over time, of its best frame."""
+    values: dict[str, list[float]] = {}
+    off: dict[str, list[float | None]] = {}
+    for kind in (*VOLUMES, *WITHOUT_VALVE):
+        rows = [row for row in volumes if row["kind"] == kind]
+        values[kind] = [float(row["confidence"]) for row in rows]
+        off[kind] = [row["errors"]["points"] if "errors" in row else None for row in rows]
     for kind in SEQUENCES:
-        best = [max(frame["confidence"] for frame in row["frames"]) for row in sequences[kind]]
-        values |= {kind: best} if best else {}
-    rows = [
-        {
-            "kind": kind,
-            "volumes": len(own),
-            "lowest": min(own),
-            "median": float(np.median(own)),
-            "highest": max(own),
-            "called a valve [%]": 100.0 * float(np.mean(np.array(own) >= least)),
-        }
-        for kind, own in values.items()
-        if own
-    ]
-    with_valve = [v for kind in (*VOLUMES, *SEQUENCES) for v in values.get(kind, [])]
-    without = [v for kind in WITHOUT_VALVE for v in values[kind]]
+        values[kind] = [max(f["confidence"] for f in row["frames"]) for row in sequences[kind]]
+        off[kind] = [_mean([f["points"] for f in row["frames"]]) for row in sequences[kind]]
+    right: list[float] = []
+    other: list[float] = []
+    told = []
+    for kind, own in values.items():
+        is_right = [distance is not None and distance < wrong_mm for distance in off[kind]]
+        right += [v for v, good in zip(own, is_right, strict=True) if good]
+        other += [v for v, good in zip(own, is_right, strict=True) if not good]
+        if own:
+            called = [v >= least for v in own]
+            told.append(
+                {
+                    "kind": kind,
+                    "volumes": len(own),
+                    "lowest": min(own),
+                    "median": float(np.median(own)),
+                    "highest": max(own),
+                    "called a valve [%]": 100.0 * _mean(called),
+                    "wrongly called so [%]": 100.0
+                    * _mean([c and not good for c, good in zip(called, is_right, strict=True)]),
+                }
+            )
     return {
         "least_confidence": least,
-        "rows": rows,
+        "wrong_mm": wrong_mm,
+        "rows": told,
         "values": values,
-        "highest_without_valve": max(without),
-        "lowest_with_valve": min(with_valve),
-        "best_threshold": _threshold(np.array(with_valve), np.array(without)),
+        "off_mm": off,
+        "highest_without_valve": max(v for kind in WITHOUT_VALVE for v in values[kind]),
+        "highest_wrong": max(other),
+        "lowest_right": min(right) if right else None,
+        "best_threshold": _threshold(np.array(right), np.array(other)) if right else None,
     }
 
 
@@ -247,18 +262,20 @@ def _threshold(with_valve: FloatArray, without: FloatArray) -> float:
     return float(best[len(best) // 2])
 
 
-def _sequence_row(row: Row, least: float) -> dict[str, Any]:
+def _sequence_row(row: Row, least: float, wrong: float) -> dict[str, Any]:
     frames = row["frames"]
     area = [v for frame in frames if (v := _area_error(frame)) is not None]
     ap = [v for frame in frames if (v := _ap_error(frame)) is not None]
     state = [v for frame in frames if (v := _state_right(frame)) is not None]
     confidence = max(frame["confidence"] for frame in frames)
+    points = _mean([frame["points"] for frame in frames])
     return {
         "setting": SETTING[row["kind"]],
         "valve": row["valve"],
         "frames": len(frames),
         "confidence": confidence,
         "found": bool(confidence >= least),
+        "wrong": bool(confidence >= least and points >= wrong),
         **{
             f"{name}_mm": _mean([f[name] for f in frames]) for name in ("surface", "points", "tips")
         },
@@ -274,8 +291,10 @@ def _sequence_row(row: Row, least: float) -> dict[str, Any]:
 def _coverage(
     held_out: HeldOut, kind: str, setting: str, accuracy: Accuracy
 ) -> list[dict[str, Any]]:
-    """How many coordinates lie within 1.96 of the standard deviations told."""
-    errors, mean = held_out.errors(kind), accuracy.samples.mean(axis=0)
+    """How many coordinates lie within 1.96 of the standard deviations told, wrong ones and all."""
+    if not held_out.sequences[kind]:
+        return []
+    errors, mean = held_out.stacked(kind, "errors"), accuracy.samples.mean(axis=0)
     out = []
     for k, frame in enumerate(("open", "closed")):
         own, about = errors[:, k : k + 1], mean[k : k + 1]
@@ -304,6 +323,7 @@ def _spent(config: Values, store: ImagingStore) -> dict[str, Any]:
     parts: dict[str, Spent] = {
         "valves": store.population_spent("train"),
         "volumes": Spent(sum(one.cpu_s for one in volumes), None),
+        "draft": store.draft_spent(),
         "trees": store.model_spent(store.training.volumes),
     }
     cpu = [spent.cpu_s for spent in parts.values()]

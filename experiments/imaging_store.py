@@ -32,6 +32,7 @@ from mvest.imaging.detection.boosting import Boosters
 from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.training import (
+    Draft,
     Samples,
     TrainingSettings,
     draft_of,
@@ -60,6 +61,9 @@ DRAWN_BY = (
     "imaging/moving_valve.py",
 )
 """What decides how a simulated valve moves, besides the forward model."""
+
+DRAFT = "draft.json"
+"""File beside samples that says what their draft cost."""
 
 NOT_SAMPLED_BY = (
     "reading",
@@ -247,7 +251,7 @@ class ImagingStore:
             missing = [number for number, place in places.items() if not place.is_file()]
             if missing:
                 shape = self.shapes(valves)
-                draft = draft_of(drafted, self.training, self.seed) if drafted else None
+                draft = self._draft(drafted, folder) if drafted else None
                 calls = (
                     (valves[k % len(valves)], k, shape, self.training, self.seed, draft)
                     for k in missing
@@ -258,6 +262,21 @@ class ImagingStore:
                         _write_samples(places[number], samples, cpu_s)
                         bar.step()
         return [StoredSamples(place) for place in places.values()]
+
+    def _draft(self, drafted: Sequence[StoredSamples], folder: Path) -> Draft:
+        with PartBar("draft of the search", 1, "search") as bar:
+            began = time.process_time(), time.monotonic()
+            draft = draft_of(drafted, self.training, self.seed)
+            spent = Spent(time.process_time() - began[0], time.monotonic() - began[1])
+            write_json(folder / DRAFT, asdict(spent))
+            bar.step()
+        return draft
+
+    def draft_spent(self) -> Spent:
+        """What the draft cost whose mistakes were learned from; nothing where there was none."""
+        if self.training.volumes <= self.training.draft_volumes:
+            return Spent(0.0, 0.0)
+        return _spent(self._place("samples", self.samples_key) / DRAFT)
 
     def shapes(self, valves: Sequence[MovingValve]) -> ShapeModel:
         """The shape model of all training valves."""

@@ -35,6 +35,13 @@ Record = Mapping[str, Any]
 NOT_KEPT: Final = ("volumes", "sequence_frames")
 """Of a record, what no table needs."""
 
+_PARTS: Final = {
+    "valves": "for valves",
+    "volumes": "for volumes and their samples",
+    "draft": "for the draft whose mistakes are learned",
+    "trees": "for trees",
+}
+
 NO_VALVE: Final = ("walls only", "no tissue", "white noise")
 """Kinds of volumes in which there is no valve."""
 
@@ -53,7 +60,8 @@ OVER_TIME: Final = (
 WITHOUT: Final = (
     "How sure the detectors are of a valve in simulated volumes, with and without one. Walls only: "
     "leaflets, annulus and chordae send no echo; no tissue: nothing does; a volume over time "
-    "counts with its best frame. Nothing here was measured in patients."
+    "counts with its best frame. Wrongly: there is none, or what was found is not it. Nothing here "
+    "was measured in patients."
 )
 
 
@@ -62,10 +70,9 @@ def study_words(record: Record) -> list[str]:
     spent, told = record["spent"], []
     parts = [
         f"{spent[part]['cpu_s']:.0f} s {words}"
-        for part, words in (("valves", "for valves"), ("volumes", "for volumes and their samples"),
-                            ("trees", "for trees"))
+        for part, words in _PARTS.items()
         if spent[part]["cpu_s"] is not None
-    ]  # fmt: skip
+    ]
     total = spent["training"]["cpu_s"]
     told.append(
         f"Trained on {record['training_volumes']} volumes of "
@@ -85,7 +92,8 @@ def study_words(record: Record) -> list[str]:
         f"Errors that the detectors tell, from {accuracy['sequences']} volumes over time of other "
         f"valves: median standard deviation of a coordinate {accuracy['median_std_mm']:.2f} mm, "
         f"alike over {accuracy['correlation_length_mm']:.1f} mm, mean error "
-        f"{accuracy['mean_error_mm']:.2f} mm."
+        f"{accuracy['mean_error_mm']:.2f} mm. Left out, as the valve was not found or something "
+        f"else was taken for it: {accuracy['left_out']}."
     )
     for row in accuracy["within_95"]:
         told.append(
@@ -96,11 +104,16 @@ def study_words(record: Record) -> list[str]:
         )
     found = record["confidence"]
     told.append(
-        f"Confidence without a valve: at most {found['highest_without_valve']:.2f}; with one: at "
-        f"least {found['lowest_with_valve']:.2f}; a valve is called one from "
-        f"{found['least_confidence']:g} on, and {found['best_threshold']:.2f} would tell them "
-        "apart best."
+        f"Confidence without a valve: at most {found['highest_without_valve']:.2f}; a valve is "
+        f"called one from {found['least_confidence']:g} on."
     )
+    if found["lowest_right"] is not None:
+        told.append(
+            f"Where the valve was found (points on average within {found['wrong_mm']:g} mm): at "
+            f"least {found['lowest_right']:.2f}; where it was not, or where there is none: at most "
+            f"{found['highest_wrong']:.2f}; {found['best_threshold']:.2f} would tell these apart "
+            "best."
+        )
     return told
 
 
@@ -195,10 +208,11 @@ def _over_time(table: pd.DataFrame) -> list[dict[str, str]]:
         row = {
             "setting": setting,
             "volumes": str(len(own)),
-            "valve found [%]": f"{100.0 * own['found'].mean():.0f}",
+            "called a valve [%]": f"{100.0 * own['found'].mean():.0f}",
+            "wrongly called so [%]": f"{100.0 * own['wrong'].mean():.0f}",
         }
         for name, words in columns.items():
-            values = own[name].dropna().astype(float)
+            values = own.loc[own["found"], name].dropna().astype(float)
             row[words] = f"{values.mean():.2f}" if len(values) else MISSING
         frames = int(own["frames"].iloc[0])
         row["time [s]"] = f"{own['seconds'].median():.1f} ({frames} frames)"
@@ -226,7 +240,8 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     Parameters
     ----------
     confidence : mapping
-        ``values`` (kind -> confidences) and ``least_confidence``.
+        ``values`` (kind -> confidences), ``off_mm`` (kind -> distances of points, None without a
+        valve), ``wrong_mm`` and ``least_confidence``.
     """
     values = {kind: own for kind, own in confidence["values"].items() if own}
     figure, grid = panels(1, 1, 0.42 * len(values) + 1.6)
@@ -235,10 +250,14 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     labels = []
     for k, (kind, own) in enumerate(values.items()):
         look = 1 if kind in NO_VALVE else 0
-        axes.plot(
-            own, k + random.uniform(-0.2, 0.2, len(own)), ls="none", marker=MARKERS[look], ms=4,
-            mew=0, alpha=0.75, color=COLOURS[look],
-        )  # fmt: skip
+        places = k + random.uniform(-0.2, 0.2, len(own))
+        off = np.array([np.nan if v is None else v for v in confidence["off_mm"][kind]])
+        wrong = off >= confidence["wrong_mm"]
+        for which, face in ((~wrong, COLOURS[look]), (wrong, "white")):
+            axes.plot(
+                np.array(own)[which], places[which], ls="none", marker=MARKERS[look], ms=4.2,
+                mec=COLOURS[look], mfc=face, alpha=0.8,
+            )  # fmt: skip
         labels.append(f"{_called(kind)} ({len(own)})")
     axes.axvline(confidence["least_confidence"], color="0.25", lw=1.0, ls="--", zorder=0)
     axes.annotate(
@@ -251,7 +270,11 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     axes.set_xlim(0.0, max(1.0, *(max(own) for own in values.values())))
     axes.set_xlabel("confidence")
     axes.grid(visible=False, axis="y")
-    headline(figure, "How sure the detectors are that there is a valve", "Simulated volumes.")
+    headline(
+        figure, "How sure the detectors are that there is a valve",
+        "Simulated volumes. Hollow: what was found is not the valve, its points are on average "
+        f"{confidence['wrong_mm']:g} mm off or more.",
+    )  # fmt: skip
     return figure
 
 

@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.build import build_filter, build_twin, truth_mesh
 from experiments.config import hash_of, register
 from experiments.mirror import build
+from experiments.request import as_published
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation_errors import WhiteNoise
 
@@ -78,6 +79,17 @@ def test_a_hash_depends_on_what_changes_the_result_only() -> None:
     }
     assert base not in others
     assert len(others) == 8
+
+
+def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
+    base = hash_of(composed("experiment=imaging"))
+    same = ["imaging.processes=7", "imaging.publish_model=true"]
+    assert hash_of(composed("experiment=imaging", *same)) == base
+    assert hash_of(composed("experiment=imaging", "imaging.evaluate=false")) != base
+    assert as_published(["experiment=imaging", *same], None)
+    assert not as_published(["experiment=imaging", "imaging.evaluate=false"], None)
+    assert not as_published(["+imaging.train.count=7"], None)
+    assert as_published(["paths.outputs=elsewhere", "~sweep"], None)
 
 
 def test_the_usual_overrides_reach_the_objects() -> None:

@@ -14,7 +14,8 @@ from omegaconf import OmegaConf
 
 from experiments import imaging, imaging_store, tables
 from experiments.config import register
-from experiments.imaging_record import _threshold, learning_rows, table_row
+from experiments.imaging_held_out import HeldOut
+from experiments.imaging_record import _confidences, _threshold, learning_rows, table_row
 from experiments.imaging_store import ImagingStore, StoredSamples
 from experiments.imaging_trials import KINDS, Trial
 from experiments.run import main
@@ -94,9 +95,10 @@ def test_the_study_tells_how_far_detectors_are_off(done: Path):
         (s, f) for s in settings for f in ("open", "closed")
     }
     assert all(0 <= row["share"] <= 1 for row in accuracy["within_95"])
-    for part in ("valves", "volumes", "trees", "training"):
+    parts = ("valves", "volumes", "draft", "trees")
+    for part in (*parts, "training"):
         assert record["spent"][part]["cpu_s"] > 0
-    total = sum(record["spent"][part]["cpu_s"] for part in ("valves", "volumes", "trees"))
+    total = sum(record["spent"][part]["cpu_s"] for part in parts)
     assert record["spent"]["training"]["cpu_s"] == pytest.approx(total)
     assert record["measures"]["training_cpu_s"] == pytest.approx(total)
 
@@ -224,6 +226,7 @@ def test_a_model_is_made_the_one_of_the_package_without_training_again(
         ("imaging.processes=0", "imaging.processes = 0"),
         ("imaging.held_out.shifted=0", "imaging.held_out.shifted = 0"),
         ("imaging.held_out.curve_volumes=3", "expected at most 2"),
+        ("imaging.held_out.wrong_mm=0", "imaging.held_out.wrong_mm = 0"),
         ("imaging.training.modes=7", "expected at least 8"),
         ("imaging.training.acquisition.beats=0", "beats"),
         ("imaging.population.motion.columns=12", "no column"),
@@ -262,12 +265,13 @@ def test_keys_follow_what_they_are_of():
 
     base = keys()
     assert keys("imaging.processes=2", "imaging.held_out.volumes=9") == base
-    trees = keys("imaging.training.boosting.trees=5")
+    trees = keys("imaging.training.boundary_trees=5")
     assert trees[:2] == base[:2]
     assert trees[2] != base[2]
     # More volumes go on from those that are there.
     more = keys("imaging.training.volumes=9")
     assert more == base
+    assert keys("imaging.training.draft_volumes=2")[1] != base[1]
     other = keys("seed=2")
     assert other[0] == base[0]
     assert other[1] != base[1]
@@ -344,6 +348,45 @@ def test_the_threshold_tells_with_from_without():
     assert _threshold(np.array([0.6, 0.8, 0.9]), np.array([0.1, 0.4])) == pytest.approx(0.5)
     # One outlier does not move it.
     assert 0.4 < _threshold(np.array([0.3, 0.8, 0.9]), np.array([0.1, 0.4])) < 0.8
+
+
+def sequence(confidence: float, off: float) -> tuple[dict, dict]:
+    frames = [
+        {"confidence": confidence - 0.1, "points": off},
+        {"confidence": confidence, "points": off},
+    ]
+    return {"frames": frames, "valve": f"{off}"}, {"errors": np.full((2, 4, 3), off)}
+
+
+def test_errors_are_told_of_valves_that_were_found_only():
+    held_out = HeldOut(
+        {}, {"calibration": [sequence(0.9, 1.0), sequence(0.8, 30.0), sequence(0.3, 2.0)]}
+    )
+    right = held_out.found("calibration", 0.5, 5.0)
+    assert right.stacked("calibration", "errors").max() == 1.0
+    assert len(held_out.found("calibration", 0.5).sequences["calibration"]) == 2
+    config = {"imaging": {"detection": {"least_confidence": 0.5}, "held_out": {"wrong_mm": 5.0}}}
+    with pytest.raises(InputError, match="in 1 of 3 volumes the valve was found"):
+        imaging._calibrated(config, held_out)
+
+
+def test_a_wrong_valve_counts_as_none():
+    volumes = [
+        volume("in distribution", 0, 1.0, 0.9),
+        volume("in distribution", 1, 8.0, 0.6),
+        *({"kind": kind, "confidence": 0.2} for kind in ("walls only", "no tissue", "white noise")),
+    ]
+    sequences = {"calibration": [sequence(0.8, 1.0)[0]], "sequence": [], "shifted sequence": []}
+    found = _confidences(volumes, sequences, 0.5, 5.0)
+    assert found["highest_without_valve"] == 0.2
+    assert found["highest_wrong"] == 0.6
+    assert found["lowest_right"] == 0.8
+    assert found["best_threshold"] == pytest.approx(0.7)
+    rows = {row["kind"]: row for row in found["rows"]}
+    assert rows["in distribution"]["called a valve [%]"] == 100
+    assert rows["in distribution"]["wrongly called so [%]"] == 50
+    assert rows["walls only"]["wrongly called so [%]"] == 0
+    assert "sequence" not in rows
 
 
 def test_the_small_scanner_is_the_simulators():

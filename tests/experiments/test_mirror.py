@@ -8,7 +8,10 @@ from omegaconf.errors import ConfigKeyError, ValidationError
 from experiments.config import MechanicsConfig, TemplateConfig
 from experiments.mirror import build, schema
 from mvest.errors import ConfigurationError, InputError
+from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.detection.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
+from mvest.simulated_motion import PopulationSettings
 from mvest.valve.template import TemplateParameters
 
 
@@ -53,6 +56,10 @@ def test_typos_and_wrong_types_are_refused() -> None:
 def test_the_librarys_defaults_are_the_configurations() -> None:
     template = OmegaConf.to_container(OmegaConf.structured(TemplateConfig))
     assert build(TemplateParameters, template) == TemplateParameters()
+    # Dataclasses within dataclasses, and mappings.
+    for cls in (PopulationSettings, TrainingSettings, TrackingSettings):
+        made = OmegaConf.to_container(OmegaConf.structured(schema(cls)))
+        assert build(cls, made) == cls()
     mechanics = OmegaConf.structured(MechanicsConfig)
     mechanics.merge_with({"tissue": {"anterior": {"ratio": 2.0}}})
     tissue = {"anterior": TissueSettings(2.0)}

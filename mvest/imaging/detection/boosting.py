@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,9 @@ class Boosters:
         return np.stack(found, axis=1)
 
 
+@lru_cache(maxsize=64)
 def _as_checked(texts: tuple[str, ...], features: int, source: str) -> Boosters:
+    """Trees that another process sent: those of one call after another are read once."""
     found = Boosters.__new__(Boosters)
     found._begin(texts, features, source)
     return found
