@@ -1,0 +1,44 @@
+"""What the documents say of the image step: settings, stages, landmarks, layout, links."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from experiments.config import ImagedConfig, ImagingConfig
+from mvest.imaging.detection.model import STAGES
+from mvest.imaging.landmarks import LANDMARKS
+from mvest.imaging.layout import ValveLayout
+
+ROOT = Path(__file__).resolve().parents[2]
+OWN, MAIN = (ROOT / "mvest" / "imaging" / "README.md", ROOT / "README.md")
+
+
+@pytest.mark.parametrize("path", [OWN, MAIN], ids=["imaging", "main"])
+def test_settings_that_are_named_exist(path):
+    text = path.read_text(encoding="utf-8")
+    for part, config in (("imaged", ImagedConfig), ("imaging", ImagingConfig)):
+        named = set(re.findall(rf"(?<![\w./]){part}\.(\w+)\b", text)) - {"md"}
+        assert named, part
+        assert named <= {f.name for f in fields(config)}
+
+
+def test_all_stages_and_landmarks_are_named():
+    text = OWN.read_text(encoding="utf-8")
+    for name in LANDMARKS:
+        assert f"`{name}`" in text
+    for name in {re.sub(r"_\d+$", "", stage) for stage in STAGES}:
+        assert re.search(rf"`{name}(_0)?`", text), name
+    last = max(int(found[1]) for stage in STAGES if (found := re.match(r"landmark_(\d+)", stage)))
+    assert f"`landmark_0` to `_{last}`" in text
+
+
+def test_the_layout_is_the_default_one():
+    layout = ValveLayout()
+    assert f"{layout.columns} x {layout.rows} by default" in OWN.read_text(encoding="utf-8")
+
+
+def test_local_links_lead_somewhere():
+    for target in re.findall(r"\]\((?!https?:|#)([^)#]+)\)", OWN.read_text(encoding="utf-8")):
+        assert (OWN.parent / target).exists(), target
