@@ -14,7 +14,7 @@ import numpy as np
 
 from mvest.errors import GeometryError
 from mvest.imaged_valve import OPEN_SHARE
-from mvest.imaging.detection.detect import fit_frame, search_frame
+from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.evaluation import frame_errors, surface_distances
 from mvest.imaging.detection.frame import standard_frame
 from mvest.imaging.detection.model import DetectionModel, load_model
@@ -134,8 +134,7 @@ def try_volume(
         model = _model(str(path))
         began = time.process_time()
         picture = standard_frame(volume, 0)
-        poses, _ = search_frame(picture, model)
-        fitted = fit_frame(picture, model, poses[:1], settings.fit)
+        fitted = find_frame(picture, model, settings.fit)
         row: dict[str, Any] = {
             "kind": asked.kind,
             "number": asked.number,

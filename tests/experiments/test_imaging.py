@@ -265,7 +265,7 @@ def test_keys_follow_what_they_are_of():
 
     base = keys()
     assert keys("imaging.processes=2", "imaging.held_out.volumes=9") == base
-    trees = keys("imaging.training.boundary_trees=5")
+    trees = keys("imaging.training.many_trees=5")
     assert trees[:2] == base[:2]
     assert trees[2] != base[2]
     # More volumes go on from those that are there.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,15 @@ from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["FitSettings", "FrameValve", "fit_frame", "search_frame"]
+__all__ = [
+    "FitSettings",
+    "FrameValve",
+    "NoValveError",
+    "find_frame",
+    "fit_frame",
+    "likeliest",
+    "search_frame",
+]
 
 LANDMARK_STD_MM = 1.2
 RIM_STD_MM = (0.8, 0.8)
@@ -51,6 +59,20 @@ class FitSettings:
     alike: float = 8.0
     stiffness: float = 4.0
     hold: float = 0.3
+
+
+CANDIDATES = 24
+"""Poses that a search returns, many of them alike."""
+
+SURE = 0.6
+"""Rating above which the best pose is taken without trying others."""
+
+TRIED = 4
+"""Poses that are tried otherwise."""
+
+
+class NoValveError(InputError):
+    """A volume shows no valve that the detectors believe in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +110,43 @@ def search_frame(
     """The best ``count`` poses in a frame and their ratings (0 to 1), best first."""
     places, _ = model.position(frame, PLACES)
     return model.poses(frame, places, count)
+
+
+def find_frame(
+    frame: StandardFrame, model: DetectionModel, settings: FitSettings | None = None
+) -> FrameValve:
+    """Search one frame and fit the valve in it.
+
+    Raises
+    ------
+    NoValveError
+        If there is no place to look at.
+    """
+    poses, rating = search_frame(frame, model, CANDIDATES)
+    if not len(poses):
+        raise NoValveError("no place to look for a valve at: no field of view")
+    if rating[0] < SURE:
+        poses = poses[likeliest(frame, model, poses, rating, settings or FitSettings())]
+    return fit_frame(frame, model, poses[:1], settings)
+
+
+def likeliest(
+    frame: StandardFrame,
+    model: DetectionModel,
+    poses: Poses,
+    rating: FloatArray,
+    settings: FitSettings,
+) -> list[int]:
+    """Order of the few best poses that differ, by how well a valve is fitted there in one round.
+
+    Where poses are rated low, a wrong one may be rated best; its leaflets then are not where the
+    boundary is seen.
+    """
+    few = poses.apart(rating, TRIED)
+    once = replace(settings, modes=settings.modes[:1], reach_mm=settings.reach_mm[:1])
+    quick = [fit_frame(frame, model, poses[k : k + 1], once) for k in few]
+    merit = [valve.confidence + 2.0 * valve.vertex_confidence.mean() for valve in quick]
+    return [int(few[k]) for k in np.argsort(-np.array(merit), kind="stable")]
 
 
 def fit_frame(
@@ -163,7 +222,7 @@ def fit_frame(
     )
     hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
     vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), told.stiffness, told.hold)
-    rating = float(model.poses.refined(frame, pose, 1)[1][0])
+    rating = float(np.clip(model.poses.refined(frame, pose, 1)[1][0], 0.0, 1.0))
     return FrameValve(begin, pose, b, vertices, tips, rating, confidence, stages)
 
 

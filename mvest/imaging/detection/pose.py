@@ -74,6 +74,21 @@ class Poses:
             *(np.repeat(v, count, 0) for v in (self.centre, self.rotation, self.log_scale))
         )
 
+    def apart(self, ratings: FloatArray, count: int) -> IntArray:
+        """Numbers of the best rated poses that are not about the same as a better one.
+
+        Poses are about the same within 4 mm and 15 degrees.
+        """
+        kept: list[int] = []
+        for k in np.argsort(-ratings, kind="stable"):
+            turn = Rotation.from_matrix(np.swapaxes(self.rotation[kept], 1, 2) @ self.rotation[k])
+            gap = np.linalg.norm(self.centre[kept] - self.centre[k], axis=1)
+            if not kept or np.all((gap > 4.0) | (turn.magnitude() > np.deg2rad(15.0))):
+                kept.append(int(k))
+            if len(kept) == count:
+                break
+        return np.array(kept, dtype=np.int64)
+
     @staticmethod
     def joined(parts: list[Poses]) -> Poses:
         """All poses of several."""

@@ -35,6 +35,12 @@ ORIENTATIONS = 700
 REFINED = 160
 """Hypotheses that are refined."""
 
+TURNED = 12
+"""Of the best ones, so many are turned front to back and refined too."""
+
+HALF_TURN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi, 0.0])
+"""About the valve's axis, as poses are moved."""
+
 REFINEMENTS = (
     Misses(7.0, 22.0, 0.12),
     Misses(4.0, 12.0, 0.08),
@@ -165,12 +171,23 @@ class PoseSearch:
         )
         rating = self.coarse(features(frame, COARSE, every.centre, every.axes))[:, 0]
         best = np.argsort(-rating, kind="stable")[:REFINED]
-        return self.refined(frame, every[best], count)
+        poses, rating = self.refined(frame, every[best], REFINED)
+        # Front and back are told apart last, so the best ones are tried the other way round too.
+        back = poses[:TURNED].moved(np.tile(HALF_TURN, (len(poses[:TURNED]), 1)))
+        back, rated = self.refined(frame, back, TURNED)
+        poses, rating = Poses.joined([poses, back]), np.concatenate([rating, rated])
+        best = np.argsort(-rating, kind="stable")[:count]
+        return poses[best], rating[best]
 
     def refined(self, frame: StandardFrame, poses: Poses, count: int) -> tuple[Poses, FloatArray]:
         """Refine some poses; the best ``count`` of them and their ratings."""
+        poses, rating = self.refined_in_order(frame, poses)
+        best = np.argsort(-rating, kind="stable")[:count]
+        return poses[best], rating[best]
+
+    def refined_in_order(self, frame: StandardFrame, poses: Poses) -> tuple[Poses, FloatArray]:
+        """Refine some poses; all of them in their order, and their ratings."""
         for step in self.refine:
             poses = poses.moved(step(features(frame, FINE, poses.centre, poses.axes)))
         rating = self.fine(features(frame, WIDE, poses.centre, poses.axes))[:, 0]
-        best = np.argsort(-rating, kind="stable")[:count]
-        return poses[best], rating[best]
+        return poses, rating

@@ -15,7 +15,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
-from mvest.imaging.detection.detect import FitSettings, FrameValve, fit_frame, search_frame
+from mvest.imaging.detection.detect import (
+    CANDIDATES,
+    HAND_STD_MM,
+    SURE,
+    FitSettings,
+    FrameValve,
+    NoValveError,
+    fit_frame,
+    likeliest,
+    search_frame,
+)
+from mvest.imaging.detection.fit import Pulls, relax
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
@@ -23,7 +34,7 @@ from mvest.imaging.detection.smoothing import smooth_in_time
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve"]
 
@@ -36,10 +47,6 @@ POSE_LANDMARKS = 4
 
 LINE_MM = 2.0
 """mm, root sum of squares across the best line: below it a pose does not follow from points."""
-
-
-class NoValveError(InputError):
-    """No frame of a volume shows a valve that the detectors believe in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +116,8 @@ def detect_valve(
         if progress is not None:
             progress(k + 1, len(frames))
     confidence = np.array([valve.confidence for valve in found])
-    if confidence.max() < told.least_confidence:
+    by_eye = any(len(points) >= POSE_LANDMARKS for points in by_hand.values())
+    if confidence.max() < told.least_confidence and not by_eye:
         raise NoValveError(
             f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
             f"of {confidence.max():.2f}, expected at least {told.least_confidence:g} (a mitral "
@@ -125,12 +133,8 @@ def detect_valve(
         model.shape.layout.s,
         told.smoothing_s,
     )
-    # Tips have no neighbours along the leaflets that would have to come along.
-    first = len(LANDMARKS) - tips.shape[1]
     for k, points in by_hand.items():
-        for number, point in points.items():
-            if number >= first:
-                tips[k, number - first] = point
+        vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, told.fit)
     accuracy, layout = model.accuracy, model.shape.layout
     return ValveSequence(
         layout,
@@ -142,6 +146,28 @@ def detect_valve(
         np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
         np.nan if accuracy is None else accuracy.correlation_length_mm,
     )
+
+
+def _held(
+    vertices: FloatArray,
+    tips: FloatArray,
+    points: Mapping[int, FloatArray],
+    model: DetectionModel,
+    fit: FitSettings,
+) -> tuple[FloatArray, FloatArray]:
+    """One frame with its landmarks where they were placed; the leaflets about them come along."""
+    at = np.array(list(landmark_vertices(model.shape.layout).values()))
+    moved = np.array(tips)
+    for number, point in points.items():
+        if number >= len(at):
+            moved[number - len(at)] = point
+    on = [number for number in points if number < len(at)]
+    if on:
+        target = np.stack([points[number] for number in on])
+        std = np.full(len(on), HAND_STD_MM[1])
+        pulls = Pulls.to_points(at[on], vertices[at[on]], target, std)
+        vertices = relax(vertices, model.shape.layout, pulls, fit.stiffness, fit.hold)
+    return vertices, moved
 
 
 def _checked(
@@ -188,14 +214,19 @@ def _trajectory(
     for k, frame in enumerate(frames):
         placed = _pose_by_hand(by_hand.get(k, {}), model)
         if placed is None:
-            own.append(search_frame(frame, model, told.hypotheses))
+            poses, rating = search_frame(frame, model, CANDIDATES)
+            few = poses.apart(rating, told.hypotheses)
+            own.append((poses[few], rating[few]))
         else:
             own.append((placed, np.ones(1)))
     ratings = np.concatenate([rating for _, rating in own])
     pool = Poses.joined([poses for poses, _ in own])
     if not len(pool):
         raise NoValveError("no valve found; there is no place in any frame to look for one at")
-    best = pool[_apart(pool, ratings, told.shared)]
+    best = pool[pool.apart(ratings, told.shared)]
+    if not by_hand and np.median([rating[0] for _, rating in own if len(rating)]) < SURE:
+        best = best[_likeliest_in_all(frames, model, best, told.fit)]
+        own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
     candidates = []
     for k, frame in enumerate(frames):
         if _pose_by_hand(by_hand.get(k, {}), model) is not None:
@@ -207,17 +238,24 @@ def _trajectory(
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
 
 
-def _apart(poses: Poses, ratings: FloatArray, count: int) -> IntArray:
-    """The best rated poses that are not about the same as a better one."""
-    kept: list[int] = []
-    for k in np.argsort(-ratings, kind="stable"):
-        turn = Rotation.from_matrix(np.swapaxes(poses.rotation[kept], 1, 2) @ poses.rotation[k])
-        gap = np.linalg.norm(poses.centre[kept] - poses.centre[k], axis=1)
-        if not kept or np.all((gap > 4.0) | (turn.magnitude() > np.deg2rad(15.0))):
-            kept.append(int(k))
-        if len(kept) == count:
-            break
-    return np.array(kept, dtype=np.int64)
+def _likeliest_in_all(
+    frames: list[StandardFrame], model: DetectionModel, best: Poses, fit: FitSettings
+) -> IntArray:
+    """Which of some poses the valve is fitted to best in a few frames, as a list of one."""
+    places = np.zeros(len(best))
+    for k in sorted({0, len(frames) // 2, len(frames) - 1}):
+        poses, rating = model.poses.refined_in_order(frames[k], best)
+        order = likeliest(frames[k], model, poses, rating, fit)
+        for place, which in enumerate(order):
+            places[which] -= place
+        places[[n for n in range(len(best)) if n not in order]] -= len(best)
+    return np.array([int(np.argmax(places))])
+
+
+def _like(poses: Poses, best: Poses) -> BoolArray:
+    """Which poses ``(P,)`` face the way of one, within 60 degrees."""
+    turn = Rotation.from_matrix(np.swapaxes(best.rotation[:1], 1, 2) @ poses.rotation)
+    return np.asarray(turn.magnitude() < np.deg2rad(60.0))
 
 
 def _best_path(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mvest.errors import InputError
 from mvest.imaging.detection.boosting import Boosters, BoostSettings, train_boosters
 from mvest.imaging.detection.boundary import boundary_samples
+from mvest.imaging.detection.degrade import degrade
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.landmark_detector import landmark_samples
 from mvest.imaging.detection.model import STAGES, DetectionModel
@@ -60,6 +61,9 @@ __all__ = [
     "volume_samples",
 ]
 
+MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
+"""Stages with ``TrainingSettings.many_trees``."""
+
 Setting: TypeAlias = Literal["training", "shifted"]
 """Within the ranges that detectors are trained in, or outside of them."""
 
@@ -91,8 +95,9 @@ class TrainingSettings:
         Of the shape model.
     samples : SampleCounts
     boosting : BoostSettings
-    boundary_trees : int
-        For the boundary, which has the most samples.
+    many_trees : int
+        For the stages on which most depends, or that have most samples: the ratings of poses and
+        the boundary.
     volumes : int
         Simulated: one frame each, of the valves in turn.
     draft_volumes : int
@@ -105,7 +110,7 @@ class TrainingSettings:
     modes: int = 40
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
-    boundary_trees: int = 120
+    many_trees: int = 130
     volumes: int = 480
     draft_volumes: int = 60
     acquisition: Acquisition = field(default_factory=Acquisition)
@@ -193,13 +198,24 @@ class RenderedFrame:
 
 
 def render_frame(
-    valve: MovingValve, which: int, base: Acquisition, spread: Setting, seed: np.random.SeedSequence
+    valve: MovingValve,
+    which: int,
+    base: Acquisition,
+    spread: Setting,
+    seed: np.random.SeedSequence,
+    *,
+    degraded: bool = False,
 ) -> RenderedFrame:
-    """Simulate the volume of one frame of a valve, probe and rendering drawn at random."""
+    """Simulate the volume of one frame of a valve, probe and rendering drawn at random.
+
+    With ``degraded`` it is made worse besides, see :mod:`mvest.imaging.detection.degrade`.
+    """
     rng = np.random.default_rng(seed)
     acquisition = draw_acquisition(rng, base, spread)
     probe = draw_probe(rng, acquisition)
     volume = simulate_volume(valve, acquisition, probe, int(rng.integers(2**31)), frames=[which])
+    if degraded:
+        volume = degrade(volume, rng)
     true = true_sequence(valve, probe, [which])
     return RenderedFrame(
         standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition, volume
@@ -231,7 +247,7 @@ def volume_samples(
     """
     render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     which = int(np.random.default_rng(sample).integers(len(valve.times)))
-    seen = render_frame(valve, which, settings.acquisition, "training", render)
+    seen = render_frame(valve, which, settings.acquisition, "training", render, degraded=True)
     true = TrueValve.of(seen.vertices, seen.tips, shape)
     rng = np.random.default_rng(sample.spawn(1)[0])
     return draw_samples(seen.frame, true, shape, settings.samples, rng, draft)
@@ -256,10 +272,10 @@ def train_stage(
         Of the training.
     """
     boosting, seed = settings.boosting, seed + 1000 * STAGES.index(name)
-    if name == "boundary":
-        boosting = replace(boosting, trees=settings.boundary_trees)
-        return train_boosters(x, y.astype(np.float64), boosting, seed, "cross_entropy")
-    return train_boosters(x, y.astype(np.float64), boosting, seed)
+    if name in MANY_TREES:
+        boosting = replace(boosting, trees=settings.many_trees)
+    objective = "cross_entropy" if name == "boundary" else "regression"
+    return train_boosters(x, y.astype(np.float64), boosting, seed, objective)
 
 
 def train_model(

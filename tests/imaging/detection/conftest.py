@@ -44,7 +44,7 @@ def settings():
         modes=14,
         samples=SampleCounts(*(24 for _ in fields(SampleCounts))),
         boosting=BoostSettings(trees=3, leaves=4, least=3, share_features=0.2),
-        boundary_trees=4,
+        many_trees=4,
         volumes=2,
     )
 

@@ -266,9 +266,7 @@ def test_hypotheses_that_are_about_the_same_count_once():
     by = np.zeros((5, 7))
     by[1, 0], by[2, 3], by[3, 5], by[4, 1] = 1.0, 0.05, 1.0, 12.0
     some = base.repeated(5).moved(by)
-    kept = tracking._apart(some, np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 5)
+    kept = some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 5)
     # 1 is best; 0 and 2 lie upon it; 3 is turned by 57 degrees and 4 is 12 mm away.
     np.testing.assert_array_equal(kept, [1, 3, 4])
-    np.testing.assert_array_equal(
-        tracking._apart(some, np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3]
-    )
+    np.testing.assert_array_equal(some.apart(np.array([0.5, 0.9, 0.7, 0.8, 0.6]), 2), [1, 3])

@@ -58,7 +58,8 @@ def rendered(monkeypatch, seen_valve):
     """No volume is simulated: every valve is seen in the same small frame."""
     calls = []
 
-    def render(valve, which, base, spread, seed):
+    def render(valve, which, base, spread, seed, *, degraded):
+        assert degraded
         assert spread == "training"
         assert 0 <= which < len(valve.times)
         calls.append((valve.name, which, seed.entropy, seed.spawn_key))
