@@ -6,6 +6,7 @@ it is written down here.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
+from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
@@ -160,6 +162,7 @@ class ImagedConfig:
     """From a volume over time to a case: what the file does not say."""
 
     model: str | None = None  # file of the detection model; null: the one for ultrasound
+    package_model: str | None = None  # SHA-256 of that one, where a result is kept as its own
     modality: str | None = None  # ultrasound, ct or mr, where the file does not say
     frame_interval_s: float | None = None  # where the file states no times
     time_unit: str | None = None  # s or ms, where the file states times without a unit
@@ -171,7 +174,8 @@ class ImagedConfig:
     pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
     held_out: list[Any] = field(default_factory=list)  # [frame, mmHg]: closed frames not shown
     thickness_mm: list[float] = field(default_factory=list)  # anterior, posterior; empty: generic
-    least_confidence: float = 0.5  # of the frames that are chosen
+    valve_confidence: float = 0.3  # of the best frame; below it there is no valve (0: show it)
+    least_confidence: float = 0.3  # of the frames that are chosen
     error_samples: int = 12  # with which the valve is closed anew
     name: str | None = None  # null: the name of the file
     description: str = ""
@@ -353,9 +357,21 @@ def hash_of(config: DictConfig) -> str:
     return config_hash(values)
 
 
+def _package_model() -> str | None:
+    """SHA-256 of the detectors that come with the package, if there are any."""
+    if not MODEL_FILE.is_file():
+        return None
+    return hashlib.sha256(MODEL_FILE.read_bytes()).hexdigest()
+
+
 def register() -> None:
-    """Make the schema and the resolver ``${config_hash:}`` known; may be called again."""
+    """Make the schema and its resolvers known; may be called again.
+
+    ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the package's
+    detectors.
+    """
     ConfigStore.instance().store(name="schema", node=Config)
+    OmegaConf.register_new_resolver("package_model", _package_model, replace=True)
     OmegaConf.register_new_resolver(
         "config_hash", lambda *, _root_: hash_of(_root_)[:16], replace=True
     )

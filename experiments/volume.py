@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-import mvest.imaging
 from experiments.case import run_case
+from experiments.progress import PartBar
 from mvest.cases.case import ValveCase
 from mvest.cases.csv_files import read_numbers
 from mvest.cases.pressure_curve import PressureCurve
@@ -34,8 +34,14 @@ from mvest.imaged_valve import (
     write_surfaces,
 )
 from mvest.imaged_valve.measures import Row
-from mvest.imaging.detection.model import Accuracy, DetectionModel, load_model
-from mvest.imaging.detection.tracking import detect_valve
+from mvest.imaging.detection.model import (
+    MODEL_FILE,
+    Accuracy,
+    DetectionModel,
+    default_model,
+    load_model,
+)
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.markups import read_markups
 from mvest.imaging.reading.reader import read_volume
@@ -49,9 +55,6 @@ from mvest.typing import FloatArray
 __all__ = ["FoundValve", "check_volume", "find_valve", "run_volume", "write_image_step"]
 
 Values = Mapping[str, Any]
-
-TEE_MODEL = Path(mvest.imaging.__file__).parent / "models" / "tee.npz"
-"""Detectors for transoesophageal echo, trained on simulated volumes."""
 
 IMAGES, CASE = "images", "case"
 """Folders of what the image step writes, and of the case."""
@@ -113,6 +116,11 @@ def find_valve(config: Values) -> FoundValve:
     told = config["imaged"]
     if config["volume"] is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
+    # What is asked for, before anything that takes long.
+    by_hand = _landmarks(_pairs("landmarks", told["landmarks"], str))
+    held = _pairs("held_out", told["held_out"], float)
+    curve = _pressure_curve(told)
+    thickness = _thickness(told["thickness_mm"])
     volume = read_volume(
         Path(config["volume"]),
         modality=_modality(told["modality"]),
@@ -124,16 +132,28 @@ def find_valve(config: Values) -> FoundValve:
             f"imaged.model is not given; for {volume.modality.value} no model comes with the "
             "package: expected a detection model's file"
         )
-    file = TEE_MODEL if told["model"] is None else Path(told["model"])
-    model = load_model(file)
+    model = default_model() if told["model"] is None else load_model(Path(told["model"]))
     if model.accuracy is None:
-        raise InputError(f"{file}: its accuracy was never measured, expected a model whose was")
-    valve = detect_valve(
-        volume, model, landmarks=_landmarks(_pairs("landmarks", told["landmarks"], str))
-    )
-    thickness = _thickness(told["thickness_mm"], valve)
+        raise InputError(
+            f"{told['model'] or MODEL_FILE}: its accuracy was never measured, expected a model "
+            "whose was"
+        )
+    if thickness is not None and set(thickness) != set(model.shape.layout.region_names):
+        raise ConfigurationError(
+            f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
+            f"{', '.join(model.shape.layout.region_names)}"
+        )
+    tracking = TrackingSettings(least_confidence=told["valve_confidence"])
+    with PartBar("valve in the frames", len(volume.times), "frame") as bar:
+        valve = detect_valve(
+            volume,
+            model,
+            tracking,
+            landmarks=by_hand,
+            progress=lambda _done, _all: bar.step(),
+        )
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
-    frames = _frames(told, volume, valve, rows)
+    frames = _frames(told, curve, held, valve, rows)
     texts = CaseTexts(
         told["name"] or Path(config["volume"]).name.partition(".")[0],
         told["description"],
@@ -229,14 +249,27 @@ def _modality(name: str | None) -> Modality | None:
     return None if name is None else Modality(name)
 
 
-def _thickness(given: Sequence[float], valve: ValveSequence) -> dict[str, float] | None:
-    names = valve.layout.region_names
+def _thickness(given: Sequence[float]) -> dict[str, float] | None:
+    names = ("anterior", "posterior")
     if given and len(given) != len(names):
         raise ConfigurationError(
             f"imaged.thickness_mm = {list(given)}, expected one number for each of "
             f"{', '.join(names)}, or none"
         )
     return dict(zip(names, given, strict=True)) if given else None
+
+
+def _pressure_curve(told: Values) -> PressureCurve | None:
+    """The configured curve, or None where the pressure in the closed frame is given."""
+    if (told["pressure_mmHg"] is None) == (told["pressure_curve"] is None):
+        raise ConfigurationError(
+            "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
+            "pressure on the closed valve"
+        )
+    if told["pressure_curve"] is None:
+        return None
+    table = read_numbers(Path(told["pressure_curve"]), ("time", "pressure"))
+    return PressureCurve(table[:, 0], table[:, 1])
 
 
 def _pairs(setting: str, given: Sequence[Any], kind: type) -> dict[int, Any]:
@@ -274,25 +307,21 @@ def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | N
 
 
 def _frames(
-    told: Values, volume: VolumeSequence, valve: ValveSequence, rows: list[Row]
+    told: Values,
+    curve: PressureCurve | None,
+    held: Mapping[int, float],
+    valve: ValveSequence,
+    rows: list[Row],
 ) -> CaseFrames:
-    pressure, closed = told["pressure_mmHg"], told["closed_frame"]
-    held = _pairs("held_out", told["held_out"], float)
-    if (pressure is None) == (told["pressure_curve"] is None):
-        raise ConfigurationError(
-            "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
-            "pressure on the closed valve"
-        )
+    pressure, closed, count = told["pressure_mmHg"], told["closed_frame"], len(valve.times)
     least = told["least_confidence"]
-    if pressure is None:
-        table = read_numbers(Path(told["pressure_curve"]), ("time", "pressure"))
-        curve = PressureCurve(table[:, 0], table[:, 1])
+    if curve is not None:
         if closed is None:
             sure = [row for row in rows if (row["confidence"] or 0.0) >= least]
             closed = closed_frame(sure)
-        if closed is None or not 0 <= closed < len(volume.times):
-            raise InputError(f"closed frame {closed}, expected one of 0 to {len(volume.times) - 1}")
-        pressure = curve(float(volume.times[closed]))
+        if closed is None or not 0 <= closed < count:
+            raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
+        pressure = curve(float(valve.times[closed]))
     return choose_frames(
         valve,
         rows,

@@ -43,7 +43,12 @@ def run(tmp_path, monkeypatch, capsys, volume):
         0.05 * rng.standard_normal((20, 2, LAYOUT.size, 3)),
         0.5 * rng.standard_normal((20, 2, 2, 3)),
     )
-    model = SimpleNamespace(accuracy=accuracy, sha256="0" * 64, trained_on={"seed": 1})
+    model = SimpleNamespace(
+        accuracy=accuracy,
+        sha256="0" * 64,
+        trained_on={"seed": 1},
+        shape=SimpleNamespace(layout=LAYOUT),
+    )
     told = []
 
     def detect(volume, given, settings=None, *, landmarks=None, progress=None):
@@ -53,6 +58,7 @@ def run(tmp_path, monkeypatch, capsys, volume):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("experiments.volume.load_model", lambda path: model)
+    monkeypatch.setattr("experiments.volume.default_model", lambda: model)
     monkeypatch.setattr("experiments.volume.detect_valve", detect)
 
     def call(*arguments, pressure=True):
@@ -187,3 +193,23 @@ def test_the_case_is_personalised_and_its_record_tells_of_the_images(run, monkey
     assert len(step["frames"]) == len(step["confidence"]) == 4
     assert (step["open_frame"], step["volume"]["shape"]) == (0, [4, 20, 20, 20])
     assert json.dumps(step, allow_nan=False)
+
+
+def test_what_is_missing_is_said_before_the_volume_is_searched(run):
+    # The search takes a second for every frame.
+    status, _, err = run("check=true", pressure=False)
+    assert status == 2
+    assert "imaged.pressure_mmHg or imaged.pressure_curve" in err
+    assert run.told == []
+
+
+def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypatch):
+    asked = []
+
+    def detect(volume, model, settings, *, landmarks=None, progress=None):
+        asked.append(settings.least_confidence)
+        return sequence()
+
+    monkeypatch.setattr("experiments.volume.detect_valve", detect)
+    assert run("check=true", "imaged.valve_confidence=0.1")[0] == 0
+    assert asked == [0.1]
