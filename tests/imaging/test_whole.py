@@ -1,0 +1,98 @@
+"""The detectors that come with the package, on simulated volumes of a valve that they never saw."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.detection.evaluation import surface_distances
+from mvest.imaging.detection.model import default_model
+from mvest.imaging.detection.tracking import NoValveError, detect_valve
+from mvest.imaging.landmarks import LANDMARKS, landmarks
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume, true_sequence
+from mvest.valve.template import Template, TemplateParameters
+
+LAYOUT = ValveLayout(64, 15)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return default_model()
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Two open frames of a valve with an anatomy of its own, and where it truly is."""
+    template = Template(TemplateParameters(half_commissural=17.2, half_ap=13.4))
+    valve = template.valve(LAYOUT.columns, LAYOUT.rows)
+    phi, s, _, tip = template.chord_places()
+    vertices = valve.surface.vertices
+    moving = MovingValve(
+        "not in any training",
+        LAYOUT,
+        np.array([0.0, 0.04]),
+        np.stack([vertices, vertices + [0.0, 0.0, -1.0]]),
+        np.stack([valve.papillary_tips] * 2),
+        valve.surface.thickness,
+        np.asarray(phi, float),
+        np.asarray(s, float),
+        np.asarray(tip, np.int64),
+    )
+    probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))
+    return simulate_volume(moving, Acquisition(), probe, 3), true_sequence(moving, probe)
+
+
+def test_a_valve_is_found_where_it_is(model, seen):
+    # Limits are some three times the mean errors of results/imaging.md.
+    volume, true = seen
+    found = detect_valve(volume, model)
+    for k in range(2):
+        there, back = surface_distances(found.vertices[k], true.vertices[k], LAYOUT)
+        assert 0.5 * (there.mean() + back.mean()) < 1.0
+        assert np.linalg.norm(found.vertices[k] - true.vertices[k], axis=1).mean() < 3.0
+        assert np.linalg.norm(found.tips[k] - true.tips[k], axis=1).mean() < 6.0
+    assert found.frame_confidence.min() > 0.3
+    assert np.isfinite(found.std_mm).all()
+
+
+def test_where_the_volume_lies_in_the_world_makes_no_difference(model, seen):
+    # Positions in the axes of the volume, taken for positions in the world.
+    volume, _ = seen
+    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+    shift = np.array([100.0, -50.0, 30.0])
+    one = replace(volume, frames=volume.frames[:1], times=volume.times[:1])
+    other = replace(
+        one, direction=turn @ volume.direction, origin=turn @ volume.origin + shift
+    )
+    here, there = detect_valve(one, model), detect_valve(other, model)
+    gap = np.linalg.norm(here.vertices[0] @ turn.T + shift - there.vertices[0], axis=1)
+    assert gap.mean() < 1.5  # the grid of orientations is fixed in the world
+
+
+def test_a_volume_without_a_valve_gives_a_verdict_and_no_mesh(model, seen):
+    volume, _ = seen
+    grey = np.random.default_rng(1).integers(0, 256, volume.frames.shape[1:], dtype=np.uint8)
+    noise = replace(volume, frames=grey[None], times=volume.times[:1], source="noise")
+    with pytest.raises(NoValveError, match="noise: no valve found") as told:
+        detect_valve(noise, model)
+    assert "\n" not in str(told.value)
+
+
+def test_a_blank_frame_is_refused(model, seen):
+    volume, _ = seen
+    blank = replace(volume, frames=np.zeros_like(volume.frames), source="blank")
+    with pytest.raises(InputError, match="blank, frame 0: all voxels are 0"):
+        detect_valve(blank, model)
+
+
+def test_landmarks_placed_by_hand_stay_and_lead(model, seen):
+    volume, true = seen
+    placed = {0: landmarks(true, 0), 1: landmarks(true, 1)}
+    found = detect_valve(volume, model, landmarks=placed)
+    for k in range(2):
+        own = landmarks(found, k)
+        gap = [np.linalg.norm(own[name] - placed[k][name]) for name in LANDMARKS]
+        assert max(gap) < 0.1
