@@ -367,8 +367,8 @@ def _package_model() -> str | None:
 def register() -> None:
     """Make the schema and its resolvers known; may be called again.
 
-    ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the package's
-    detectors.
+    ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the
+    package's detectors.
     """
     ConfigStore.instance().store(name="schema", node=Config)
     OmegaConf.register_new_resolver("package_model", _package_model, replace=True)

@@ -127,6 +127,10 @@ def find_valve(config: Values) -> FoundValve:
         frame_interval_s=told["frame_interval_s"],
         time_unit=told["time_unit"],
     )
+    if len(volume.times) < 2:
+        raise InputError(
+            f"{volume.source}: one frame, expected two or more: the valve open and closed"
+        )
     if told["model"] is None and volume.modality is not Modality.ULTRASOUND:
         raise ConfigurationError(
             f"imaged.model is not given; for {volume.modality.value} no model comes with the "

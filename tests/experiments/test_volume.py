@@ -213,3 +213,17 @@ def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypa
     monkeypatch.setattr("experiments.volume.detect_valve", detect)
     assert run("check=true", "imaged.valve_confidence=0.1")[0] == 0
     assert asked == [0.1]
+
+
+def test_one_frame_is_no_cycle(run, volume, tmp_path):
+    # The largest and the smallest orifice would be the same frame.
+    frames = np.random.default_rng(1).integers(0, 255, (1, 20, 20, 20), dtype=np.uint8)
+    single = VolumeSequence(
+        frames, np.full(3, 3.0), np.eye(3), np.full(3, -30.0), np.zeros(1), Modality.ULTRASOUND
+    )
+    write_sequence_nrrd(tmp_path / "single.seq.nrrd", single)
+    status, _, err = run("check=true", f"volume={tmp_path / 'single.seq.nrrd'}")
+    assert status == 2
+    assert "single.seq.nrrd" in err
+    assert "one frame, expected two or more" in err
+    assert run.told == []

@@ -34,7 +34,7 @@ def seen():
         "not in any training",
         LAYOUT,
         np.array([0.0, 0.04]),
-        np.stack([vertices, vertices + [0.0, 0.0, -1.0]]),
+        np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
         np.stack([valve.papillary_tips] * 2),
         valve.surface.thickness,
         np.asarray(phi, float),
@@ -64,9 +64,7 @@ def test_where_the_volume_lies_in_the_world_makes_no_difference(model, seen):
     turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
     shift = np.array([100.0, -50.0, 30.0])
     one = replace(volume, frames=volume.frames[:1], times=volume.times[:1])
-    other = replace(
-        one, direction=turn @ volume.direction, origin=turn @ volume.origin + shift
-    )
+    other = replace(one, direction=turn @ volume.direction, origin=turn @ volume.origin + shift)
     here, there = detect_valve(one, model), detect_valve(other, model)
     gap = np.linalg.norm(here.vertices[0] @ turn.T + shift - there.vertices[0], axis=1)
     assert gap.mean() < 1.5  # the grid of orientations is fixed in the world
