@@ -17,6 +17,7 @@ from mvest.imaged_case import (
     choose_frames,
     samples_in_world,
     valve_axes,
+    without_mean_error,
 )
 from mvest.imaged_valve import measure_sequence
 from mvest.imaging.layout import ValveLayout
@@ -126,6 +127,31 @@ def test_errors_become_displacements_back_to_where_it_may_have_been():
     assert case.error_samples is found
     with pytest.raises(InputError, match="errors of shape"):
         samples_in_world(seen, FRAMES, errors[:, :, :5], tips)
+
+
+def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
+    # A bias that is left in, taken off twice (valve and samples), or in the world's axes.
+    rng = np.random.default_rng(3)
+    bias, tip_bias = rng.normal(size=(2, LAYOUT.size, 3)), rng.normal(size=(2, 2, 3))
+    spread = rng.normal(size=(6, 2, LAYOUT.size, 3))
+    spread -= spread.mean(axis=0)
+    tip_spread = rng.normal(size=(6, 2, 2, 3))
+    tip_spread -= tip_spread.mean(axis=0)
+    seen = sequence(TURN)
+    found, errors, tips = without_mean_error(seen, FRAMES, bias + spread, tip_bias + tip_spread)
+    for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
+        axes = valve_axes(seen, number)
+        off = (seen.vertices[number] - found.vertices[number]) @ axes
+        np.testing.assert_allclose(off, bias[which], atol=1e-9)
+        off = (seen.tips[number] - found.tips[number]) @ axes
+        np.testing.assert_allclose(off, tip_bias[which], atol=1e-9)
+    np.testing.assert_allclose(errors, np.sqrt(7 / 5) * spread, atol=1e-9)
+    np.testing.assert_allclose(tips, np.sqrt(7 / 5) * tip_spread, atol=1e-9)
+    untouched = set(range(len(seen.times))) - set(FRAMES.in_order)
+    for number in untouched:
+        np.testing.assert_array_equal(found.vertices[number], seen.vertices[number])
+    with pytest.raises(InputError, match="errors of 1 valves"):
+        without_mean_error(seen, FRAMES, bias[None], tip_bias[None])
 
 
 def test_vertices_that_were_never_measured_have_no_weight():

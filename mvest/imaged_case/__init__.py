@@ -6,7 +6,7 @@ as the closed frame asks for. Coordinates stay those of the images (LPS).
 """
 
 from mvest.imaged_case.build import CaseTexts, case_of_sequence
-from mvest.imaged_case.errors_in_world import samples_in_world, valve_axes
+from mvest.imaged_case.errors_in_world import samples_in_world, valve_axes, without_mean_error
 from mvest.imaged_case.frames import CaseFrames, choose_frames
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "choose_frames",
     "samples_in_world",
     "valve_axes",
+    "without_mean_error",
 ]

@@ -197,7 +197,7 @@ def distance_figure(rows: Sequence[Row], *, title: str = "") -> Figure:
     for limit in LIMITS_MM:
         axes.axvline(limit, color="0.25", lw=1.0, ls="--", zorder=0, label="limit")
         axes.annotate(
-            f"{limit:g} mm", (limit, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+            f"{limit:g}", (limit, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
             textcoords="offset points", ha="center", va="bottom", fontsize=SMALL, color="0.25",
         )  # fmt: skip
     axes.set_yticks(range(len(SETTINGS)), labels, fontsize=SMALL)
