@@ -176,7 +176,7 @@ class ImagedConfig:
     thickness_mm: list[float] = field(default_factory=list)  # anterior, posterior; empty: generic
     valve_confidence: float = 0.3  # of the best frame; below it there is no valve (0: show it)
     least_confidence: float = 0.3  # of the frames that are chosen
-    error_samples: int = 12  # with which the valve is closed anew
+    error_samples: int = 20  # at most, with which the valve is closed anew
     name: str | None = None  # null: the name of the file
     description: str = ""
     source: str = ""
