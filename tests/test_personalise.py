@@ -584,7 +584,11 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
     assert np.all(told.result.std > 1.5 * plain.result.std)
     assert np.all((told.image_share > 0.5) & (told.image_share <= 1.0))
     exact = told.narrower["geometry known exactly"]
-    np.testing.assert_allclose(exact, plain.narrower["now"], rtol=0.4)
+    # Of the linear model at another estimate, 4 std of the frame's errors away; with the noise that
+    # filters weigh with instead of the stated one, it would be 0.4 of this.
+    ratio = exact / plain.narrower["now"]
+    assert np.all((ratio > 0.5) & (ratio < 2.0))
+    assert np.all(exact < 0.7 * told.narrower["now"])
     np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
 
 

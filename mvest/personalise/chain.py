@@ -213,17 +213,19 @@ class _Chain:
         plain = self.plain_observation()
         return plain if self.errors is None else WeighedObservation(plain, self.errors.noise)
 
-    def plain_observation(self) -> Observed:
-        """The closed frame, with the uncertainty that the case states.
+    def plain_observation(self, *, stated: bool = False) -> Observed:
+        """The closed frame, with the uncertainty of single observations.
 
-        Where samples tell how errors are alike, what is beside them is taken for independent. Were
-        it smooth too, the filter would trust the finest detail of a closed leaflet most, which no
-        mesh and no image have right: moduli of two simulated patients then came out two to four
-        times too high, and the fitted valve farther from the frame than the generic one.
+        That is what the case states, always so if ``stated``. But where samples tell how errors are
+        alike, what is beside them is taken for independent. Were it smooth too, the filter would
+        trust the finest detail of a closed leaflet most, which no mesh and no image have right:
+        moduli of two simulated patients then came out two to four times too high, and the fitted
+        valve farther from the frame than the generic one.
         """
         told = self.case.uncertainty
         frame, std = self.closed, told.typical_mm
-        length = 0.0 if self.case.error_samples is not None else told.correlation_length_mm
+        sampled = self.case.error_samples is not None and not stated
+        length = 0.0 if sampled else told.correlation_length_mm
         scale = told.std_mm / std if isinstance(told.std_mm, np.ndarray) else None
         kept = _thinned(len(frame.vertices))
         if self.corresponding:
@@ -239,7 +241,7 @@ class _Chain:
             frame.free_edge,
             scale=None if scale is None else scale[kept],
         )
-        if length > 0:
+        if told.correlation_length_mm > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
             border = BORDER * std * (1.0 if points.scale is None else points.scale)
             near = replace(points, annulus=frame.annulus).inner(border)
@@ -405,7 +407,7 @@ class _Chain:
         prior = to_filter(self.transform, self.prior)
         z = filtered.transformed_iterates[-1]
         H = filtered.prediction.jacobian * self.transform.derivative(z)
-        plain = observation_noise(self.plain_observation().R, len(H))
+        plain = observation_noise(self.plain_observation(stated=True).R, len(H))
         groups = {
             "pressure known": ("pressure_scale",),
             "rest lengths known": ("chord_rest_length",),
