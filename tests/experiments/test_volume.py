@@ -13,6 +13,7 @@ import pytest
 from experiments.run import main
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
+from mvest.imaged_case import valve_axes
 from mvest.imaging.detection.model import Accuracy
 from mvest.imaging.detection.tracking import NoValveError
 from mvest.imaging.markups import PointList, write_markups
@@ -86,8 +87,11 @@ def test_the_image_step_is_checked_written_and_drawn(run, tmp_path):
     assert not case.simulated
     assert [frame.name for frame in case.frames] == ["open", "closed"]
     assert case.frames[1].pressure_mmHg == 110.0
-    assert len(case.error_samples) == 12
-    np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[0])
+    assert len(case.error_samples) == 20
+    # Near where it was found, less what the detectors are off by on average.
+    off = np.linalg.norm(case.surface.vertices - sequence().vertices[0], axis=1)
+    mean = np.linalg.norm(run.model.accuracy.samples[:, 0].mean(axis=0), axis=1)
+    np.testing.assert_allclose(off, mean, atol=1e-9)
     assert "trained and tested on simulated volumes only" in out
     assert "chordae: 34 laid out as in the template" in out
     assert list((folder / "images").glob("valve_*.mrk.json"))
@@ -110,7 +114,11 @@ def test_what_is_told_of_the_frames_is_taken(run, tmp_path):
     assert (case.name, case.simulated) == ("mine", True)
     assert set(case.surface.thickness) == {1.5, 1.1}
     assert case.error_samples.vertices.shape == (5, 3, LAYOUT.size, 3)
-    np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[1])
+    # Where it was found, less what the detectors are off by on average.
+    axes, mean = valve_axes(sequence(), 1), run.model.accuracy.samples.mean(axis=0)
+    np.testing.assert_allclose(
+        case.surface.vertices, sequence().vertices[1] - mean[0] @ axes.T, atol=1e-9
+    )
 
 
 def test_the_pressure_may_come_from_a_curve(run, tmp_path):

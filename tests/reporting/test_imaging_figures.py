@@ -76,7 +76,7 @@ def test_every_volume_is_a_point_and_the_limits_are_marked():
     limits = [line.get_xdata()[0] for line in axes.lines if line.get_label() == "limit"]
     assert limits == list(LIMITS_MM)
     words = [text.get_text() for text in axes.texts]
-    assert words == ["1 beyond, up to 12.0 mm →", "0.5 mm", "0.8 mm", "1.5 mm"]
+    assert words == ["1 beyond, up to 12.0 mm →", "0.5", "0.8", "1.5"]
     ticks = [text.get_text() for text in axes.get_yticklabels()]
     assert ticks[0] == "in distribution\n(3 volumes)"
     assert ticks[1] == "shifted\n(3 volumes, 1 without a valve found)"
