@@ -19,13 +19,13 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Simulation, Step
-from mvest.mechanics.system import Factors, Loads, Parameter, System
+from mvest.mechanics.system import Loads, Parameter, System
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
     build_system,
     held_loading,
-    material_law,
+    retune,
 )
 from mvest.typing import FloatArray
 from mvest.valve.anatomy import Valve
@@ -210,19 +210,16 @@ class ClosureModel:
                 if not result.simulation.converged:
                     return result
         values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
-        moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
-        factors = Factors(
-            values.get("pressure_scale", 1.0),
-            values.get("chord_stiffness", 1.0),
-            values.get("chord_rest_length", 1.0),
-        )
         if self._system is None or self._solver is None:
             self._solver = linear_solver(self.settings.solver)
             self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, moduli
+                self.valve, self.contact_valve, self.mesh, self.settings, values
             )
         system = self._system
-        system.retune(material_law(self.mesh, self.settings, moduli), factors)
+        retune(system, self.settings, values)
+        damping = replace(
+            self.settings.damping, beta=values.get("damping", self.settings.damping.beta)
+        )
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
@@ -233,7 +230,7 @@ class ClosureModel:
                 system,
                 loading,
                 steps,
-                damping=self.settings.damping,
+                damping=damping,
                 newton=self.settings.newton,
                 parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
                 final_only=not every_frame,

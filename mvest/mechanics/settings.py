@@ -8,7 +8,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.contact import ContactSettings
-from mvest.mechanics.law import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
 __all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings"]
@@ -39,11 +39,20 @@ class TissueSettings:
                 f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
             )
 
+    def moduli(
+        self, E_f: float, ratio: float | None = None, G: float | None = None
+    ) -> LeafletModuli:
+        """The moduli with ``E_f`` (MPa) along the fibre.
+
+        ``ratio`` replaces that of the tissue; ``G`` (MPa) is the shear modulus where it does not
+        follow ``E_f``.
+        """
+        own = self.ratio if ratio is None else ratio
+        return LeafletModuli(E_f, own, self.nu, PoissonReading(self.reading), G)
+
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
-        return TransverselyIsotropic.from_ratio(
-            E_f, self.ratio, self.nu, PoissonReading(self.reading)
-        )
+        return self.moduli(E_f).material
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ loads, contact and observations in every mesh.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +15,10 @@ from mvest.errors import InputError
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact
 from mvest.mechanics.law import BiotLaw
+from mvest.mechanics.parameters import check_names
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.settings import MechanicsSettings
-from mvest.mechanics.solid import Solid
+from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa
@@ -25,7 +26,16 @@ from mvest.valve.anatomy import Valve
 from mvest.valve.embedding import Embedding, embed
 from mvest.valve.mesh import SolidMesh
 
-__all__ = ["HeldState", "boundary_loading", "build_system", "held_loading", "material_law"]
+__all__ = [
+    "HeldState",
+    "boundary_loading",
+    "build_system",
+    "check_parameters",
+    "factors_of",
+    "held_loading",
+    "material_law",
+    "retune",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +60,7 @@ def build_system(
     contact_valve: Valve,
     mesh: SolidMesh,
     settings: MechanicsSettings,
-    moduli: dict[str, float],
-    factors: Factors | None = None,
+    values: Mapping[str, float],
 ) -> System:
     """A system of the valve in the given mesh.
 
@@ -63,20 +72,29 @@ def build_system(
         The same valve in the resolution at which contact is sampled.
     mesh : SolidMesh
     settings : MechanicsSettings
-    moduli : dict
-        Region -> E_f, MPa.
-    factors : Factors, optional
+    values : mapping
+        Parameter (:data:`mvest.mechanics.parameters.KINDS`) -> value, at least the modulus of each
+        region.
+
+    Raises
+    ------
+    InputError
+        If a region has no tissue or no modulus, or there is no such parameter.
+    MaterialError
+        If a modulus is inadmissible.
     """
-    solid = Solid(mesh, material_law(mesh, settings, moduli), density=settings.density)
+    check_parameters(values, valve, settings)
+    chordae = valve.chordae
+    solid = Solid(mesh, material_law(mesh, settings, values), density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
-    chordae = valve.chordae
     cables = Cables(
         _patches(midpoints, contact_valve, settings.patch_radius, chordae.insertion),
         chordae.tip,
         chordae.rest_length,
         chordae.axial_stiffness,
         chordae.toe_strain,
+        {name: chordae.family == k for k, name in enumerate(chordae.family_names)},
     )
     contact = Contact(
         midpoints,
@@ -92,29 +110,63 @@ def build_system(
         cables=cables,
         contact=contact,
         hinge=_support(mesh, contact_valve, settings),
-        factors=factors,
+        factors=factors_of(cables, values),
     )
 
 
-def material_law(mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]) -> BiotLaw:
-    """The law of the mesh with one modulus E_f (MPa) per region.
+def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSettings) -> None:
+    """Refuse names that are no parameters of this valve under these settings; InputError."""
+    tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
+    check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips])
+
+
+def material_law(mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[str, float]) -> Law:
+    """The law of the mesh.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    settings : MechanicsSettings
+    values : mapping
+        Parameter -> value: ``E_f.REGION`` of each region, and any of the others; those that are no
+        parameters of tissue are passed over.
 
     Raises
     ------
     InputError
-        If a region has no tissue or no modulus.
+        If a region has no tissue or no modulus, or a value is of another region.
     MaterialError
         If a modulus is inadmissible.
     """
-    materials = []
+    moduli = []
     for region in mesh.region_names:
-        if region not in settings.tissue or region not in moduli:
+        if region not in settings.tissue or f"E_f.{region}" not in values:
             raise InputError(
                 f"region {region!r} of the mesh has no tissue or modulus; given are "
-                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(moduli))}"
+                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
             )
-        materials.append(settings.tissue[region].material(moduli[region]))
-    return BiotLaw.of(tuple(materials))
+        moduli.append(
+            settings.tissue[region].moduli(
+                values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
+            )
+        )
+    return BiotLaw.of_moduli(moduli)
+
+
+def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
+    """Give a system of a valve other values of its parameters; see `build_system`."""
+    assert system.cables is not None
+    law = material_law(system.solid.mesh, settings, values)
+    system.retune(law, factors_of(system.cables, values))
+
+
+def factors_of(cables: Cables, values: Mapping[str, float]) -> Factors:
+    """The factors on pressure and cables among the values; InputError if a part is unknown."""
+    return Factors(
+        values.get("pressure_scale", 1.0),
+        cables.factor("chord_stiffness", values),
+        cables.factor("chord_rest_length", values),
+    )
 
 
 def _patches(points: Embedding, valve: Valve, radius: float, insertion: FloatArray) -> Embedding:
