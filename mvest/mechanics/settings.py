@@ -8,6 +8,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.contact import ContactSettings
+from mvest.mechanics.field import ModulusField
 from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
@@ -130,6 +131,9 @@ class MechanicsSettings:
     patch_radius : float
         mm over which a chord is spread at its insertion.
     solver : str
+    fields : dict
+        Region name -> :class:`mvest.mechanics.field.ModulusField`, where the modulus varies within
+        it; the coefficients ``field.REGION.K`` that are given no value are 0.
     """
 
     tissue: dict[str, TissueSettings]
@@ -142,6 +146,7 @@ class MechanicsSettings:
     support_stiffness: float = 50.0
     patch_radius: float = 2.0
     solver: str = "auto"
+    fields: dict[str, ModulusField] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("density", "support_stiffness", "patch_radius"):

@@ -14,6 +14,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact
+from mvest.mechanics.field import FieldBasis, FieldLaw, basis_at_quadrature
 from mvest.mechanics.law import BiotLaw
 from mvest.mechanics.parameters import check_names
 from mvest.mechanics.pressure import PressureLoad
@@ -32,6 +33,7 @@ __all__ = [
     "build_system",
     "check_parameters",
     "factors_of",
+    "field_modes",
     "held_loading",
     "material_law",
     "retune",
@@ -85,7 +87,9 @@ def build_system(
     """
     check_parameters(values, valve, settings)
     chordae = valve.chordae
-    solid = Solid(mesh, material_law(mesh, settings, values), density=settings.density)
+    modes = field_modes(valve, mesh, settings)
+    law = material_law(mesh, settings, values, modes)
+    solid = Solid(mesh, law, density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
     cables = Cables(
@@ -117,10 +121,16 @@ def build_system(
 def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSettings) -> None:
     """Refuse names that are no parameters of this valve under these settings; InputError."""
     tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
-    check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips])
+    modes = {region: own.modes for region, own in settings.fields.items()}
+    check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips], modes)
 
 
-def material_law(mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[str, float]) -> Law:
+def material_law(
+    mesh: SolidMesh,
+    settings: MechanicsSettings,
+    values: Mapping[str, float],
+    modes: Mapping[str, FloatArray] | None = None,
+) -> Law:
     """The law of the mesh.
 
     Parameters
@@ -130,6 +140,8 @@ def material_law(mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[s
     values : mapping
         Parameter -> value: ``E_f.REGION`` of each region, and any of the others; those that are no
         parameters of tissue are passed over.
+    modes : mapping, optional
+        Of the settings' fields, from `field_modes`.
 
     Raises
     ------
@@ -150,13 +162,32 @@ def material_law(mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[s
                 values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
             )
         )
-    return BiotLaw.of_moduli(moduli)
+    law = BiotLaw.of_moduli(moduli)
+    if not modes:
+        return law
+    coefficients = {
+        region: np.array([values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])])
+        for region, own in modes.items()
+    }
+    return FieldLaw(law, modes, coefficients)
+
+
+def field_modes(
+    valve: Valve, mesh: SolidMesh, settings: MechanicsSettings
+) -> dict[str, FloatArray]:
+    """Region -> modes ``(e, q, k)`` of its field at the quadrature points of the mesh."""
+    return {
+        region: basis_at_quadrature(mesh, region, FieldBasis.of(valve.surface, region, own))
+        for region, own in settings.fields.items()
+    }
 
 
 def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
     """Give a system of a valve other values of its parameters; see `build_system`."""
     assert system.cables is not None
-    law = material_law(system.solid.mesh, settings, values)
+    old = system.solid.law
+    modes = old.modes if isinstance(old, FieldLaw) else None
+    law = material_law(system.solid.mesh, settings, values, modes)
     system.retune(law, factors_of(system.cables, values))
 
 
