@@ -19,7 +19,7 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
-from mvest.mechanics.steps import Simulation, Step
+from mvest.mechanics.steps import Damping, Simulation, Step
 from mvest.mechanics.system import Loads, Parameter, System
 from mvest.mechanics.valve_system import (
     HeldState,
@@ -232,17 +232,7 @@ class ClosureModel:
                 result = self.close(between, sensitivities=False)
                 if not result.simulation.converged:
                     return result
-        values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
-        if self._system is None or self._solver is None:
-            self._solver = linear_solver(self.settings.solver)
-            self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, values
-            )
-        system = self._system
-        retune(system, self.settings, values)
-        damping = replace(
-            self.settings.damping, beta=values.get("damping", self.settings.damping.beta)
-        )
+        system, parameters = self.tuned(m)
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
@@ -253,9 +243,9 @@ class ClosureModel:
                 system,
                 loading,
                 steps,
-                damping=damping,
+                damping=self.damping(m),
                 newton=self.settings.newton,
-                parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
+                parameters=parameters if sensitivities else [],
                 final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
@@ -282,6 +272,42 @@ class ClosureModel:
         if simulation.converged:
             self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
+
+    def _values(self, m: FloatArray) -> dict[str, float]:
+        """All parameters that have a value, those that are not estimated included."""
+        return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
+
+    def damping(self, m: FloatArray) -> Damping:
+        """The damping with parameters ``m (p,)``, of which it may be one."""
+        own = self.settings.damping
+        return replace(own, beta=self._values(m).get("damping", own.beta))
+
+    def tuned(self, m: FloatArray) -> tuple[System, tuple[Parameter, ...]]:
+        """The system, set to parameters ``m (p,)``, and the parameters to differentiate by.
+
+        The system is built once and belongs to the model.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        values = self._values(m)
+        if self._system is None or self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+            self._system = build_system(
+                self.valve, self.contact_valve, self.mesh, self.settings, values
+            )
+        system = self._system
+        retune(system, self.settings, values)
+        return system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    @property
+    def solver(self) -> LinearSolver:
+        """The solver that goes with the system, made with it."""
+        if self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+        return self._solver
 
     def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
         """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.
