@@ -174,8 +174,8 @@ class ImagedConfig:
     pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
     held_out: list[Any] = field(default_factory=list)  # [frame, mmHg]: closed frames not shown
     thickness_mm: list[float] = field(default_factory=list)  # anterior, posterior; empty: generic
-    valve_confidence: float = 0.3  # of the best frame; below it there is no valve (0: show it)
-    least_confidence: float = 0.3  # of the frames that are chosen
+    valve_confidence: float = 0.6  # of the best frame; below it there is no valve (0: show it)
+    least_confidence: float = 0.6  # of the frames that are chosen
     error_samples: int = 20  # at most, with which the valve is closed anew
     name: str | None = None  # null: the name of the file
     description: str = ""

@@ -62,7 +62,7 @@ def choose_frames(
     open_: int | None = None,
     closed: int | None = None,
     held_out: Mapping[int, float] | None = None,
-    least_confidence: float = 0.5,
+    least_confidence: float = 0.6,
 ) -> CaseFrames:
     """Choose the frames that were not told.
 

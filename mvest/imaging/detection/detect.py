@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.position import PLACES
 from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.landmarks import landmark_vertices
+from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -23,7 +24,7 @@ __all__ = [
     "NoValveError",
     "find_frame",
     "fit_frame",
-    "likeliest",
+    "merits",
     "search_frame",
 ]
 
@@ -68,12 +69,11 @@ SURE = 0.6
 """Rating above which the best pose is taken without trying others."""
 
 TRIED = 14
-"""Poses that are tried otherwise."""
+"""Poses that are tried otherwise: among fewer the right one is often missing."""
 
 RATING_SHARE = 0.3
-"""Weight of a pose's rating beside that of the boundary, where poses are compared. Where images are
-unlike those of training, the rating prefers a wrong pose in every third volume; the boundary is
-seen best at the right one."""
+"""Weight of a pose's rating beside what is seen of the leaflets, in the confidence. Of simulated
+volumes unlike those of training, the rating alone prefers a wrong pose in every third."""
 
 
 class NoValveError(InputError):
@@ -131,27 +131,51 @@ def find_frame(
     if not len(poses):
         raise NoValveError("no place to look for a valve at: no field of view")
     if rating[0] < SURE:
-        poses = poses[likeliest(frame, model, poses, rating, settings or FitSettings())]
+        poses = poses[poses.apart(rating, TRIED)]
+        best = int(np.argmax(merits(frame, model, poses, settings or FitSettings())))
+        poses = poses[best : best + 1]
     return fit_frame(frame, model, poses[:1], settings)
 
 
-def likeliest(
-    frame: StandardFrame,
-    model: DetectionModel,
-    poses: Poses,
-    rating: FloatArray,
-    settings: FitSettings,
-) -> list[int]:
-    """Order of the few best poses that differ, by how well a valve is fitted there in one round.
+def merits(
+    frame: StandardFrame, model: DetectionModel, poses: Poses, settings: FitSettings
+) -> FloatArray:
+    """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
 
-    Where poses are rated low, a wrong one may be rated best; its leaflets then are not where the
-    boundary is seen.
+    Where images are unlike those of training, a wrong pose may be rated best; its leaflets then are
+    not where the boundary is seen.
     """
-    few = poses.apart(rating, TRIED)
-    once = replace(settings, modes=settings.modes[:1], reach_mm=settings.reach_mm[:1])
-    quick = [fit_frame(frame, model, poses[k : k + 1], once) for k in few]
-    merit = [RATING_SHARE * v.confidence + v.vertex_confidence.mean() for v in quick]
-    return [int(few[k]) for k in np.argsort(-np.array(merit), kind="stable")]
+    return np.array([_merit(frame, model, poses[k : k + 1], settings) for k in range(len(poses))])
+
+
+def _merit(
+    frame: StandardFrame, model: DetectionModel, pose: Poses, settings: FitSettings
+) -> float:
+    shape, layout = model.shape, model.shape.layout
+    some = np.arange(layout.size).reshape(layout.rows, -1)[::2, ::2]
+    coarse = ValveLayout(some.shape[1], some.shape[0], layout.region_names)
+    start, _ = model.start(frame, pose, shape)
+    b = np.zeros(settings.modes[0])
+    b[:MODES] = start[0]
+    seen = np.zeros(0)
+    wide = np.sqrt(max(1.0, settings.alike * coarse.size / layout.size))
+    for reach in (settings.reach_mm[0], settings.reach_mm[-1]):
+        vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
+        normals, offset, std, seen = model.boundary(frame, vertices, coarse, reach)
+        pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
+    return _confidence(frame, model, pose, seen)
+
+
+def _confidence(
+    frame: StandardFrame, model: DetectionModel, pose: Poses, seen: FloatArray
+) -> float:
+    """How sure it is that there is a valve, 0 to 1: how well its leaflets are seen, and its pose.
+
+    In volumes with walls and no valve, leaflets may be seen (on a wall) where no pose is believed
+    in, or the other way round.
+    """
+    rating = float(np.clip(model.poses.refined(frame, pose, 1)[1][0], 0.0, 1.0))
+    return min(1.0, RATING_SHARE * rating + float(seen.mean()))
 
 
 def fit_frame(
@@ -227,8 +251,8 @@ def fit_frame(
     )
     hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
     vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), told.stiffness, told.hold)
-    rating = float(np.clip(model.poses.refined(frame, pose, 1)[1][0], 0.0, 1.0))
-    return FrameValve(begin, pose, b, vertices, tips, rating, confidence, stages)
+    sure = _confidence(frame, model, pose, confidence)
+    return FrameValve(begin, pose, b, vertices, tips, sure, confidence, stages)
 
 
 def _by_hand(at: IntArray, vertices: FloatArray, points: FloatArray, std: float) -> Pulls:

@@ -19,11 +19,12 @@ from mvest.imaging.detection.detect import (
     CANDIDATES,
     HAND_STD_MM,
     SURE,
+    TRIED,
     FitSettings,
     FrameValve,
     NoValveError,
     fit_frame,
-    likeliest,
+    merits,
     search_frame,
 )
 from mvest.imaging.detection.fit import Pulls, relax
@@ -34,7 +35,7 @@ from mvest.imaging.detection.smoothing import smooth_in_time
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray
 
 __all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve"]
 
@@ -75,7 +76,7 @@ class TrackingSettings:
     speed_mm_s: float = 60.0
     still_mm: float = 2.0
     smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
-    least_confidence: float = 0.3
+    least_confidence: float = 0.6
     fit: FitSettings = field(default_factory=FitSettings)
 
 
@@ -225,7 +226,9 @@ def _trajectory(
         raise NoValveError("no valve found; there is no place in any frame to look for one at")
     best = pool[pool.apart(ratings, told.shared)]
     if not by_hand and np.median([rating[0] for _, rating in own if len(rating)]) < SURE:
-        best = best[_likeliest_in_all(frames, model, best, told.fit)]
+        tried = pool[pool.apart(ratings, TRIED)]
+        likeliest = _likeliest_in_all(frames, model, tried, told.fit)
+        best = tried[likeliest : likeliest + 1]
         own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
     candidates = []
     for k, frame in enumerate(frames):
@@ -239,17 +242,14 @@ def _trajectory(
 
 
 def _likeliest_in_all(
-    frames: list[StandardFrame], model: DetectionModel, best: Poses, fit: FitSettings
-) -> IntArray:
-    """Which of some poses the valve is fitted to best in a few frames, as a list of one."""
-    places = np.zeros(len(best))
+    frames: list[StandardFrame], model: DetectionModel, tried: Poses, fit: FitSettings
+) -> int:
+    """At which of some poses the valve is seen best in a few frames."""
+    seen = np.zeros(len(tried))
     for k in sorted({0, len(frames) // 2, len(frames) - 1}):
-        poses, rating = model.poses.refined_in_order(frames[k], best)
-        order = likeliest(frames[k], model, poses, rating, fit)
-        for place, which in enumerate(order):
-            places[which] -= place
-        places[[n for n in range(len(best)) if n not in order]] -= len(best)
-    return np.array([int(np.argmax(places))])
+        poses, _ = model.poses.refined_in_order(frames[k], tried)
+        seen += merits(frames[k], model, poses, fit)
+    return int(np.argmax(seen))
 
 
 def _like(poses: Poses, best: Poses) -> BoolArray:
