@@ -77,8 +77,8 @@ def _words(record: Record) -> str:
         f"Simulated: a sheet of {sheet['length']:g} × {sheet['width']:g} × "
         f"{sheet['thickness']:g} mm, clamped at three sides, under {sheet['pressure_mmHg']:g} "
         f"mmHg; truth {truth}; errors of {record['noise_mm']:g} mm SD, the same in both sets of "
-        "data. ± is one standard deviation. The estimates that belong to one set of data see the same "
-        "numbers, so that what they differ by is the model."
+        "data. ± is one standard deviation. The estimates that belong to one set of data see the "
+        "same numbers, so that what they differ by is the model."
     )
 
 
@@ -92,8 +92,8 @@ def _readable(record: Record) -> str:
             markdown_rows(_estimates(record)),
             "How far the observed points, and their derivatives by the moduli, are from those of "
             "scikit-fem with the Biot law on the same mesh, at the true moduli. The same elements "
-            "are triquadratic bricks, in both codes with the same quadrature; solid-shells are what "
-            "this project uses for leaflets, and are compared with fully integrated bricks:",
+            "are triquadratic bricks, in both codes with the same quadrature; solid-shells are "
+            "what this project uses for leaflets, compared with fully integrated bricks:",
             markdown_rows(_differences(record)),
         ]
     )
