@@ -174,6 +174,12 @@ def _draw_iterates(axes: Any, record: Record, k: int) -> None:
             np.arange(len(values)), values, linestyle=styles[row["data"]], color=COLOURS[n],
             marker=MARKERS[n], markersize=10 - 1.5 * n, markerfacecolor="none",
         )  # fmt: skip
+    first = record["rows"][0]
+    axes.errorbar(
+        len(first["iterates"]) - 0.85, first["estimate"][k], first["std"][k], color="black",
+        capsize=3, linewidth=1, label="± 1 SD of the noise and the prior",
+    )  # fmt: skip
+    shown += [first["estimate"][k] + sign * first["std"][k] for sign in (-1, 1)]
     axes.axhline(record["truth"][k], color="grey", linestyle="--", linewidth=1, label="truth")
     for data, style in styles.items():
         axes.plot([], [], color="black", linestyle=style, label=f"data of {data}")
