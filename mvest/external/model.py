@@ -30,11 +30,12 @@ FINISHED = "finished.json"
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """An answer, and whether a program was started for it."""
+    """An answer, and where it is from: neither, where no program could be started for it."""
 
     answer: Answer
-    started: bool
-    seconds: float
+    started: bool = False
+    reused: bool = False
+    seconds: float = 0.0
 
 
 class ProcessModel:
@@ -177,7 +178,7 @@ class ProcessModel:
                     pool.shutdown(cancel_futures=True)
                     raise
         self.runs += sum(run.started for run in found)
-        self.reused += sum(not run.started for run in found)
+        self.reused += sum(run.reused for run in found)
         self.seconds += sum(run.seconds for run in found)
         return [run.answer for run in found]
 
@@ -189,10 +190,10 @@ class ProcessModel:
             with FileLock(folder / ".lock"):
                 done = self._finished(folder, request) if self.reuse else None
                 if done is not None:
-                    return _Run(done, False, 0.0)
+                    return _Run(done, reused=True)
                 return self._start(folder, request, stop)
         except (OSError, InputError) as error:
-            return _Run(Answer(f"{folder.name}: {error}", np.empty(0)), False, 0.0)
+            return _Run(Answer(f"{folder.name}: {error}", np.empty(0)))
 
     def _start(self, folder: Path, request: Request, stop: threading.Event | None) -> _Run:
         for name in (FINISHED, *ANSWERS):
@@ -211,7 +212,7 @@ class ProcessModel:
             answer = Answer(f"{folder.name}: {answer.reason}", np.empty(0))
         else:
             write_json(folder / FINISHED, {"sha256": _answers(folder), "seconds": ending.seconds})
-        return _Run(answer, True, ending.seconds)
+        return _Run(answer, started=True, seconds=ending.seconds)
 
     def _finished(self, folder: Path, request: Request) -> Answer | None:
         """The answer of a finished run; None if there is none, or its files were changed since."""

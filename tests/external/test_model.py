@@ -189,3 +189,11 @@ def test_an_inadmissible_model_is_refused_before_anything_runs(tmp_path):
         ProcessModel(command, tmp_path / "file" / "runs", NAMES, 2)
     with pytest.raises(InputError, match="1 parameters"):
         ProcessModel(command, tmp_path, NAMES, 2)(np.ones(1))
+
+
+def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
+    program = model(tmp_path)
+    (tmp_path / "runs").rmdir()
+    (tmp_path / "runs").touch()
+    assert "Not a directory" in program(M).reason
+    assert (program.runs, program.reused) == (0, 0)
