@@ -21,6 +21,7 @@ from mvest.imaging.detection.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.personalise import CaseMesh, PaperSettings
 from mvest.provenance import config_hash
+from mvest.sheet.sheet import Sheet
 from mvest.simulated_motion import PopulationSettings
 from mvest.valve.template import TemplateParameters
 from mvest.virtual_patient import Deviations, Simulation
@@ -42,6 +43,9 @@ NOT_THE_RESULT = (
     "check",
     "imaging.processes",
     "imaging.publish_model",
+    "external.folder",
+    "external.processes",
+    "models.processes",
 )
 """What in a configuration changes no number of the result, left out of its hash."""
 
@@ -54,6 +58,7 @@ DeviationsConfig = schema(Deviations)
 PopulationSettingsConfig = schema(PopulationSettings)
 TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
+SheetConfig = schema(Sheet)
 
 
 @dataclass
@@ -248,6 +253,39 @@ class EchoConfig:
 
 
 @dataclass
+class ExternalConfig:
+    """A program as the model, asked through files (mvest/external/README.md)."""
+
+    command: list[str] = field(default_factory=list)  # the program and its arguments, no shell
+    folder: str | None = None  # where its runs are kept; null: in the folder of the job
+    observation: str | None = None  # .csv x,y,z (mm), one row per observed point
+    points: str | None = None  # .csv x,y,z (mm), reference positions that the program is told
+    units: list[str] = field(default_factory=list)  # of the parameters; empty: not told
+    prior_std: list[float] = field(default_factory=list)  # of the parameters, in their units
+    noise_mm: float | None = None  # SD of the error of each observed coordinate
+    settings: dict[str, Any] = field(default_factory=dict)  # handed to the program as they are
+    environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
+    inputs: list[str] = field(default_factory=list)  # files after whose change runs are done anew
+    time_limit_s: float = 600.0  # of one run
+    differences: str = "central"  # or forward, or none: the program must give jacobian.csv
+    relative_step: float = 1e-3  # of a parameter, in differences
+    floor: float = 0.0  # size of a parameter that may be zero
+    processes: int = 1  # runs at a time
+    reuse: bool = True  # finished runs serve again
+
+
+@dataclass
+class ModelsConfig:
+    """The same sheet in two finite-element codes, and as a program."""
+
+    sheet: SheetConfig = field(default_factory=SheetConfig)  # type: ignore[valid-type]
+    refinements: list[Any] = field(default_factory=list)  # [along, across, layers] to compare on
+    relative_step: float = 1e-3  # of the program's differences
+    time_limit_s: float = 120.0  # of one run of the program
+    processes: int = 1  # of its runs at a time
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -315,6 +353,8 @@ class Config:
     patient: PatientConfig | None = None
     echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
+    external: ExternalConfig = field(default_factory=ExternalConfig)
+    models: ModelsConfig = field(default_factory=ModelsConfig)
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

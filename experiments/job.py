@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from experiments.case import check_case, run_case
 from experiments.config import register
 from experiments.donor import run_donor
+from experiments.external import check_external, run_external
 from experiments.folder import (
     CONFIG,
     RESULT,
@@ -26,6 +27,7 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
+from experiments.models import run_models
 from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
@@ -35,9 +37,11 @@ from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
+from mvest.reporting.external import external_text, write_external_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
+from mvest.reporting.models import models_text, publish_models, write_models_tables
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -76,7 +80,8 @@ def run_job(config: DictConfig) -> None:
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["check"]:
-        check = check_volume if values["study"] == "volume" else check_case
+        checks = {"volume": check_volume, "external": check_external}
+        check = checks.get(values["study"], check_case)
         print(check(values, folder))
         return
     if values["time_limit_s"] is not None:
@@ -246,6 +251,18 @@ STUDIES: dict[str, Study] = {
         write_imaging_study,
         lambda results, _name, record, _folder: publish_imaging(results, record),
         finish=publish_model,
+    ),
+    "models": Study(
+        run_models,
+        models_text,
+        write_models_tables,
+        lambda results, _name, record, _folder: publish_models(results, record),
+    ),
+    "external": Study(
+        run_external,
+        external_text,
+        write_external_tables,
+        lambda _results, _name, _record, _folder: [],
     ),
 }
 """Kinds of studies that a configuration can name."""

@@ -96,6 +96,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.study",
         "mvest.surface_observation",
     ),
+    "mvest.external": (*LEAVES, "mvest.provenance", "mvest.estimation"),
+    "mvest.sheet": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.estimation",
+        "mvest.external",
+    ),
     "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
     "mvest.imaged_case": (
         *LEAVES,
@@ -124,8 +132,11 @@ IMPORT_NAME = {
     "pillow": ("PIL",),
     "pynrrd": ("nrrd",),
     "pyyaml": ("yaml",),
+    "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
 }
+OPTIONAL = ("viz", "cluster", "postgres", "browser", "second-model")
+"""Extras that mvest and experiments may use, within functions."""
 
 
 class Import(NamedTuple):
@@ -324,9 +335,7 @@ def undeclared(source: str, module: str, required: set[str], optional: set[str])
 def test_what_is_imported_is_declared(project: dict) -> None:
     required = import_names(project["dependencies"])
     extras = project["optional-dependencies"]
-    optional = import_names(
-        [text for name in ("viz", "cluster", "postgres", "browser") for text in extras[name]]
-    )
+    optional = import_names([text for name in OPTIONAL for text in extras[name]])
     messages = [
         message
         for module, path in modules("mvest", "experiments")

@@ -59,6 +59,7 @@ OTHERS = (
         ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
     ),
     ("donor", "A recorded donor valve", ("donor",)),
+    ("models", "Other biomechanical models (simulated)", ("models",)),
     ("benchmark", "How fast", ("benchmark",)),
 )
 """Other results: Markdown file, title where it has none, and the pictures beside it."""
@@ -75,6 +76,8 @@ CAPTIONS = {
     "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
     "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
+    "models": "A pressed sheet in two finite-element codes: deformed, its moduli iterate by "
+    "iterate under each model, and how the codes differ on finer meshes. Simulated.",
     "benchmark": "Where the time goes.",
 }
 

@@ -1,0 +1,249 @@
+"""A program as an observation model: parameters in, positions and derivatives out, all in files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+
+from mvest.errors import ConfigurationError, InputError, cannot_write
+from mvest.estimation.prediction import Prediction
+from mvest.external.contract import ANSWERS, Answer, Request, read_answer, write_request
+from mvest.external.differences import Differences
+from mvest.external.process import Command
+from mvest.provenance import config_hash, write_json
+from mvest.typing import FloatArray
+
+__all__ = ["ProcessModel"]
+
+FINISHED = "finished.json"
+"""Written after an answer has been read and found in order."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """An answer, and where it is from: neither, where no program could be started for it."""
+
+    answer: Answer
+    started: bool = False
+    reused: bool = False
+    seconds: float = 0.0
+
+
+class ProcessModel:
+    """Coordinates ``(3 n,)`` mm that a program predicts for parameters ``(p,)``.
+
+    An observation model of the filters: whatever goes wrong with a run is the reason of a failed
+    prediction. Each run has a folder of its own below ``folder``, named by the hash of all that the
+    run depends on; a run that is finished there is not done again.
+
+    Parameters
+    ----------
+    command : Command
+    folder : Path
+        Where the runs are kept; made if need be.
+    names : sequence of str
+        Of the parameters.
+    count : int
+        Number n of observed points.
+    units : sequence of str, optional
+        Of the parameters; empty if not given.
+    points : ndarray, optional
+        ``(n, 3)`` mm reference positions of the points to be observed, where the program has to be
+        told.
+    settings : mapping, optional
+        Plain data for the program, handed on as they are.
+    differences : Differences or None
+        How derivatives are made if the program gives none; None demands them of the program.
+    reuse : bool
+        Whether finished runs serve again.
+    inputs : sequence of Path
+        Files whose contents a run depends on, such as the program's own and its mesh: after a
+        change of one of them nothing finished serves any more.
+
+    Attributes
+    ----------
+    runs, reused : int
+        How often a program was started, and how often a finished run served instead.
+    seconds : float
+        Wall time of the started runs, summed over those that ran side by side.
+    own_jacobian : bool
+        Whether the last prediction's derivatives are the program's own.
+
+    Raises
+    ------
+    InputError, ConfigurationError
+        If the folder cannot be made, an input cannot be read or the points have another shape.
+    """
+
+    def __init__(
+        self,
+        command: Command,
+        folder: Path,
+        names: Sequence[str],
+        count: int,
+        *,
+        units: Sequence[str] | None = None,
+        points: FloatArray | None = None,
+        settings: Mapping[str, Any] | None = None,
+        differences: Differences | None = Differences(),  # noqa: B008 - frozen
+        reuse: bool = True,
+        inputs: Sequence[Path] = (),
+    ) -> None:
+        self.command, self.folder, self.names = command, folder, tuple(names)
+        self.units = ("",) * len(self.names) if units is None else tuple(units)
+        self.count, self.settings = count, dict(settings or {})
+        self.differences, self.reuse = differences, reuse
+        self.runs = self.reused = 0
+        self.seconds = 0.0
+        self.own_jacobian = False
+        self._points = None if points is None else np.asarray(points, dtype=np.float64)
+        if self._points is not None and self._points.shape != (count, 3):
+            raise ConfigurationError(f"points: shape {self._points.shape}, expected ({count}, 3)")
+        self._inputs = {str(path): _sha256(path) for path in inputs}
+        # Units and names are in order, or this says what is not.
+        self._request(np.zeros(len(self.names)), True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(folder, error) from error
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Run the program at ``m``, and at its neighbours if it gives no derivatives."""
+        if m.shape != (len(self.names),):
+            raise InputError(f"{m.size} parameters, expected {', '.join(self.names)}")
+        if not np.all(np.isfinite(m)):
+            return Prediction.failed(f"the parameters {m} are not finite")
+        (first,) = self._all([m], jacobian=True)
+        if first.reason:
+            return Prediction.failed(first.reason)
+        self.own_jacobian = first.jacobian is not None
+        if first.jacobian is not None:
+            return Prediction(first.y, first.jacobian)
+        if self.differences is None:
+            return Prediction.failed("the program gives no derivatives: jacobian.csv is missing")
+        jacobian = self.by_differences(m, first.y)
+        if isinstance(jacobian, str):
+            return Prediction.failed(jacobian)
+        return Prediction(first.y, jacobian)
+
+    def by_differences(self, m: FloatArray, y: FloatArray) -> FloatArray | str:
+        """Derivatives ``(3 n, p)`` by differences, or the reason why there are none.
+
+        Parameters
+        ----------
+        m : ndarray
+            ``(p,)``.
+        y : ndarray
+            ``(3 n,)`` mm, the prediction at ``m``.
+        """
+        if self.differences is None:
+            return "no differences are configured"
+        try:
+            points = self.differences.neighbours(m)
+        except InputError as error:
+            return str(error)
+        answers = self._all(points, jacobian=False)
+        for at, answer in zip(points, answers, strict=True):
+            if answer.reason:
+                values = ", ".join(f"{n} = {v:g}" for n, v in zip(self.names, at, strict=True))
+                return f"run for a difference at {values}: {answer.reason}"
+        return self.differences.jacobian(m, y, [answer.y for answer in answers])
+
+    def _request(self, m: FloatArray, jacobian: bool) -> Request:
+        values = tuple(float(v) for v in m)
+        return Request(self.names, self.units, values, self.count, jacobian, self.settings)
+
+    def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Answer]:
+        """Answers at all points, several at a time; none goes on where one is interrupted."""
+        requests = [self._request(m, jacobian) for m in points]
+        processes = 1 if self.differences is None else self.differences.processes
+        if processes == 1 or len(requests) == 1:
+            found = [self._run(request, None) for request in requests]
+        else:
+            stop = threading.Event()
+            with ThreadPoolExecutor(processes) as pool:
+                try:
+                    found = list(pool.map(lambda request: self._run(request, stop), requests))
+                except BaseException:
+                    stop.set()
+                    pool.shutdown(cancel_futures=True)
+                    raise
+        self.runs += sum(run.started for run in found)
+        self.reused += sum(run.reused for run in found)
+        self.seconds += sum(run.seconds for run in found)
+        return [run.answer for run in found]
+
+    def _run(self, request: Request, stop: threading.Event | None) -> _Run:
+        """One run in its folder, unless it is finished there."""
+        folder = self.folder / f"run-{self._hash(request)[:24]}"
+        try:
+            folder.mkdir(exist_ok=True)
+            with FileLock(folder / ".lock"):
+                done = self._finished(folder, request) if self.reuse else None
+                if done is not None:
+                    return _Run(done, reused=True)
+                return self._start(folder, request, stop)
+        except (OSError, InputError) as error:
+            return _Run(Answer(f"{folder.name}: {error}", np.empty(0)))
+
+    def _start(self, folder: Path, request: Request, stop: threading.Event | None) -> _Run:
+        for name in (FINISHED, *ANSWERS):
+            # An old answer is not to be taken for that of a program that writes none.
+            (folder / name).unlink(missing_ok=True)
+        write_request(folder, request, self._points)
+        ending = self.command.run(folder, stop)
+        try:
+            answer = read_answer(folder, request)
+        except InputError as error:
+            answer = Answer(str(error), np.empty(0))
+        if ending.reason:
+            said = [] if not answer.reason or "missing" in answer.reason else [answer.reason]
+            answer = Answer("; ".join([ending.reason, *said]), np.empty(0))
+        if answer.reason:
+            answer = Answer(f"{folder.name}: {answer.reason}", np.empty(0))
+        else:
+            write_json(folder / FINISHED, {"sha256": _answers(folder), "seconds": ending.seconds})
+        return _Run(answer, started=True, seconds=ending.seconds)
+
+    def _finished(self, folder: Path, request: Request) -> Answer | None:
+        """The answer of a finished run; None if there is none, or its files were changed since."""
+        try:
+            marker = json.loads((folder / FINISHED).read_text(encoding="utf-8"))
+            if marker["sha256"] == _answers(folder):
+                return read_answer(folder, request)
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+        return None
+
+    def _hash(self, request: Request) -> str:
+        """SHA-256 of all that an answer depends on."""
+        return config_hash(
+            {
+                "request": request.data(),
+                "command": self.command.arguments,
+                "environment": self.command.environment,
+                "points": self._points,
+                "inputs": self._inputs,
+            }
+        )
+
+
+def _answers(folder: Path) -> dict[str, str]:
+    """SHA-256 of the files of an answer that are there."""
+    return {name: _sha256(folder / name) for name in ANSWERS if (folder / name).is_file()}
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error

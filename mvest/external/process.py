@@ -1,0 +1,195 @@
+"""A program that is started, watched and stopped with all that it has started.
+
+No shell is involved: each argument reaches the program as it stands, whatever characters it holds.
+The program leads a process group of its own, which is stopped as a whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mvest.errors import ConfigurationError
+from mvest.external.contract import REQUEST
+
+__all__ = ["ERRORS", "OUTPUT", "Command", "Ending"]
+
+OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
+"""Files of a run's folder that hold what its program said."""
+
+PLACEHOLDER = re.compile(r"\{(request|folder|here)\}")
+GRACE_S = 1.0
+"""Between asking a program to stop and stopping it."""
+
+POLL_S = 0.05
+TAIL_BYTES, TAIL_LINES, LINE_LENGTH = 4096, 4, 200
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a run of a program ended.
+
+    Attributes
+    ----------
+    reason : str
+        Empty where the exit status is 0.
+    seconds : float
+        Wall time.
+    """
+
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """How a program is started, and how long it may take.
+
+    Attributes
+    ----------
+    arguments : tuple of str
+        The program and its arguments. ``{request}`` and ``{folder}`` stand for the request file and
+        the folder of the run, ``{here}`` for the folder in which this process was started; nothing
+        else is replaced. Programs run in the folder of their run.
+    environment : mapping
+        Variables beside those of this process.
+    time_limit_s : float
+        After which the program and all that it has started is stopped.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such program, or an argument, a variable or the limit is inadmissible.
+    """
+
+    arguments: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+    time_limit_s: float = 600.0
+
+    def __post_init__(self) -> None:
+        if not self.arguments or not self.arguments[0]:
+            raise ConfigurationError("command is empty, expected a program and its arguments")
+        for text in (*self.arguments, *self.environment, *self.environment.values()):
+            if "\0" in text:
+                raise ConfigurationError(f"command: {text!r} holds a NUL character")
+        wrong = [name for name in self.environment if not name or "=" in name]
+        if wrong:
+            raise ConfigurationError(f"environment: {wrong[0]!r} is no name of a variable")
+        if not self.time_limit_s > 0:
+            raise ConfigurationError(f"time_limit_s = {self.time_limit_s}, expected > 0")
+        program = self._filled(self.arguments[0], Path())
+        if os.sep in program and not Path(program).is_absolute():
+            raise ConfigurationError(
+                f"program {program!r}: a relative path, but programs run in the folder of their "
+                f"run; expected {{here}}{os.sep}{program} or an absolute path"
+            )
+        if shutil.which(program) is None:
+            raise ConfigurationError(f"program {program!r} is not found or not executable")
+
+    def run(self, folder: Path, stop: threading.Event | None = None) -> Ending:
+        """Run the program in ``folder``; how it ended.
+
+        What it says goes to ``stdout.txt`` and ``stderr.txt`` there. It is stopped at the time
+        limit, when ``stop`` is set, and when this process is interrupted.
+        """
+        started = time.monotonic()
+        arguments = [self._filled(text, folder.resolve()) for text in self.arguments]
+        try:
+            with (folder / OUTPUT).open("wb") as output, (folder / ERRORS).open("wb") as errors:
+                process = subprocess.Popen(
+                    arguments,
+                    cwd=folder,
+                    env={**os.environ, **self.environment},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=errors,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            reason = f"the program could not be started: {error.strerror or error}"
+            return Ending(reason, time.monotonic() - started)
+        try:
+            stopped = self._watch(process, started, stop)
+        finally:
+            # Also what an ended program has left behind: it could write into files read by now.
+            _end(process)
+        seconds = time.monotonic() - started
+        reason = stopped or _status(process.returncode)
+        return Ending(reason + _last_words(folder) if reason else "", seconds)
+
+    def _watch(
+        self, process: subprocess.Popen[bytes], started: float, stop: threading.Event | None
+    ) -> str:
+        """Wait for the program; why it was not let finish, empty where it was."""
+        while True:
+            left = started + self.time_limit_s - time.monotonic()
+            try:
+                process.wait(max(0.0, min(POLL_S, left)))
+            except subprocess.TimeoutExpired:
+                if stop is not None and stop.is_set():
+                    return "stopped with the study"
+                if left <= POLL_S:
+                    return f"stopped at the time limit of {self.time_limit_s:g} s"
+            else:
+                return ""
+
+    def _filled(self, text: str, folder: Path) -> str:
+        places = {
+            "request": str(folder / REQUEST),
+            "folder": str(folder),
+            "here": str(Path.cwd()),
+        }
+        return PLACEHOLDER.sub(lambda found: places[found[1]], text)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a program and its group: asked first, then made to."""
+    if process.poll() is None:
+        _signal(process.pid, signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(GRACE_S)
+    _signal(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _signal(group: int, which: signal.Signals) -> None:
+    try:
+        os.killpg(group, which)
+    except (ProcessLookupError, PermissionError):
+        # Nobody is left, or (macOS) only what has ended and waits to be collected.
+        return
+
+
+def _status(code: int) -> str:
+    """How a program ended by itself, in words; empty for exit status 0."""
+    if code == 0:
+        return ""
+    if code > 0:
+        return f"exit status {code}"
+    try:
+        return f"killed by signal {signal.Signals(-code).name}"
+    except ValueError:
+        return f"killed by signal {-code}"
+
+
+def _last_words(folder: Path) -> str:
+    """The last lines that a program wrote to its standard error."""
+    try:
+        with (folder / ERRORS).open("rb") as stream:
+            stream.seek(0, os.SEEK_END)
+            stream.seek(max(0, stream.tell() - TAIL_BYTES))
+            text = stream.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    shown = "".join(c if c.isprintable() or c == "\n" else " " for c in text)
+    lines = [line.strip()[:LINE_LENGTH] for line in shown.splitlines() if line.strip()]
+    return f"; its last words: {' | '.join(lines[-TAIL_LINES:])}" if lines else ""
