@@ -22,9 +22,10 @@ from mvest.estimation import (
     Transform,
     observation_noise,
 )
+from mvest.mechanics.parameters import is_positive, kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
-from mvest.mechanics.system import FACTORS
+from mvest.mechanics.valve_system import check_parameters
 from mvest.model import ClosureModel
 from mvest.observation import require_frames
 from mvest.observation_errors import (
@@ -132,6 +133,7 @@ def build_twin(config: Values) -> Twin:
     template = template_of(config)
     observation = config["observation"]
     valve = template.valve(observation["columns"], observation["rows"])
+    check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
     points = config["mechanics"]["contact_points"]
     contact_valve = template.valve(points["columns"], points["rows"])
     correlations = Correlations(valve.surface)
@@ -223,13 +225,11 @@ def observation_errors(
 
 def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
     """The estimator's mechanics with the truth's changes."""
-    unknown = [
-        name for name in truth["fixed"] if name not in FACTORS and not name.startswith("E_f.")
-    ]
-    if unknown:
-        raise ConfigurationError(
-            f"truth.fixed has {', '.join(unknown)}; known: {', '.join(FACTORS)}"
-        )
+    for name in truth["fixed"]:
+        try:
+            kind_of(name)
+        except InputError as error:
+            raise ConfigurationError(f"truth.fixed: {error}") from error
     tissue = dict(settings.tissue)
     for region, ratio in truth["ratio"].items():
         if region not in tissue:
@@ -315,7 +315,10 @@ def build_filter(
     _one_each("filter.initial", mean, parameters)
     prior = _gaussian("filter.P0", mean, settings["P0"])
     tolerance, most = settings["tolerance"], settings["max_iterations"]
-    transforms: dict[str, Transform] = {"identity": Identity(), "log": Log()}
+    transforms: dict[str, Transform] = {
+        "identity": Identity(),
+        "log": Log(tuple(map(is_positive, parameters))),
+    }
     if settings["transform"] not in transforms:
         raise ConfigurationError(
             f"filter.transform = {settings['transform']!r}, expected identity or log"
@@ -349,22 +352,21 @@ def _gaussian(name: str, mean: FloatArray, variance: Any) -> Gaussian:
 def _require_tissue(
     settings: MechanicsSettings, parameters: tuple[str, ...], *points: FloatArray
 ) -> None:
-    """Refuse unknowns that the model does not have, and values that no tissue can have."""
-    for k, parameter in enumerate(parameters):
+    """Refuse moduli of a region without tissue, and values that no tissue can have."""
+    for parameter in parameters:
+        kind_of(parameter)
         kind, _, region = parameter.partition(".")
-        if kind != "E_f":
-            if parameter not in FACTORS:
-                raise ConfigurationError(
-                    f"unknown parameter {parameter!r}; known: E_f.REGION, {', '.join(FACTORS)}"
-                )
-            continue
-        if region not in settings.tissue:
+        if kind == "E_f" and region not in settings.tissue:
             raise ConfigurationError(
                 f"parameter {parameter!r}: no tissue is given for the region {region!r}; known: "
                 f"{', '.join(settings.tissue)}"
             )
-        for values in points:
-            settings.tissue[region].material(float(values[k]))
+    for point in points:
+        values = dict(zip(parameters, map(float, point), strict=True))
+        for region, tissue in settings.tissue.items():
+            if f"E_f.{region}" in values:
+                own = [values.get(f"{kind}.{region}") for kind in ("ratio", "G")]
+                _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
 
 
 def _numbers(name: str, value: Any) -> float | FloatArray:

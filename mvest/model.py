@@ -16,16 +16,17 @@ import numpy as np
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
-from mvest.mechanics.steps import Simulation, Step
-from mvest.mechanics.system import Factors, Loads, Parameter, System
+from mvest.mechanics.steps import Damping, Simulation, Step
+from mvest.mechanics.system import Loads, Parameter, System
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
     build_system,
     held_loading,
-    material_law,
+    retune,
 )
 from mvest.typing import FloatArray
 from mvest.valve.anatomy import Valve
@@ -90,9 +91,10 @@ class ClosureModel:
         closed state is the same as long as there is one only, which the gate (:mod:`mvest.gate`)
         examines.
     reach : float
-        Largest change of any parameter's logarithm over which a closure is continued; beyond it
-        the valve is closed from the open state. A much softer valve may close in another way, and
-        what is continued from there may keep to that way.
+        Largest change of any parameter's logarithm (of a field's coefficient: times its standard
+        deviation of log E_f) over which a closure is continued; beyond it the valve is closed from
+        the open state. A much softer valve may close in another way, and what is continued from
+        there may keep to that way.
     guide : ClosureModel, optional
         The same valve with the same parameters on a coarser mesh. A closure that would start from
         the open valve is followed there, and its closed state is where the equilibrium on this
@@ -102,9 +104,9 @@ class ClosureModel:
         Whether a continued closure that fails is repeated with the guide, and one that fails with
         the guide from the open valve, which takes long and seldom finds what the others did not.
     largest_change : float
-        Of the logarithm of any parameter from one continued equilibrium to the next: one farther
-        away is reached through others between. Newton's method does not find an equilibrium that
-        lies millimetres away.
+        Of any parameter, measured as for ``reach``, from one continued equilibrium to the next: one
+        farther away is reached through others between. Newton's method does not find an equilibrium
+        that lies millimetres away.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
     """
@@ -170,20 +172,41 @@ class ClosureModel:
             return False
         if np.isinf(self.reach):
             return True
-        if np.any(m <= 0) or np.any(self._closed.at <= 0):
-            return False
-        return bool(np.max(np.abs(np.log(m / self._closed.at))) <= self.reach)
+        change = self._change(self._closed.at, m)
+        return change is not None and bool(np.max(np.abs(change)) <= self.reach)
+
+    @cached_property
+    def _units(self) -> FloatArray:
+        """What a coefficient of a field ``(p,)`` changes log E_f by; 0 for positive parameters."""
+        out = np.zeros(len(self.names))
+        for k, name in enumerate(self.names):
+            if not is_positive(name):
+                out[k] = self.settings.fields[Parameter(name, 0.0).region].std_log
+        return out
+
+    def _change(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
+        """Change ``(p,)`` of the parameters' logarithms; None where there is no logarithm."""
+        positive = self._units == 0
+        if np.any(start[positive] <= 0) or np.any(end[positive] <= 0):
+            return None
+        change = self._units * (end - start)
+        change[positive] = np.log(end[positive] / start[positive])
+        return change
 
     def _way_to(self, m: FloatArray) -> list[FloatArray]:
         """Parameters between the last closed state and ``m``, where that is continued from."""
         if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
             return []
-        if np.any(m <= 0) or np.any(self._closed.at <= 0):
-            return []
         start = self._closed.at
-        change = np.log(m / start)
+        change = self._change(start, m)
+        if change is None:
+            return []
         n = int(np.ceil(float(np.abs(change).max()) / self.largest_change))
-        return [start * np.exp(change * k / n) for k in range(1, n)]
+        positive = self._units == 0
+        return [
+            np.where(positive, start * np.exp(change * k / n), start + (m - start) * k / n)
+            for k in range(1, n)
+        ]
 
     def close(
         self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
@@ -209,20 +232,7 @@ class ClosureModel:
                 result = self.close(between, sensitivities=False)
                 if not result.simulation.converged:
                     return result
-        values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
-        moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
-        factors = Factors(
-            values.get("pressure_scale", 1.0),
-            values.get("chord_stiffness", 1.0),
-            values.get("chord_rest_length", 1.0),
-        )
-        if self._system is None or self._solver is None:
-            self._solver = linear_solver(self.settings.solver)
-            self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, moduli
-            )
-        system = self._system
-        system.retune(material_law(self.mesh, self.settings, moduli), factors)
+        system, parameters = self.tuned(m)
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
@@ -233,9 +243,9 @@ class ClosureModel:
                 system,
                 loading,
                 steps,
-                damping=self.settings.damping,
+                damping=self.damping(m),
                 newton=self.settings.newton,
-                parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
+                parameters=parameters if sensitivities else [],
                 final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
@@ -262,6 +272,42 @@ class ClosureModel:
         if simulation.converged:
             self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
+
+    def _values(self, m: FloatArray) -> dict[str, float]:
+        """All parameters that have a value, those that are not estimated included."""
+        return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
+
+    def damping(self, m: FloatArray) -> Damping:
+        """The damping with parameters ``m (p,)``, of which it may be one."""
+        own = self.settings.damping
+        return replace(own, beta=self._values(m).get("damping", own.beta))
+
+    def tuned(self, m: FloatArray) -> tuple[System, tuple[Parameter, ...]]:
+        """The system, set to parameters ``m (p,)``, and the parameters to differentiate by.
+
+        The system is built once and belongs to the model.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        values = self._values(m)
+        if self._system is None or self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+            self._system = build_system(
+                self.valve, self.contact_valve, self.mesh, self.settings, values
+            )
+        system = self._system
+        retune(system, self.settings, values)
+        return system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    @property
+    def solver(self) -> LinearSolver:
+        """The solver that goes with the system, made with it."""
+        if self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+        return self._solver
 
     def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
         """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.

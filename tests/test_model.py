@@ -481,7 +481,7 @@ def test_what_hangs_on_the_valve_is_the_same_in_every_mesh():
     # Chord patches and hinge are given in the rest frame: their rest positions and stiffness must
     # not know the mesh. Finer and other elements are nearer to the exact surface.
     valve, contact_valve = TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)
-    moduli = {"anterior": 6.23, "posterior": 2.09}
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     settings = settings_of(CLOSING)
     systems = [
         build_system(valve, contact_valve, structured_mesh(TEMPLATE, *kind), settings, moduli)
@@ -554,7 +554,7 @@ def test_the_protocol_ramps_in_equal_steps_then_grows_to_the_end_and_to_equilibr
 
 def test_the_loading_runs_from_the_open_to_the_closed_frame():
     model = model_of(replace(CLOSING, pressure_mmHg=120.0), **SMALL)
-    moduli = {"anterior": 6.23, "posterior": 2.09}
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     system = build_system(model.valve, model.contact_valve, model.mesh, model.settings, moduli)
     loading = boundary_loading(system, model.valve, model.contact_valve, model.settings)
     start, end = loading(0.0), loading(0.2)
@@ -580,7 +580,7 @@ def test_more_key_frames_are_met_exactly_and_joined_without_overshoot():
         valve,
         motion=Motion(phase, valve.motion.annulus[:1] + shift, valve.papillary_tips + shift),
     )
-    moduli = {"anterior": 6.23, "posterior": 2.09}
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     system = build_system(model.valve, moving, model.mesh, model.settings, moduli)
     loading = boundary_loading(system, model.valve, moving, model.settings)
     times = np.linspace(0.0, 0.2, 41)
@@ -594,8 +594,8 @@ def test_more_key_frames_are_met_exactly_and_joined_without_overshoot():
 @pytest.mark.parametrize(
     ("tissue", "moduli"),
     [
-        ({"anterior": TISSUE["anterior"]}, {"anterior": 6.23, "posterior": 2.09}),
-        (TISSUE, {"anterior": 6.23}),
+        ({"anterior": TISSUE["anterior"]}, {"E_f.anterior": 6.23, "E_f.posterior": 2.09}),
+        (TISSUE, {"E_f.anterior": 6.23}),
     ],
 )
 def test_a_region_without_tissue_or_modulus_is_named(tissue, moduli):

@@ -14,9 +14,12 @@ which is twice continuously differentiable: value, slope and curvature agree at 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from mvest.typing import FloatArray
+from mvest.errors import InputError
+from mvest.typing import BoolArray, FloatArray
 from mvest.valve.embedding import Embedding
 
 __all__ = ["Cables", "Hinge", "cable_force"]
@@ -42,6 +45,8 @@ class Cables:
     rest_length, axial_stiffness : ndarray
         ``(c,)`` mm and N.
     toe_strain : float
+    families : dict, optional
+        Name -> ``(c,)`` bool, which cables belong to it.
     """
 
     def __init__(
@@ -51,22 +56,64 @@ class Cables:
         rest_length: FloatArray,
         axial_stiffness: FloatArray,
         toe_strain: float,
+        families: dict[str, BoolArray] | None = None,
     ) -> None:
         self.patches = patches
         self.tip = tip
         self.rest_length = rest_length
         self.axial_stiffness = axial_stiffness
         self.toe_strain = toe_strain
+        tips = range(int(np.max(tip, initial=-1)) + 1)
+        self.parts = {**(families or {}), **{f"tip{k}": np.asarray(tip) == k for k in tips}}
 
-    def strain(self, x: FloatArray, tips: FloatArray, length_factor: float = 1.0) -> FloatArray:
+    def members(self, part: str) -> BoolArray:
+        """Which cables ``(c,)`` a family or papillary tip (``tip0``, ...) has; empty: all.
+
+        Raises
+        ------
+        InputError
+            If there is no such part.
+        """
+        if not part:
+            return np.ones(len(self.rest_length), dtype=np.bool_)
+        if part not in self.parts:
+            raise InputError(
+                f"no chordae {part!r}; known families and tips: {', '.join(self.parts)}"
+            )
+        return self.parts[part]
+
+    def factor(self, kind: str, values: Mapping[str, float]) -> FloatArray:
+        """Factor ``(c,)`` of each cable: the product of what is called ``kind`` or ``kind.PART``.
+
+        Parameters
+        ----------
+        kind : str
+            ``chord_stiffness`` or ``chord_rest_length``.
+        values : mapping
+            Parameter -> value; others are passed over.
+        """
+        out = np.ones(len(self.rest_length))
+        for name, value in values.items():
+            own, _, part = name.partition(".")
+            if own == kind:
+                out[self.members(part)] *= value
+        return out
+
+    def strain(
+        self, x: FloatArray, tips: FloatArray, length_factor: float | FloatArray = 1.0
+    ) -> FloatArray:
         """Cable strains ``(c,)``; negative means slack."""
         span = np.linalg.norm(self.patches(x) - tips[self.tip], axis=1)
         return span / (length_factor * self.rest_length) - 1
 
     def forces(
-        self, x: FloatArray, tips: FloatArray, stiffness_factor: float, length_factor: float
+        self,
+        x: FloatArray,
+        tips: FloatArray,
+        stiffness_factor: float | FloatArray,
+        length_factor: float | FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Force on the leaflet end, its stiffness, and its derivatives by the two factors.
+        """Force on the leaflet end, its stiffness, and its derivatives by its two factors.
 
         Returns
         -------

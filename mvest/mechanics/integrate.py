@@ -415,7 +415,12 @@ class _Stepper:
         right = np.empty((3 * system.n, len(self.parameters)))
         stresses = []
         for k, parameter in enumerate(self.parameters):
-            d_stress = system.partial_stress(parameter, state)
+            d_stress = system.partial_stress(parameter, state, old.strain, rate)
+            if parameter.kind == "damping" and not static:
+                # The law is damped by ``rate = beta / dt`` times the change of its strain.
+                d_stress = d_stress + solid.law.history_stress(
+                    state.green, region, old.strain - new.strain, 1 / dt
+                )
             if rate:
                 d_stress = d_stress + solid.law.history_stress(
                     state.green, region, old.d_strain[k], rate

@@ -29,109 +29,18 @@ nor drives rigid rotation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 
 import numba as nb
 import numpy as np
 
-from mvest.errors import MaterialError
+from mvest.errors import InputError
+from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter, known_names
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["BiotLaw", "PoissonReading", "TransverselyIsotropic"]
-
-
-class PoissonReading(Enum):
-    """How the single Poisson ratio of the paper is read.
-
-    LITERAL: the same ratio along and across the fibre. NEARLY_INCOMPRESSIBLE: the transverse ratio
-    follows from the wish that uniaxial tension along the fibre and across it keep the volume to the
-    same degree, ``nu_pp = 2 nu (1 - E_p / (2 E_f))``.
-    """
-
-    LITERAL = "A"
-    NEARLY_INCOMPRESSIBLE = "C"
-
-
-@dataclass(frozen=True, slots=True)
-class TransverselyIsotropic:
-    """Moduli of one region.
-
-    Attributes
-    ----------
-    E_f, E_p : float
-        Young's moduli along and across the fibre, MPa.
-    G : float
-        Shear modulus of planes that contain the fibre, MPa.
-    nu_fp, nu_pp : float
-        Poisson ratios: contraction across under tension along the fibre, and within the plane
-        perpendicular to it.
-
-    Raises
-    ------
-    MaterialError
-        If the elastic energy would not be positive definite (Jones 1975, Mechanics of Composite
-        Materials, section 2.4): all moduli positive, ``|nu_pp| < 1`` and
-        ``1 - nu_pp - 2 nu_fp^2 E_p / E_f > 0``.
-    """
-
-    E_f: float
-    E_p: float
-    G: float
-    nu_fp: float
-    nu_pp: float
-
-    def __post_init__(self) -> None:
-        values = {name: float(getattr(self, name)) for name in ("E_f", "E_p", "G")}
-        for name, value in values.items():
-            if not np.isfinite(value) or value <= 0:
-                raise MaterialError(f"{name} = {value} MPa, expected > 0")
-        if not abs(self.nu_pp) < 1:
-            raise MaterialError(f"nu_pp = {self.nu_pp}, expected -1 < nu_pp < 1")
-        margin = 1 - self.nu_pp - 2 * self.nu_fp**2 * self.E_p / self.E_f
-        if not margin > 0:
-            raise MaterialError(
-                f"not positive definite: 1 - nu_pp - 2 nu_fp^2 E_p/E_f = {margin:.4g}, "
-                f"expected > 0 (E_f = {self.E_f}, E_p = {self.E_p} MPa, "
-                f"nu_fp = {self.nu_fp}, nu_pp = {self.nu_pp})"
-            )
-
-    @classmethod
-    def isotropic(cls, E: float, nu: float) -> TransverselyIsotropic:
-        """Isotropic material with Young's modulus ``E`` (MPa) and Poisson ratio ``nu``."""
-        if not -1 < nu < 0.5:
-            raise MaterialError(f"nu = {nu}, expected -1 < nu < 0.5")
-        return cls(E, E, E / (2 * (1 + nu)), nu, nu)
-
-    @classmethod
-    def from_ratio(
-        cls, E_f: float, ratio: float, nu: float, reading: PoissonReading
-    ) -> TransverselyIsotropic:
-        """The paper's one-parameter family: ``E_p = E_f / ratio``, ``G = E_f / (2 (1 + nu))``."""
-        if not np.isfinite(ratio) or ratio <= 0:
-            raise MaterialError(f"E_f/E_p ratio = {ratio}, expected > 0")
-        e_p = E_f / ratio
-        literal = reading is PoissonReading.LITERAL
-        nu_pp = nu if literal else 2 * nu * (1 - e_p / (2 * E_f))
-        return cls(E_f, e_p, E_f / (2 * (1 + nu)), nu, nu_pp)
-
-    @property
-    def compliance(self) -> FloatArray:
-        """``(6, 6)`` compliance in 1/MPa (engineering shear), axis 1 along the fibre."""
-        s = np.zeros((6, 6))
-        s[0, 0] = 1 / self.E_f
-        s[1, 1] = s[2, 2] = 1 / self.E_p
-        s[0, 1] = s[1, 0] = s[0, 2] = s[2, 0] = -self.nu_fp / self.E_f
-        s[1, 2] = s[2, 1] = -self.nu_pp / self.E_p
-        s[3, 3] = 2 * (1 + self.nu_pp) / self.E_p
-        s[4, 4] = s[5, 5] = 1 / self.G
-        return s
-
-    @property
-    def stiffness(self) -> FloatArray:
-        """``(6, 6)`` stiffness C in MPa, the inverse of the compliance, symmetrised."""
-        c = np.linalg.inv(self.compliance)
-        return 0.5 * (c + c.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,14 +53,35 @@ class BiotLaw:
     ----------
     stiffness : ndarray
         ``(n_regions, 6, 6)`` MPa.
+    moduli : tuple of LeafletModuli
+        What the stiffness was made of, one per region; empty where it is only known itself, and
+        has a scale E_f but no ratio and no G to differentiate by.
     """
 
     stiffness: FloatArray
+    moduli: tuple[LeafletModuli, ...] = ()
 
     @classmethod
-    def of(cls, materials: tuple[TransverselyIsotropic, ...]) -> BiotLaw:
+    def of(cls, materials: Sequence[TransverselyIsotropic]) -> BiotLaw:
         """The law with one material per region."""
         return cls(np.ascontiguousarray([m.stiffness for m in materials]))
+
+    @classmethod
+    def of_moduli(cls, moduli: Sequence[LeafletModuli]) -> BiotLaw:
+        """The law with the moduli of each region.
+
+        Raises
+        ------
+        MaterialError
+            If some are inadmissible.
+        """
+        law = cls.of([m.material for m in moduli])
+        return cls(law.stiffness, tuple(moduli))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        return ("E_f", "ratio", "G")
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Biot strain ``(e, q, 6)`` of Green-Lagrange strain ``(e, q, 6)``, both engineering."""
@@ -175,9 +105,49 @@ class BiotLaw:
         """
         return _response(green, region, self.stiffness, previous, rate)
 
-    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
-        """``dS / d(log E_f)`` of region ``which``: S there, since S is linear in the scale of C."""
-        return np.where((region == which)[:, None, None], stress, 0.0)
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """Derivative of S ``(e, q, 6)`` by a parameter of region ``which``, at fixed strain.
+
+        Parameters
+        ----------
+        parameter : Parameter
+        green, region, previous, rate
+            As in `response`.
+        which : int
+            Index of the parameter's region.
+        stress : ndarray
+            ``(e, q, 6)`` what `response` has given.
+
+        Raises
+        ------
+        InputError
+            If the law does not know the parameter.
+        """
+        if parameter.kind not in self.kinds:
+            raise InputError(
+                f"parameter {parameter.name!r}: the law of the leaflets knows "
+                f"{known_names(self.kinds)}"
+            )
+        here = region == which
+        if parameter.kind == "E_f" and (not self.moduli or self.moduli[which].G is None):
+            # All moduli follow E_f: S is linear in the scale of C.
+            return np.where(here[:, None, None], stress, 0.0) / parameter.value
+        if not self.moduli:
+            raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
+        out = np.zeros_like(stress)
+        by = self.moduli[which].stiffness_by(parameter.kind)
+        out[here] = _linear_stress(green[here], by, previous[here], rate)
+        return out
 
     def history_stress(
         self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
@@ -364,6 +334,31 @@ def _response(
                     tangent[e, p, i, j] = value
                     tangent[e, p, j, i] = value
     return stress, tangent
+
+
+@nb.njit(cache=True)
+def _linear_stress(
+    green: FloatArray, stiffness: FloatArray, previous: FloatArray, rate: float
+) -> FloatArray:
+    """``L^T C (eps + rate (eps - eps_n))`` with one C ``(6, 6)`` for all points."""
+    n_e, n_q, _ = green.shape
+    out = np.zeros((n_e, n_q, 6))
+    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    big_l, du, eps = np.empty((6, 6)), np.empty((6, 3, 3)), np.empty(6)
+    for e in range(n_e):
+        for p in range(n_q):
+            _stretch(green[e, p], q, lam, u)
+            _voigt_biot(u, eps)
+            _linear_map(q, lam, big_l, du)
+            for i in range(6):
+                eps[i] = (1.0 + rate) * eps[i] - rate * previous[e, p, i]
+            for j in range(6):
+                t = 0.0
+                for k in range(6):
+                    t += stiffness[j, k] * eps[k]
+                for i in range(6):
+                    out[e, p, i] += big_l[j, i] * t
+    return out
 
 
 @nb.njit(cache=True)

@@ -8,10 +8,17 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.contact import ContactSettings
-from mvest.mechanics.law import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.field import ModulusField
+from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
-__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings"]
+__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings", "smooth_step"]
+
+
+def smooth_step(u: float) -> float:
+    """Quintic from 0 at ``u <= 0`` to 1 at ``u >= 1`` whose first two derivatives vanish there."""
+    u = min(max(u, 0.0), 1.0)
+    return u**3 * (10 - 15 * u + 6 * u * u)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,11 +46,20 @@ class TissueSettings:
                 f"Poisson reading = {self.reading!r}, expected one of {', '.join(known)}"
             )
 
+    def moduli(
+        self, E_f: float, ratio: float | None = None, G: float | None = None
+    ) -> LeafletModuli:
+        """The moduli with ``E_f`` (MPa) along the fibre.
+
+        ``ratio`` replaces that of the tissue; ``G`` (MPa) is the shear modulus where it does not
+        follow ``E_f``.
+        """
+        own = self.ratio if ratio is None else ratio
+        return LeafletModuli(E_f, own, self.nu, PoissonReading(self.reading), G)
+
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""
-        return TransverselyIsotropic.from_ratio(
-            E_f, self.ratio, self.nu, PoissonReading(self.reading)
-        )
+        return self.moduli(E_f).material
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +114,7 @@ class ClosureProtocol:
 
     def phase(self, t: float) -> float:
         """Share of the closure at time ``t``: quintic smooth step over the ramp."""
-        u = min(max(t / self.ramp, 0.0), 1.0)
-        return u**3 * (10 - 15 * u + 6 * u * u)
+        return smooth_step(t / self.ramp)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +136,9 @@ class MechanicsSettings:
     patch_radius : float
         mm over which a chord is spread at its insertion.
     solver : str
+    fields : dict
+        Region name -> :class:`mvest.mechanics.field.ModulusField`, where the modulus varies within
+        it; the coefficients ``field.REGION.K`` that are given no value are 0.
     """
 
     tissue: dict[str, TissueSettings]
@@ -133,6 +151,7 @@ class MechanicsSettings:
     support_stiffness: float = 50.0
     patch_radius: float = 2.0
     solver: str = "auto"
+    fields: dict[str, ModulusField] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("density", "support_stiffness", "patch_radius"):

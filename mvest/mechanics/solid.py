@@ -28,6 +28,7 @@ import numpy as np
 
 from mvest.elements import Element
 from mvest.errors import InputError
+from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh import SolidMesh
 
@@ -49,8 +50,26 @@ class Law(Protocol):
     ) -> tuple[FloatArray, FloatArray]:
         """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
 
-    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
-        """Derivative of the stress with respect to log E_f of a region."""
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of parameter (:data:`mvest.mechanics.parameters.KINDS`) that it knows."""
+
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """Derivative of the stress ``(e, q, 6)`` by a parameter of region ``which``.
+
+        At fixed strain; ``stress`` is what `response` has given with the same arguments, of which
+        the derivative is often a multiple. InputError if the parameter is none of `kinds`.
+        """
 
     def history_stress(
         self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float

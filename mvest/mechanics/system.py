@@ -7,7 +7,6 @@ and mass-proportional damping. The tangent is dr/dx, exact in every term.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,14 +23,12 @@ from mvest.mechanics.assembly import (
 )
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact, ContactPairs
+from mvest.mechanics.parameters import Parameter, Part, kind_of
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["FACTORS", "Evaluation", "Factors", "Loads", "Parameter", "System"]
-
-FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
-"""Parameters of the whole valve, besides the moduli of its regions."""
+__all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
 
 CONTACT_MARGIN = 0.12
 """A pair of elements enters the sparsity pattern this share of its reach before it touches."""
@@ -64,36 +61,20 @@ class Loads:
     body_force: FloatArray | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Factors:
-    """Factors on the nominal loads and chordae, all 1 by default."""
+    """Factors on the nominal loads and chordae, all 1 by default.
 
-    pressure: float = 1.0
-    chord_stiffness: float = 1.0
-    chord_rest_length: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One parameter to differentiate by: its name and its current value.
-
-    Names are ``E_f.REGION`` (MPa; the region's other moduli follow in proportion),
-    ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length`` (factors). A further parameter
-    is one entry in ``PARTIAL_DERIVATIVES``.
+    Attributes
+    ----------
+    pressure : float
+    chord_stiffness, chord_rest_length : float or ndarray
+        For all chordae, or ``(c,)`` for each.
     """
 
-    name: str
-    value: float
-
-    @property
-    def kind(self) -> str:
-        """The name without the region."""
-        return self.name.partition(".")[0]
-
-    @property
-    def region(self) -> str:
-        """The region, empty for parameters of the whole valve."""
-        return self.name.partition(".")[2]
+    pressure: float = 1.0
+    chord_stiffness: float | FloatArray = 1.0
+    chord_rest_length: float | FloatArray = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -286,57 +267,55 @@ class System:
         return self.pattern.matrix(blocks)
 
     # -- partial derivatives ----------------------------------------------------------------------
-    def partial_stress(self, parameter: Parameter, state: SolidState) -> FloatArray:
-        """Partial derivative of the stress ``(e, q, 6)`` by the parameter, at fixed strain."""
-        if parameter.kind != "E_f":
+    def partial_stress(
+        self, parameter: Parameter, state: SolidState, previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Partial derivative of the stress ``(e, q, 6)`` by the parameter, at fixed strain.
+
+        Parameters
+        ----------
+        parameter : Parameter
+        state : SolidState
+        previous, rate
+            Those that ``state`` was evaluated with.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter, or none of this body.
+        """
+        if kind_of(parameter.name).part not in (Part.REGION, Part.MODE):
             return np.zeros_like(state.stress)
-        names = self.solid.mesh.region_names
+        mesh, names = self.solid.mesh, self.solid.mesh.region_names
         if parameter.region not in names:
             raise InputError(
                 f"parameter {parameter.name!r}: unknown region; the mesh has {', '.join(names)}"
             )
-        which = names.index(parameter.region)
-        by_log = self.solid.law.stress_of_region(state.stress, self.solid.mesh.region, which)
-        return by_log / parameter.value
+        return self.solid.law.partial_stress(
+            parameter,
+            state.green,
+            mesh.region,
+            previous,
+            rate,
+            which=names.index(parameter.region),
+            stress=state.stress,
+        )
 
     def partial_load(self, parameter: Parameter, x: FloatArray, loads: Loads) -> FloatArray:
         """Partial derivative ``(n, 3)`` of the residual by the parameter, solid's part excluded."""
-        try:
-            derivative = PARTIAL_DERIVATIVES[parameter.kind]
-        except KeyError:
-            raise InputError(
-                f"unknown parameter {parameter.name!r}; known: E_f.REGION, "
-                + ", ".join(k for k in PARTIAL_DERIVATIVES if k != "E_f")
-            ) from None
-        return derivative(self, x, loads)
-
-
-def _none(system: System, x: FloatArray, loads: Loads) -> FloatArray:
-    return np.zeros((system.n, 3))
-
-
-def _by_pressure(system: System, x: FloatArray, loads: Loads) -> FloatArray:
-    out = np.zeros((system.n, 3))
-    if system.pressure is not None:
-        add_forces(out, system.pressure.faces, -loads.pressure * system.pressure.forces(x))
-    return out
-
-
-def _by_cables(index: int) -> Callable[[System, FloatArray, Loads], FloatArray]:
-    def derivative(system: System, x: FloatArray, loads: Loads) -> FloatArray:
-        out = np.zeros((system.n, 3))
-        if system.cables is not None:
-            force = system._cable_forces(system.cables, x, loads)[index]
-            patches = system.cables.patches
-            add_forces(out, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
+        kind_of(parameter.name)
+        out = np.zeros((self.n, 3))
+        if parameter.kind == "pressure_scale" and self.pressure is not None:
+            add_forces(out, self.pressure.faces, -loads.pressure * self.pressure.forces(x))
+        elif parameter.kind in ("chord_stiffness", "chord_rest_length") and self.cables is not None:
+            _, _, by_stiffness, by_length = self._cable_forces(self.cables, x, loads)
+            stiffness = parameter.kind == "chord_stiffness"
+            force = by_stiffness if stiffness else by_length
+            factors = self.factors
+            own = factors.chord_stiffness if stiffness else factors.chord_rest_length
+            # A chord's factor is a product: its derivative by one factor is the product over it.
+            share = own * self.cables.members(parameter.part) / parameter.value
+            patches = self.cables.patches
+            weights = patches.weights * share[:, None]
+            add_forces(out, patches.nodes, weights[:, :, None] * force[:, None, :])
         return out
-
-    return derivative
-
-
-PARTIAL_DERIVATIVES: dict[str, Callable[[System, FloatArray, Loads], FloatArray]] = {
-    "E_f": _none,
-    "pressure_scale": _by_pressure,
-    "chord_stiffness": _by_cables(2),
-    "chord_rest_length": _by_cables(3),
-}

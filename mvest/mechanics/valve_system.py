@@ -6,18 +6,21 @@ loads, contact and observations in every mesh.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact
+from mvest.mechanics.field import FieldBasis, FieldLaw, basis_at_quadrature
 from mvest.mechanics.law import BiotLaw
+from mvest.mechanics.parameters import check_names
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.settings import MechanicsSettings
-from mvest.mechanics.solid import Solid
+from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa
@@ -25,7 +28,31 @@ from mvest.valve.anatomy import Valve
 from mvest.valve.embedding import Embedding, embed
 from mvest.valve.mesh import SolidMesh
 
-__all__ = ["HeldState", "boundary_loading", "build_system", "held_loading", "material_law"]
+__all__ = [
+    "HeldState",
+    "Pacing",
+    "boundary_loading",
+    "build_system",
+    "check_parameters",
+    "factors_of",
+    "field_modes",
+    "held_loading",
+    "material_law",
+    "retune",
+]
+
+
+class Pacing(Protocol):
+    """How pressure and the motion of the boundary run in time."""
+
+    @property
+    def pressure_mmHg(self) -> float:
+        """Peak transmitral pressure."""
+        ...
+
+    def phase(self, t: float, /) -> float:
+        """Share of the closure at time ``t`` (s), from 0 (open) to 1 (closed)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +77,7 @@ def build_system(
     contact_valve: Valve,
     mesh: SolidMesh,
     settings: MechanicsSettings,
-    moduli: dict[str, float],
-    factors: Factors | None = None,
+    values: Mapping[str, float],
 ) -> System:
     """A system of the valve in the given mesh.
 
@@ -63,20 +89,31 @@ def build_system(
         The same valve in the resolution at which contact is sampled.
     mesh : SolidMesh
     settings : MechanicsSettings
-    moduli : dict
-        Region -> E_f, MPa.
-    factors : Factors, optional
+    values : mapping
+        Parameter (:data:`mvest.mechanics.parameters.KINDS`) -> value, at least the modulus of each
+        region.
+
+    Raises
+    ------
+    InputError
+        If a region has no tissue or no modulus, or there is no such parameter.
+    MaterialError
+        If a modulus is inadmissible.
     """
-    solid = Solid(mesh, material_law(mesh, settings, moduli), density=settings.density)
+    check_parameters(values, valve, settings)
+    chordae = valve.chordae
+    modes = field_modes(valve, mesh, settings)
+    law = material_law(mesh, settings, values, modes)
+    solid = Solid(mesh, law, density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
-    chordae = valve.chordae
     cables = Cables(
         _patches(midpoints, contact_valve, settings.patch_radius, chordae.insertion),
         chordae.tip,
         chordae.rest_length,
         chordae.axial_stiffness,
         chordae.toe_strain,
+        {name: chordae.family == k for k, name in enumerate(chordae.family_names)},
     )
     contact = Contact(
         midpoints,
@@ -92,29 +129,90 @@ def build_system(
         cables=cables,
         contact=contact,
         hinge=_support(mesh, contact_valve, settings),
-        factors=factors,
+        factors=factors_of(cables, values),
     )
 
 
-def material_law(mesh: SolidMesh, settings: MechanicsSettings, moduli: dict[str, float]) -> BiotLaw:
-    """The law of the mesh with one modulus E_f (MPa) per region.
+def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSettings) -> None:
+    """Refuse names that are no parameters of this valve under these settings; InputError."""
+    tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
+    modes = {region: own.modes for region, own in settings.fields.items()}
+    check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips], modes)
+
+
+def material_law(
+    mesh: SolidMesh,
+    settings: MechanicsSettings,
+    values: Mapping[str, float],
+    modes: Mapping[str, FloatArray] | None = None,
+) -> Law:
+    """The law of the mesh.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    settings : MechanicsSettings
+    values : mapping
+        Parameter -> value: ``E_f.REGION`` of each region, and any of the others; those that are no
+        parameters of tissue are passed over.
+    modes : mapping, optional
+        Of the settings' fields, from `field_modes`.
 
     Raises
     ------
     InputError
-        If a region has no tissue or no modulus.
+        If a region has no tissue or no modulus, or a value is of another region.
     MaterialError
         If a modulus is inadmissible.
     """
-    materials = []
+    moduli = []
     for region in mesh.region_names:
-        if region not in settings.tissue or region not in moduli:
+        if region not in settings.tissue or f"E_f.{region}" not in values:
             raise InputError(
                 f"region {region!r} of the mesh has no tissue or modulus; given are "
-                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(moduli))}"
+                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
             )
-        materials.append(settings.tissue[region].material(moduli[region]))
-    return BiotLaw.of(tuple(materials))
+        moduli.append(
+            settings.tissue[region].moduli(
+                values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
+            )
+        )
+    law = BiotLaw.of_moduli(moduli)
+    if not modes:
+        return law
+    coefficients = {
+        region: np.array([values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])])
+        for region, own in modes.items()
+    }
+    return FieldLaw(law, modes, coefficients)
+
+
+def field_modes(
+    valve: Valve, mesh: SolidMesh, settings: MechanicsSettings
+) -> dict[str, FloatArray]:
+    """Region -> modes ``(e, q, k)`` of its field at the quadrature points of the mesh."""
+    return {
+        region: basis_at_quadrature(mesh, region, FieldBasis.of(valve.surface, region, own))
+        for region, own in settings.fields.items()
+    }
+
+
+def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
+    """Give a system of a valve other values of its parameters; see `build_system`."""
+    assert system.cables is not None
+    old = system.solid.law
+    modes = old.modes if isinstance(old, FieldLaw) else None
+    law = material_law(system.solid.mesh, settings, values, modes)
+    system.retune(law, factors_of(system.cables, values))
+
+
+def factors_of(cables: Cables, values: Mapping[str, float]) -> Factors:
+    """The factors on pressure and cables among the values; InputError if a part is unknown."""
+    return Factors(
+        values.get("pressure_scale", 1.0),
+        cables.factor("chord_stiffness", values),
+        cables.factor("chord_rest_length", values),
+    )
 
 
 def _patches(points: Embedding, valve: Valve, radius: float, insertion: FloatArray) -> Embedding:
@@ -161,10 +259,14 @@ def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hing
 
 
 def boundary_loading(
-    system: System, valve: Valve, contact_valve: Valve, settings: MechanicsSettings
+    system: System,
+    valve: Valve,
+    contact_valve: Valve,
+    settings: MechanicsSettings,
+    pacing: Pacing | None = None,
 ) -> Callable[[float], Loads]:
-    """Time -> loads: pressure, annulus and papillary tips of the protocol."""
-    protocol = settings.protocol
+    """Time -> loads: pressure, annulus and papillary tips of ``pacing`` (default: the closure)."""
+    protocol: Pacing = settings.protocol if pacing is None else pacing
     assert system.hinge is not None
     start = system.hinge.points(system.solid.mesh.nodes)
     motion = contact_valve.motion

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mvest.cases.case import Role, ValveCase
 from mvest.errors import GeometryError, InputError
-from mvest.mechanics.system import FACTORS
+from mvest.mechanics.valve_system import check_parameters
 from mvest.model import ClosureModel
 from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
 from mvest.registration import REGISTRATION
@@ -88,18 +88,18 @@ def _mechanical(settings: PersonaliseSettings) -> list[Unknown]:
 
 def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
     mechanical = _mechanical(settings)
-    strange = [u.name for u in mechanical if not u.is_modulus and u.name not in FACTORS]
-    if strange:
-        raise InputError(
-            f"unknowns {', '.join(strange)}; expected E_f.REGION, {', '.join(FACTORS)} or some of "
-            f"{', '.join(REGISTRATION)}"
-        )
-    needed = {f"E_f.{region}" for region in case.surface.region_names}
+    regions = case.surface.region_names
+    others = [u.name for u in mechanical if not u.is_modulus]
+    try:
+        check_parameters(others, case.valve, settings.mechanics)
+    except InputError as error:
+        raise InputError(f"unknowns: {error}; or some of {', '.join(REGISTRATION)}") from error
+    needed = {f"E_f.{region}" for region in regions}
     given = {u.name for u in mechanical if u.is_modulus}
     if given != needed:
         raise InputError(
             f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
-            f"{', '.join(case.surface.region_names)}: expected {', '.join(sorted(needed))}, or "
+            f"{', '.join(regions)}: expected {', '.join(sorted(needed))}, or "
             "leaflets named as the unknowns are"
         )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation import IteratedFilter
+from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.registration import REGISTRATION
 
@@ -30,8 +31,8 @@ class Unknown:
     Attributes
     ----------
     name : str
-        ``E_f.REGION`` (MPa), ``pressure_scale``, ``chord_stiffness``, ``chord_rest_length``
-        (factors), ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
+        One of the mechanics' (:data:`mvest.mechanics.parameters.KINDS`): ``E_f.REGION`` (MPa),
+        ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
     mean, std : float
         Prior in the same unit.
     treatment : Treatment
@@ -59,7 +60,7 @@ class Unknown:
     @property
     def is_positive(self) -> bool:
         """Whether it is estimated by its logarithm."""
-        return self.name not in REGISTRATION
+        return self.name not in REGISTRATION and is_positive(self.name)
 
 
 @dataclass(frozen=True, slots=True)

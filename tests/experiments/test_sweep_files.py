@@ -181,7 +181,7 @@ def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> No
         ("repeats=0", "repeats = 0"),
         ("truth.reading=Z", "expected one of A, C"),
         ("+truth.ratio.septal=1.0", "region 'septal'"),
-        ("+truth.fixed.presure_scale=1.1", "presure_scale; known: pressure_scale"),
+        ("+truth.fixed.presure_scale=1.1", "truth.fixed: unknown parameter 'presure_scale'"),
         ("observation.noise_mm=-1", "noise of -1.0 mm"),
         ("observation.correlated_mm=-1", "noise of -1.0 mm"),
         ("observation.dropout_mm=-1", "drop-out within -1.0 mm"),

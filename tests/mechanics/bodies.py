@@ -128,7 +128,10 @@ def sandwich(
     system = System(
         Solid(mesh, law),
         pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
-        cables=Cables(ends, np.array([0, 1]), np.array([9.3, 7.9]), np.array([0.4, 0.3]), 0.03),
+        cables=Cables(
+            ends, np.array([0, 1]), np.array([9.3, 7.9]), np.array([0.4, 0.3]), 0.03,
+            {"left": np.array([True, False]), "right": np.array([False, True])},
+        ),
         contact=Contact(
             embedded, points, areas, np.ones(len(points)),
             np.concatenate([triangles, triangles + len(plane)]), ContactSettings(0.004),

@@ -87,7 +87,13 @@ def test_sensitivities_do_not_change_the_run_and_have_their_shape():
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("E_f.middle", "unknown region.*lower, upper"), ("viscosity", "known: E_f.REGION, pressure")],
+    [
+        ("E_f.middle", "unknown region.*lower, upper"),
+        ("viscosity", "known: E_f.REGION, ratio.REGION"),
+        ("chord_stiffness.strut", "no chordae 'strut'; known .*left, right, tip0, tip1"),
+        ("E_f", "unknown parameter 'E_f'"),
+        ("pressure_scale.lower", "unknown parameter 'pressure_scale.lower'"),
+    ],
 )
 def test_an_unknown_parameter_names_the_known_ones(name, message):
     with pytest.raises(InputError, match=message):

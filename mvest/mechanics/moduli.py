@@ -1,0 +1,180 @@
+r"""The moduli of a leaflet: as they are, and as functions of what is estimated.
+
+The elastic moduli of one region follow from E_f, the ratio E_f / E_perp and, where it does not
+follow E_f, the shear modulus G. With the compliance s (:attr:`TransverselyIsotropic.compliance`)
+and C its inverse,
+
+.. math:: dC/dp = -C \, (ds/dp) \, C .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.typing import FloatArray
+
+__all__ = ["LeafletModuli", "PoissonReading", "TransverselyIsotropic"]
+
+
+class PoissonReading(Enum):
+    """How the single Poisson ratio of the paper is read.
+
+    LITERAL: the same ratio along and across the fibre. NEARLY_INCOMPRESSIBLE: the transverse ratio
+    follows from the wish that uniaxial tension along the fibre and across it keep the volume to the
+    same degree, ``nu_pp = 2 nu (1 - E_p / (2 E_f))``.
+    """
+
+    LITERAL = "A"
+    NEARLY_INCOMPRESSIBLE = "C"
+
+
+@dataclass(frozen=True, slots=True)
+class TransverselyIsotropic:
+    """Moduli of one region.
+
+    Attributes
+    ----------
+    E_f, E_p : float
+        Young's moduli along and across the fibre, MPa.
+    G : float
+        Shear modulus of planes that contain the fibre, MPa.
+    nu_fp, nu_pp : float
+        Poisson ratios: contraction across under tension along the fibre, and within the plane
+        perpendicular to it.
+
+    Raises
+    ------
+    MaterialError
+        If the elastic energy would not be positive definite (Jones 1975, Mechanics of Composite
+        Materials, section 2.4): all moduli positive, ``|nu_pp| < 1`` and
+        ``1 - nu_pp - 2 nu_fp^2 E_p / E_f > 0``.
+    """
+
+    E_f: float
+    E_p: float
+    G: float
+    nu_fp: float
+    nu_pp: float
+
+    def __post_init__(self) -> None:
+        values = {name: float(getattr(self, name)) for name in ("E_f", "E_p", "G")}
+        for name, value in values.items():
+            if not np.isfinite(value) or value <= 0:
+                raise MaterialError(f"{name} = {value} MPa, expected > 0")
+        if not abs(self.nu_pp) < 1:
+            raise MaterialError(f"nu_pp = {self.nu_pp}, expected -1 < nu_pp < 1")
+        margin = 1 - self.nu_pp - 2 * self.nu_fp**2 * self.E_p / self.E_f
+        if not margin > 0:
+            raise MaterialError(
+                f"not positive definite: 1 - nu_pp - 2 nu_fp^2 E_p/E_f = {margin:.4g}, "
+                f"expected > 0 (E_f = {self.E_f}, E_p = {self.E_p} MPa, "
+                f"nu_fp = {self.nu_fp}, nu_pp = {self.nu_pp})"
+            )
+
+    @classmethod
+    def isotropic(cls, E: float, nu: float) -> TransverselyIsotropic:
+        """Isotropic material with Young's modulus ``E`` (MPa) and Poisson ratio ``nu``."""
+        if not -1 < nu < 0.5:
+            raise MaterialError(f"nu = {nu}, expected -1 < nu < 0.5")
+        return cls(E, E, E / (2 * (1 + nu)), nu, nu)
+
+    @classmethod
+    def from_ratio(
+        cls, E_f: float, ratio: float, nu: float, reading: PoissonReading
+    ) -> TransverselyIsotropic:
+        """The paper's one-parameter family: ``E_p = E_f / ratio``, ``G = E_f / (2 (1 + nu))``."""
+        if not np.isfinite(ratio) or ratio <= 0:
+            raise MaterialError(f"E_f/E_p ratio = {ratio}, expected > 0")
+        e_p = E_f / ratio
+        literal = reading is PoissonReading.LITERAL
+        nu_pp = nu if literal else 2 * nu * (1 - e_p / (2 * E_f))
+        return cls(E_f, e_p, E_f / (2 * (1 + nu)), nu, nu_pp)
+
+    @property
+    def compliance(self) -> FloatArray:
+        """``(6, 6)`` compliance in 1/MPa (engineering shear), axis 1 along the fibre."""
+        s = np.zeros((6, 6))
+        s[0, 0] = 1 / self.E_f
+        s[1, 1] = s[2, 2] = 1 / self.E_p
+        s[0, 1] = s[1, 0] = s[0, 2] = s[2, 0] = -self.nu_fp / self.E_f
+        s[1, 2] = s[2, 1] = -self.nu_pp / self.E_p
+        s[3, 3] = 2 * (1 + self.nu_pp) / self.E_p
+        s[4, 4] = s[5, 5] = 1 / self.G
+        return s
+
+    @property
+    def stiffness(self) -> FloatArray:
+        """``(6, 6)`` stiffness C in MPa, the inverse of the compliance, symmetrised."""
+        c = np.linalg.inv(self.compliance)
+        return 0.5 * (c + c.T)
+
+
+@dataclass(frozen=True, slots=True)
+class LeafletModuli:
+    """What the moduli of one region are made of.
+
+    Attributes
+    ----------
+    E_f : float
+        MPa.
+    ratio : float
+        E_f over E_perp.
+    nu : float
+        Poisson ratio of the paper.
+    reading : PoissonReading
+    G : float or None
+        MPa; None where it follows E_f, ``G = E_f / (2 (1 + nu))``.
+    """
+
+    E_f: float
+    ratio: float
+    nu: float
+    reading: PoissonReading
+    G: float | None = None
+
+    @property
+    def material(self) -> TransverselyIsotropic:
+        """The moduli themselves; MaterialError if they are inadmissible."""
+        family = TransverselyIsotropic.from_ratio(self.E_f, self.ratio, self.nu, self.reading)
+        if self.G is None:
+            return family
+        return TransverselyIsotropic(family.E_f, family.E_p, self.G, family.nu_fp, family.nu_pp)
+
+    def stiffness_by(self, kind: str) -> FloatArray:
+        """Derivative ``(6, 6)`` of the stiffness by ``E_f``, ``ratio`` or ``G``.
+
+        Raises
+        ------
+        InputError
+            If ``kind`` is none of them, or G follows E_f.
+        """
+        c = self.material.stiffness
+        return -c @ self._compliance_by(kind) @ c
+
+    def _compliance_by(self, kind: str) -> FloatArray:
+        material = self.material
+        if kind == "E_f":
+            out = -material.compliance / self.E_f
+            if self.G is not None:
+                out[4, 4] = out[5, 5] = 0.0
+            return out
+        out = np.zeros((6, 6))
+        if kind == "ratio":
+            # E_perp = E_f / ratio; the transverse Poisson ratio of reading C depends on it too.
+            literal = self.reading is PoissonReading.LITERAL
+            by_nu = 0.0 if literal else self.nu / self.ratio**2
+            cross = material.nu_pp + self.ratio * by_nu
+            out[1, 1] = out[2, 2] = 1 / self.E_f
+            out[1, 2] = out[2, 1] = -cross / self.E_f
+            out[3, 3] = 2 * (1 + cross) / self.E_f
+        elif kind == "G" and self.G is not None:
+            out[4, 4] = out[5, 5] = -1 / self.G**2
+        elif kind == "G":
+            raise InputError("G follows E_f here; expected a value of G beside that of E_f")
+        else:
+            raise InputError(f"parameter {kind!r} of a leaflet's moduli; known: E_f, ratio, G")
+        return out
