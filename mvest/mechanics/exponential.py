@@ -36,16 +36,17 @@ Green-Lagrange strain and so leaves rigid rotation alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
-from typing import ClassVar
 
 import numba as nb
 import numpy as np
 
 from mvest.errors import InputError, MaterialError
+from mvest.mechanics.parameters import Parameter, known_names
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["ExponentialLaw", "ExponentialTissue"]
+__all__ = ["EXPONENTIAL_KINDS", "ExponentialLaw", "ExponentialTissue"]
 
 LARGEST_EXPONENT = 12.0
 """Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
@@ -99,7 +100,8 @@ class ExponentialTissue:
                 )
 
 
-KINDS = ("c0", "c1", "c2", "mu", "kappa")
+EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
+"""Coefficients that may be parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,12 +117,16 @@ class ExponentialLaw:
     """
 
     coefficients: FloatArray
-    kinds: ClassVar[tuple[str, ...]] = KINDS
 
     @classmethod
-    def of(cls, tissues: tuple[ExponentialTissue, ...]) -> ExponentialLaw:
+    def of(cls, tissues: Sequence[ExponentialTissue]) -> ExponentialLaw:
         """The law with one tissue per region."""
         return cls(np.array([astuple(tissue) for tissue in tissues], dtype=np.float64))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        return EXPONENTIAL_KINDS
 
     def strain(self, green: FloatArray) -> FloatArray:
         """The Green-Lagrange strain ``(e, q, 6)`` itself is what is damped."""
@@ -158,18 +164,32 @@ class ExponentialLaw:
         return stress, tangent
 
     def partial_stress(
-        self, kind: str, which: int, green: FloatArray, region: IntArray
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
     ) -> FloatArray:
-        """``dS / d(coefficient)`` ``(e, q, 6)`` at fixed strain, of one kind in region ``which``.
+        """Derivative of S ``(e, q, 6)`` by a coefficient of region ``which``, at fixed strain.
+
+        Damping has no part in it. The arguments are those of
+        :meth:`mvest.mechanics.law.BiotLaw.partial_stress`.
 
         Raises
         ------
         InputError
-            If the law has no such coefficient.
+            If the law does not know the parameter.
         """
-        if kind not in KINDS:
-            raise InputError(f"the exponential law has no {kind!r}; it has {', '.join(KINDS)}")
-        return _partial_stress(green, region, self.coefficients, KINDS.index(kind), which)
+        if parameter.kind not in self.kinds:
+            raise InputError(
+                f"parameter {parameter.name!r}: the exponential law knows {known_names(self.kinds)}"
+            )
+        kind = EXPONENTIAL_KINDS.index(parameter.kind)
+        return _partial_stress(green, region, self.coefficients, kind, which)
 
     def history_stress(
         self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float

@@ -11,6 +11,7 @@ from mvest.mechanics.biaxial import biaxial_stress
 from mvest.mechanics.exponential import LARGEST_EXPONENT, ExponentialLaw, ExponentialTissue
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
@@ -79,7 +80,7 @@ def test_derivatives_by_the_coefficients(kind, which):
         tissues[which] = replace(TISSUES[which], **{kind: value * (1 + relative)})
         return stress(ExponentialLaw.of(tuple(tissues)))
 
-    exact = LAW.partial_stress(kind, which, GREEN, REGION)
+    exact = by_parameter(f"{kind}.leaflet", which)
     difference = fourth_order(at, 4e-3) / value
     np.testing.assert_allclose(difference, exact, atol=1e-8 * np.abs(exact).max())
     assert np.all(exact[which != REGION] == 0)
@@ -87,9 +88,15 @@ def test_derivatives_by_the_coefficients(kind, which):
     assert np.abs(exact).max(axis=-1)[taut].min() > 0
 
 
+def by_parameter(name, which):
+    return LAW.partial_stress(
+        Parameter(name, 1.0), GREEN, REGION, PREVIOUS, 0.7, which=which, stress=NONE
+    )
+
+
 def test_an_unknown_coefficient_is_refused():
-    with pytest.raises(InputError, match="no 'E_f'; it has c0, c1, c2, mu, kappa"):
-        LAW.partial_stress("E_f", 0, GREEN, REGION)
+    with pytest.raises(InputError, match=r"knows c0\.REGION, c1\.REGION, .* kappa"):
+        by_parameter("E_f.leaflet", 0)
 
 
 # -- limits ----------------------------------------------------------------------------------------
