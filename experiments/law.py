@@ -117,7 +117,7 @@ def _fit(
     """What one law makes of the observation."""
     nothing = [None] * len(result.parameters)
     bound, filtered = result.identifiability, result.filtered
-    columns = {
+    columns: dict[str, Any] = {
         "truth": nothing if result.truth is None else result.truth.values,
         "start": start,
         "estimate": nothing if result.estimate is None else result.estimate,

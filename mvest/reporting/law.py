@@ -82,7 +82,8 @@ def _frame(record: Record) -> pd.DataFrame:
         [
             {
                 "law": fit["law"],
-                **parameter,
+                "parameter": parameter["name"],
+                **{key: value for key, value in parameter.items() if key != "name"},
                 "distance_mean_mm": fit["distance_mm"]["mean"],
                 "distance_max_mm": fit["distance_mm"]["max"],
                 "residual_rms_mm": fit["residual_rms_mm"],
@@ -125,6 +126,8 @@ def _readable(record: Record) -> str:
             f"| {fit['law']}{ended} | {cell} | {chi} | {fit['iterations']} | {fit['seconds']:.0f} |"
         )
     band = record["chi_square_band"]
+    if band is None:
+        return "\n".join(lines)
     lines += [
         "",
         f"Data: one closed frame of a simulated valve of the exponential law, with independent "
@@ -178,7 +181,7 @@ def write_law_tables(folder: Path, record: Record) -> list[Path]:
     return [
         write_with(folder / "law.csv", lambda path: table.to_csv(path, index=False)),
         write_text(folder / "law.md", "\n\n".join(parts) + "\n"),
-        *save_figure(folder / "law", curves_figure(record), record),
+        *(save_figure(folder / "law", curves_figure(record), record) if record["curves"] else []),
         *save_figure(folder / "law_biaxial", biaxial_figure(record), record),
     ]
 
