@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from experiments.build import Twin, build_twin
 from mvest.errors import ConfigurationError
-from mvest.estimation import chi_square_band
+from mvest.estimation import Prediction, chi_square_band
 from mvest.mechanics.biaxial import biaxial_stress
 from mvest.mechanics.exponential import ExponentialLaw, ExponentialTissue
 from mvest.mechanics.parameters import kind_of
@@ -21,7 +22,14 @@ from mvest.mechanics.valve_system import material_law
 from mvest.model import ClosureModel
 from mvest.observation import Observation
 from mvest.provenance import provenance
-from mvest.study import StudyResult, Truth, TwinData, estimate, simulate_observation
+from mvest.study import (
+    SharedStart,
+    StudyResult,
+    Truth,
+    TwinData,
+    estimate,
+    simulate_observation,
+)
 from mvest.typing import FloatArray
 
 __all__ = ["run_law_study"]
@@ -43,7 +51,8 @@ def run_law_study(config: Values, config_hash: str, folder: Path, started: float
     twin, linear = build_twin(config), build_twin(_linear(config))
     record = _record(config, config_hash, twin, started)
     record["excised"] = _excised(config["law_study"]["excised"])
-    data = _observed(twin, config["seed"])
+    closed = twin.truth_model(twin.truth_values)
+    data = _observed(twin, closed, config["seed"])
     if data.observation is None or data.truth is None:
         return record | {"status": "failed", "reason": data.reason}, []
     record["stretches"] = _stretches(twin.truth_model, twin.truth_values)
@@ -59,10 +68,14 @@ def run_law_study(config: Values, config_hash: str, folder: Path, started: float
     if all(result.estimate is not None for result in fits.values()):
         models = (twin.model, linear.model)
         record["curves"] = _curves(models, fits, twin.truth_values, config["seed"])
+    record["repeats"] = _repeats(
+        twin, closed, range(config["seed"], config["seed"] + config["repeats"])
+    )
     failed = [result for result in fits.values() if not result.converged]
     if failed:
         record |= {"status": "failed", "reason": failed[0].reason, "detail": failed[0].detail}
-    record["forward_solves"] = 1 + sum(fit["forward_solves"] for fit in record["fits"])
+    solves = [fit["forward_solves"] for fit in record["fits"]]
+    record["forward_solves"] = 1 + sum(solves) + sum(r["forward_solves"] for r in record["repeats"])
     record["seconds"] = record["seconds_total"] = time.time() - started
     return record, []
 
@@ -84,10 +97,10 @@ def _linear(config: Values) -> dict[str, Any]:
     return {**config, **changes}
 
 
-def _observed(twin: Twin, seed: int) -> TwinData:
-    """The observation of the true valve."""
+def _observed(twin: Twin, closed: Prediction, seed: int) -> TwinData:
+    """An observation of the true valve."""
     return simulate_observation(
-        twin.truth_model,
+        lambda m: closed,
         twin.case.parameters,
         twin.truth_values,
         frames=twin.frames,
@@ -150,6 +163,30 @@ def _fit(
         "reason": result.reason,
         "converged": result.converged,
     }
+
+
+def _repeats(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Estimates with the exponential law from observations with other errors."""
+    start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
+    case = replace(twin.case, model=SharedStart(twin.model, start))
+    entries = []
+    for seed in seeds:
+        data = _observed(twin, closed, seed)
+        assert data.observation is not None
+        filtered = estimate(case, data.observation).filtered
+        assert filtered is not None
+        low, high = filtered.interval()
+        entries.append(
+            {
+                "seed": seed,
+                "estimate": filtered.mean.tolist(),
+                "low": low.tolist(),
+                "high": high.tolist(),
+                "converged": filtered.converged,
+                "forward_solves": filtered.forward_solves,
+            }
+        )
+    return entries
 
 
 def _curves(
@@ -230,6 +267,7 @@ def _record(config: Values, config_hash: str, twin: Twin, started: float) -> dic
         "parameters": list(config["parameters"]),
         "truth": twin.truth_values.tolist(),
         "fits": [],
+        "repeats": [],
         "curves": {},
         "stretches": {},
         "chi_square_band": None,

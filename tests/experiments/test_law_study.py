@@ -28,6 +28,7 @@ SMALL = (
     "truth.values=[0.03,0.02]",
     "filter.initial=[0.02,0.03]",
     "filter.P0=1e-3",
+    "repeats=2",
     "tracking.enabled=false",
 )
 
@@ -63,6 +64,10 @@ def test_the_study_fits_both_laws_to_the_same_data(run):
     assert [p["truth"] for p in other["parameters"]] == [None, None]
     assert [p["name"] for p in other["parameters"]] == ["E_f.anterior", "E_f.posterior"]
     assert own["distance_mm"]["mean"] < other["distance_mm"]["mean"]
+    # The first repeat is the fit itself, and the second saw other errors.
+    first, second = (r["estimate"] for r in record["repeats"])
+    assert first == pytest.approx([p["estimate"] for p in own["parameters"]], rel=1e-6)
+    assert first != second
     low, high = record["chi_square_band"]
     assert low < own["chi_square"] < high
     for curves in record["curves"].values():

@@ -29,6 +29,15 @@ RECORD = {
     "title": "Two laws",
     "noise_mm": 0.5,
     "chi_square_band": [0.97, 1.03],
+    "parameters": ["c0.anterior", "c2.anterior"],
+    "truth": [0.06, 1446.5],
+    "repeats": [
+        {"estimate": [0.058, 1300.0], "low": [0.055, 1100.0], "high": [0.0599, 1500.0],
+         "converged": True},
+        {"estimate": [0.061, 1400.0], "low": [0.057, 1200.0], "high": [0.065, 1600.0],
+         "converged": True},
+        {"estimate": [9.0, 9.0], "low": [8.0, 8.0], "high": [9.5, 9.5], "converged": False},
+    ],
     "stretches": {"anterior": {"along": [0.9, 1.0, 1.07], "across": [0.95, 1.1, 1.2]}},
     "fits": [
         {
@@ -81,6 +90,14 @@ def test_the_table_has_both_fits_and_says_which_did_not_converge():
     assert "between 0.970 and 1.030" in text
 
 
+def test_repeats_are_counted_without_those_that_gave_no_estimate():
+    # The first interval of c0 ends below the truth of 0.06.
+    text = law_text(RECORD)
+    assert "from 3 samples of the errors, of which 2 gave" in text
+    assert "| c0.anterior | 0.06 | 0.0595 | 0.058 to 0.061 | 1 of 2 |" in text
+    assert "| c2.anterior | 1.45e+03 | 1.35e+03 | 1.3e+03 to 1.4e+03 | 2 of 2 |" in text
+
+
 def test_published_files_come_out_of_the_record_again(tmp_path):
     written = publish_law(tmp_path / "results", RECORD)
     names = {path.name for path in written}
@@ -112,6 +129,7 @@ def test_the_figure_shows_truth_estimates_band_and_what_was_seen():
 def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
     record = copy.deepcopy(RECORD) | {
         "fits": [], "curves": {}, "stretches": {}, "chi_square_band": None,
+        "repeats": [],
     }  # fmt: skip
     names = {path.name for path in write_law_tables(tmp_path, record)}
     assert "law.md" in names
