@@ -35,7 +35,7 @@ def curves_figure(record: Record) -> Figure:
         stretch = np.array(curves["stretch"])
         for k, (axes, direction) in enumerate(zip(axes_of_region, DIRECTIONS, strict=True)):
             low, _, high = seen["along" if k == 0 else "across"]
-            axes.axvspan(low, high, color="0.93", label="closed valve, 5th to 95th percentile")
+            axes.axvspan(low, high, color="0.9", label="stretches in the closed valve (90 %)")
             band = [np.array(curves["exponential"][side])[:, k] for side in ("low", "high")]
             axes.fill_between(stretch, *band, color=EXPONENTIAL, alpha=0.25, linewidth=0)
             for name, colour, style, label in (
@@ -51,8 +51,14 @@ def curves_figure(record: Record) -> Figure:
             axes.grid(alpha=0.3)
             axes.spines[["top", "right"]].set_visible(False)
         axes_of_region[0].set_ylabel("nominal stress [MPa]")
-    grid[0, 0].legend(frameon=False, fontsize=7.5, loc="upper left")
-    figure.suptitle("Simulated leaflets: stress under equibiaxial stretch", fontsize=11)
+    figure.legend(
+        *grid[0, 0].get_legend_handles_labels(),
+        title="Simulated leaflets: stress under equibiaxial stretch",
+        frameon=False,
+        fontsize=8,
+        loc="outside upper center",
+        ncols=2,
+    )
     return figure
 
 
@@ -65,7 +71,7 @@ def biaxial_figure(record: Record) -> Figure:
         stress = np.array(curves["stress"])
         for k, (name, style) in enumerate((("circumferential", "-"), ("radial", "--"))):
             axes.plot(curves["stretch"], 1e3 * stress[:, k], style, color=COLOURS[k], label=name)
-        axes.set(ylim=(0, 300), xlim=(1.0, 1.3))
+        axes.set(ylim=(0, 150), xlim=(1.0, 1.3))  # kPa
         axes.set_title(f"{region} leaflet", fontsize=10)
         axes.set_xlabel("stretch in both directions")
         axes.grid(alpha=0.3)
