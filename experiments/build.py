@@ -364,7 +364,10 @@ def _require_tissue(
     for point in points:
         values = dict(zip(parameters, map(float, point), strict=True))
         for region, tissue in settings.tissue.items():
-            if f"E_f.{region}" in values:
+            if tissue.law == "exponential":
+                given = {k: f"{k}.{region}" for k in tissue.kinds if f"{k}.{region}" in values}
+                tissue.coefficients({k: values[name] for k, name in given.items()})
+            elif f"E_f.{region}" in values:
                 own = [values.get(f"{kind}.{region}") for kind in ("ratio", "G")]
                 _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
 

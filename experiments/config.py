@@ -286,6 +286,16 @@ class ModelsConfig:
 
 
 @dataclass
+class LawStudyConfig:
+    """What the study of the material law adds: the linear law's fit, and curves to draw."""
+
+    linear_parameters: list[str] = field(default_factory=list)  # E_f of each leaflet
+    linear_initial: list[float] = field(default_factory=list)  # MPa
+    linear_P0: Any = None
+    excised: dict[str, list[float]] = field(default_factory=dict)  # c0 (MPa), c1, c2
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -345,6 +355,7 @@ class Config:
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     truth: TruthConfig = field(default_factory=TruthConfig)
     donor: DonorConfig = field(default_factory=DonorConfig)
+    law_study: LawStudyConfig = field(default_factory=LawStudyConfig)
     case: str | None = None  # folder of a case
     volume: str | None = None  # file of a volume over time
     imaged: ImagedConfig = field(default_factory=ImagedConfig)

@@ -27,6 +27,7 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
+from experiments.law import run_law_study
 from experiments.models import run_models
 from experiments.patient import run_patient
 from experiments.request import Request
@@ -41,6 +42,7 @@ from mvest.reporting.external import external_text, write_external_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
+from mvest.reporting.law import law_text, publish_law, write_law_tables
 from mvest.reporting.models import models_text, publish_models, write_models_tables
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
@@ -210,6 +212,12 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "law": Study(
+        run_law_study,
+        law_text,
+        write_law_tables,
+        lambda results, _name, record, _folder: publish_law(results, record),
     ),
     "donor": Study(
         run_donor,

@@ -13,6 +13,7 @@ from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
+from mvest.reporting.law import write_law_tables
 from mvest.reporting.models import write_models_tables
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
@@ -26,6 +27,7 @@ OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
     "donor": write_donor_tables,
+    "law": write_law_tables,
     "imaging": write_imaging_study,
     "volume": write_volume_tables,
     "models": write_models_tables,

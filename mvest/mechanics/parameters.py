@@ -67,6 +67,11 @@ KINDS: dict[str, Kind] = {
     "chord_stiffness": Kind("", True, Part.CHORDS, True, "factor on the axial stiffness"),
     "chord_rest_length": Kind("", True, Part.CHORDS, True, "factor on the rest length"),
     "damping": Kind("s", True, Part.NONE, True, "stiffness-proportional part of the damping"),
+    "c0": Kind("MPa", True, Part.REGION, False, "scale of the exponential law"),
+    "c1": Kind("", True, Part.REGION, False, "its exponent of the isochoric deformation"),
+    "c2": Kind("", True, Part.REGION, False, "its exponent of the fibres' stretch"),
+    "mu": Kind("MPa", True, Part.REGION, False, "its shear modulus at rest"),
+    "kappa": Kind("MPa", True, Part.REGION, False, "its bulk modulus"),
 }
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.contact import ContactSettings
+from mvest.mechanics.exponential import EXPONENTIAL_KINDS, ExponentialTissue
 from mvest.mechanics.field import ModulusField, StiffPatch
 from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
@@ -23,7 +25,7 @@ def smooth_step(u: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TissueSettings:
-    """Material of one region apart from E_f, which is estimated.
+    """Material of one region, apart from what is estimated of it.
 
     Attributes
     ----------
@@ -33,13 +35,24 @@ class TissueSettings:
         Poisson ratio of the paper.
     reading : str
         ``A`` or ``C`` (see :class:`mvest.mechanics.law.PoissonReading`).
+    law : str
+        ``biot``, the linear law, to which all of the above belongs, or ``exponential``
+        (:mod:`mvest.mechanics.exponential`).
+    exponential : ExponentialTissue, optional
+        Coefficients of the exponential law, where they are not parameters.
     """
 
     ratio: float
     nu: float = 0.488
     reading: str = "A"
+    law: str = "biot"
+    exponential: ExponentialTissue | None = None
 
     def __post_init__(self) -> None:
+        if self.law not in ("biot", "exponential"):
+            raise InputError(f"law of a tissue = {self.law!r}, expected biot or exponential")
+        if self.law == "exponential" and self.exponential is None:
+            raise InputError("law of a tissue = 'exponential': its coefficients are missing")
         known = [reading.value for reading in PoissonReading]
         if self.reading not in known:
             raise InputError(
@@ -56,6 +69,25 @@ class TissueSettings:
         """
         own = self.ratio if ratio is None else ratio
         return LeafletModuli(E_f, own, self.nu, PoissonReading(self.reading), G)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of parameters that the tissue has."""
+        return EXPONENTIAL_KINDS if self.law == "exponential" else ("E_f", "ratio", "G")
+
+    def coefficients(self, values: Mapping[str, float]) -> ExponentialTissue:
+        """Coefficients of the exponential law, some of them (by kind) replaced.
+
+        Raises
+        ------
+        InputError
+            If the tissue has none.
+        MaterialError
+            If some are inadmissible.
+        """
+        if self.exponential is None:
+            raise InputError("the tissue has no coefficients of the exponential law")
+        return replace(self.exponential, **values)
 
     def material(self, E_f: float) -> TransverselyIsotropic:
         """The material with Young's modulus ``E_f`` (MPa) along the fibre."""

@@ -15,10 +15,13 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact
+from mvest.mechanics.exponential import EXPONENTIAL_KINDS, ExponentialLaw, ExponentialTissue
 from mvest.mechanics.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law import BiotLaw
-from mvest.mechanics.parameters import check_names
+from mvest.mechanics.moduli import LeafletModuli
+from mvest.mechanics.parameters import Part, check_names, kind_of
 from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.regional import RegionalLaw
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
@@ -153,7 +156,16 @@ def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSett
     """Refuse names that are no parameters of this valve under these settings; InputError."""
     tips = [f"tip{k}" for k in range(len(valve.papillary_tips))]
     modes = {region: own.modes for region, own in settings.fields.items()}
+    names = tuple(names)
     check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips], modes)
+    for name in names:
+        kind, _, region = name.partition(".")
+        tissue = settings.tissue.get(region) if kind_of(name).part is Part.REGION else None
+        if tissue is not None and kind not in tissue.kinds:
+            raise InputError(
+                f"parameter {name!r}: the tissue of {region!r} follows the {tissue.law} law, which "
+                f"has {', '.join(tissue.kinds)}"
+            )
 
 
 def material_law(
@@ -169,8 +181,8 @@ def material_law(
     mesh : SolidMesh
     settings : MechanicsSettings
     values : mapping
-        Parameter -> value: ``E_f.REGION`` of each region, and any of the others; those that are no
-        parameters of tissue are passed over.
+        Parameter -> value: ``E_f.REGION`` of each region that follows the linear law, and any of
+        the others; those that are no parameters of tissue are passed over.
     variation : Variation, optional
         From `variation_of`; by default every leaflet has the same moduli throughout.
 
@@ -181,19 +193,16 @@ def material_law(
     MaterialError
         If a modulus is inadmissible.
     """
-    moduli = []
-    for region in mesh.region_names:
-        if region not in settings.tissue or f"E_f.{region}" not in values:
-            raise InputError(
-                f"region {region!r} of the mesh has no tissue or modulus; given are "
-                f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
-            )
-        moduli.append(
-            settings.tissue[region].moduli(
-                values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
-            )
-        )
-    law = BiotLaw.of_moduli(moduli)
+    tissues = [_tissue(region, settings, values) for region in mesh.region_names]
+    linear = [t for t in tissues if isinstance(t, LeafletModuli)]
+    exponential = [t for t in tissues if isinstance(t, ExponentialTissue)]
+    law: Law
+    if not exponential:
+        law = BiotLaw.of_moduli(linear)
+    elif not linear:
+        law = ExponentialLaw.of(exponential)
+    else:
+        law = RegionalLaw(tuple(map(_law_of_one, tissues)), mesh.region)
     if variation is None:
         return law
     coefficients = {
@@ -201,6 +210,31 @@ def material_law(
         for region, own in variation.modes.items()
     }
     return FieldLaw(law, variation.modes, coefficients, variation.given)
+
+
+def _tissue(
+    region: str, settings: MechanicsSettings, values: Mapping[str, float]
+) -> LeafletModuli | ExponentialTissue:
+    """What the law of one region is made of."""
+    tissue = settings.tissue.get(region)
+    if tissue is not None and tissue.law == "exponential":
+        names = {kind: f"{kind}.{region}" for kind in EXPONENTIAL_KINDS}
+        return tissue.coefficients({k: values[n] for k, n in names.items() if n in values})
+    if tissue is None or f"E_f.{region}" not in values:
+        raise InputError(
+            f"region {region!r} of the mesh has no tissue or modulus; given are "
+            f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
+        )
+    return tissue.moduli(
+        values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
+    )
+
+
+def _law_of_one(tissue: LeafletModuli | ExponentialTissue) -> Law:
+    """The law of a body of one region."""
+    if isinstance(tissue, LeafletModuli):
+        return BiotLaw.of_moduli([tissue])
+    return ExponentialLaw.of([tissue])
 
 
 def variation_of(valve: Valve, mesh: SolidMesh, settings: MechanicsSettings) -> Variation | None:

@@ -50,6 +50,7 @@ OTHERS = (
     ("strip", "Clamped strips", ()),
     ("gate", "One closed state", ()),
     ("closure", "A closing valve", ("closure",)),
+    ("law", "Two material laws on the same valve (simulated)", ("law", "law_biaxial")),
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
@@ -67,6 +68,9 @@ CAPTIONS = {
     "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
     "table1_valve": "The fitted valve, open and closed. Simulated.",
     "closure": "A valve closing. Simulated.",
+    "law": "Stress of each leaflet under equibiaxial stretch: true, as estimated with the "
+    "exponential law, and with the linear law from the same data. Simulated.",
+    "law_biaxial": "The exponential law with the coefficients of excised leaflets.",
     "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",
