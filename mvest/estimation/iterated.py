@@ -34,6 +34,12 @@ ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)
 GOOD_DECREASE = 0.5
 """Part of the predicted decrease from which on the linearisation is trusted with less damping."""
 
+POOR_DECREASE = 0.25
+"""Part of the predicted decrease below which a step, though accepted, is followed by a more damped
+one (Nocedal and Wright, algorithm 4.1). Where the neglected second derivatives are nearly as large
+as those that are kept, full steps overshoot again and again, from one side of the minimum to the
+other."""
+
 
 @dataclass(frozen=True, slots=True)
 class IteratedFilter:
@@ -53,9 +59,10 @@ class IteratedFilter:
     The update always starts from the prior, never from the last posterior. The step is z* − zᵢ if
     that lowers J enough; otherwise Levenberg and Marquardt's
     step = (B + λ diag B)⁻¹ B (z* − zᵢ), where B is the Hessian of the linearised J in coordinates
-    in which the prior is N(0, I), with λ growing until J decreases. A step at which the model gives
-    no prediction is rejected in the same way. The covariance is P* at the last iterate: the
-    posterior's to the order of Gauss-Newton, that is without the second derivatives of h.
+    in which the prior is N(0, I), with λ growing until J decreases, and after a step that lowers it
+    far less than predicted. A step at which the model gives no prediction is rejected in the same
+    way. The covariance is P* at the last iterate: the posterior's to the order of Gauss-Newton,
+    that is without the second derivatives of h.
 
     The run ends where the model has been run: the reported prediction belongs to the estimate, and
     the iterate is not changed any more once the next full step is below the tolerance.
@@ -192,10 +199,17 @@ class IteratedFilter:
                 if gain >= GOOD_DECREASE:
                     relaxed = damping / DAMPING_FACTOR
                     return trial, relaxed if relaxed >= NO_DAMPING else 0.0, None
-                if gain >= SUFFICIENT_DECREASE:
+                if gain >= POOR_DECREASE:
                     return trial, damping, None
-            damping = max(FIRST_DAMPING, DAMPING_FACTOR * damping)
+                if gain >= SUFFICIENT_DECREASE:
+                    return trial, _more(damping), None
+            damping = _more(damping)
         return None, damping, failure
+
+
+def _more(damping: float) -> float:
+    """The damping after a step that was rejected or poor."""
+    return max(FIRST_DAMPING, DAMPING_FACTOR * damping)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

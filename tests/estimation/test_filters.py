@@ -302,6 +302,26 @@ def test_a_decrease_far_below_the_predicted_one_is_refused():
     assert estimate.converged
 
 
+def test_full_steps_that_overshoot_again_and_again_are_damped():
+    """h = (m, c m²) with a residual whose second derivative is 0.85 of what Gauss-Newton keeps.
+
+    Full steps go from m to -0.85 m, so that 1e-6 of the start would take 85 of them.
+    """
+    c, far = 0.1, 1e12
+
+    def model(m):
+        return Prediction(np.array([m[0], c * m[0] ** 2]), np.array([[1.0], [2 * c * m[0]]]))
+
+    y = np.array([0.0, -0.85 / (2 * c)])
+    result = IteratedFilter(tolerance=1e-12, objective_tolerance=1e-14, max_iterations=40)(
+        model, Gaussian(np.array([0.3]), np.array([[far]])), y, np.array(1.0)
+    )
+
+    assert result.converged
+    assert abs(result.mean[0]) < 1e-5
+    assert result.iterations < 30
+
+
 def test_damping_goes_away_again():
     # Without that, the last steps would creep: with it, the errors of the last two steps square.
     prior = Gaussian.from_variance(np.array([2.0]), 100.0)
