@@ -34,11 +34,11 @@ ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)
 GOOD_DECREASE = 0.5
 """Part of the predicted decrease from which on the linearisation is trusted with less damping."""
 
-POOR_DECREASE = 0.25
+POOR_DECREASE = 0.4
 """Part of the predicted decrease below which a step, though accepted, is followed by a more damped
-one (Nocedal and Wright, algorithm 4.1). Where the neglected second derivatives are nearly as large
-as those that are kept, full steps overshoot again and again, from one side of the minimum to the
-other."""
+one (as in Nocedal and Wright's algorithm 4.1, there 1/4). Where the neglected second derivatives
+are nearly as large as those that are kept, full steps overshoot again and again, from one side of
+the minimum to the other, and lower the objective by a third or less of what is predicted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -319,7 +319,7 @@ def test_full_steps_that_overshoot_again_and_again_are_damped():
 
     assert result.converged
     assert abs(result.mean[0]) < 1e-5
-    assert result.iterations < 30
+    assert result.iterations < 20
 
 
 def test_damping_goes_away_again():
