@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -28,6 +29,10 @@ __all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
 
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
+
+MOST_MEMORY = 10 * 2**30
+"""Bytes that the process may ask for: a leaflet that crumples while no equilibrium is found can
+take all there is, and what else runs on the machine with it."""
 
 SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
 """Parts of a configuration that describe the patient, and that the estimator is not given."""
@@ -104,6 +109,8 @@ def estimate_blindly(
 
 def main() -> int:
     """Answer the one request on the standard input; returns the exit status."""
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, hard))
     request = json.load(sys.stdin)
     folder = Path(request["folder"])
     seal(Path(request["sealed"]))

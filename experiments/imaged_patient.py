@@ -100,13 +100,19 @@ def run_imaged_patient(
     # Of the known shape nothing is in error but what the estimator cannot know.
     beside = folder / KNOWN
     beside.mkdir(exist_ok=True)
-    known = estimate_blindly(config, config_hash, beside, place.known, place.truth)
-    record = known | NOTHING | {"reason": reason} if found is None else found
+    known: Values = NO_ESTIMATE
+    try:
+        known = estimate_blindly(config, config_hash, beside, place.known, place.truth)
+    except InputError as fault:
+        if found is None:
+            raise
+        known = NO_ESTIMATE | {"reason": str(fault)}
+    record = {**known, **NO_ESTIMATE, "reason": reason} if found is None else found
     record = {
         **record,
         "rows": volume_rows(config["patient"]["name"], found, known, hidden["values"]),
         "known_geometry": {
-            key: known[key] for key in ("status", "reason", "estimate", "std", "unknowns")
+            key: known.get(key) for key in ("status", "reason", "estimate", "std", "unknowns")
         },
         "made_from": hidden["made_from"],
         "anatomies_drawn": hidden["anatomies_drawn"],
@@ -116,8 +122,10 @@ def run_imaged_patient(
     return record, []
 
 
-NOTHING = {"status": "failed", "detail": "", "estimate": None, "std": None, "relative_error": None}
-"""Of a record of a volume from which nothing was estimated."""
+NO_ESTIMATE: dict[str, Any] = {
+    "status": "failed", "detail": "", "estimate": None, "std": None, "relative_error": None,
+}  # fmt: skip
+"""Of a record of an estimation that found nothing, or left nothing behind."""
 
 
 def volume_rows(

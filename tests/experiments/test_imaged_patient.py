@@ -4,7 +4,9 @@ import json
 
 import pytest
 
+from experiments import imaged_patient
 from experiments.imaged_patient import ImagedPlace, volume_rows
+from mvest.errors import InputError
 from mvest.reporting.imaging_volumes import publish_volume
 from tests.reporting.records import record as a_record
 
@@ -59,3 +61,27 @@ def test_the_table_is_that_of_all_patients(tmp_path):
     kept = json.loads((tmp_path / "volume.json").read_text())
     assert [row["estimate"] for row in kept["rows"]] == [5.5, 2.2, None, None]
     assert list(tmp_path.glob("volume.md"))
+
+
+def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
+    monkeypatch, tmp_path
+):
+    place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
+    place.truth.mkdir(parents=True)
+    hidden = {"told": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
+    (place.truth / "hidden.json").write_text(json.dumps(hidden))
+
+    def blindly(config, config_hash, folder, case, sealed):
+        if case == place.known:
+            raise InputError("the estimation left no result: MemoryError")
+        return estimated(5.0, 2.5) | {"reason": "converged", "provenance": {}}
+
+    monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda config: place)
+    monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
+    config = {"imaged": {}, "patient": {"name": "one"}, "row": "one", "seed": 1}
+    record, _ = imaged_patient.run_imaged_patient(config, "hash", tmp_path, 0.0)
+
+    assert record["status"] == "converged"
+    assert [row["estimate"] for row in record["rows"]] == [5.0, 2.5]
+    assert [row["known_geometry"] for row in record["rows"]] == [None, None]
+    assert "MemoryError" in record["known_geometry"]["reason"]
