@@ -135,14 +135,14 @@ def rim_oracle(truths, layout, row):
     return Oracle(2, answer)
 
 
-def boundary_oracle(truths, layout, width_mm=0.6):
-    """How likely a place is on the true leaflet; candidates come vertex by vertex."""
+def boundary_oracle(truths, layout, width_mm=0.6, best=1.0):
+    """How likely a place is on the true leaflet, at most `best`; they come vertex by vertex."""
 
     def answer(x):
         points, rotation, _, frame = seen(x)
         which = np.arange(len(x)) * layout.size // len(x)
         gap = ((truths[frame].vertices[which] - points) * rotation[:, :, 2]).sum(axis=1)
-        return np.exp(-0.5 * (gap / width_mm) ** 2)[:, None]
+        return best * np.exp(-0.5 * (gap / width_mm) ** 2)[:, None]
 
     return Oracle(1, answer)
 
@@ -201,8 +201,11 @@ def position_oracle(truths):
     return Oracle(1, answer)
 
 
-def oracle_model(shape, truths, best=1.0, accuracy=None):
-    """A detection model all of whose trees know where the valve is in every frame."""
+def oracle_model(shape, truths, best=1.0, accuracy=None, seen=1.0):
+    """A detection model all of whose trees know where the valve is in every frame.
+
+    Poses are rated `best` at most, and the boundary `seen`.
+    """
     from mvest.imaging.detection.shape_start import MODES
 
     layout = shape.layout
@@ -221,7 +224,7 @@ def oracle_model(shape, truths, best=1.0, accuracy=None):
         if name in ("annulus", "free_edge"):
             return rim_oracle(truths, layout, 0 if name == "annulus" else -1)
         assert name == "boundary"
-        return boundary_oracle(truths, layout)
+        return boundary_oracle(truths, layout, best=seen)
 
     return DetectionModel(shape, {name: of(name) for name in STAGES}, {}, accuracy)
 

@@ -138,9 +138,15 @@ def test_with_all_landmarks_by_hand_none_is_looked_for(shape, true):
     assert mean_gap(found.vertices, true.vertices) < 0.3
 
 
-def test_the_confidence_is_that_of_the_pose_rating(shape, true):
-    found = fit_frame(NumberedFrame(), oracle_model(shape, [true], best=0.4), true.pose, FIT)
-    assert 0.3 < found.confidence <= 0.4
+def test_the_confidence_is_what_is_seen_of_leaflets_and_part_of_the_pose_rating(shape, true):
+    found = [
+        fit_frame(NumberedFrame(), oracle_model(shape, [true], best=best), true.pose, FIT)
+        for best in (0.0, 0.4)
+    ]
+    seen = [valve.vertex_confidence.mean() for valve in found]
+    assert found[0].confidence == pytest.approx(min(1.0, seen[0]))
+    rating = (found[1].confidence - seen[1]) / 0.3
+    assert found[1].confidence == 1.0 or 0.3 < rating <= 0.4
 
 
 def test_more_modes_than_the_model_has_are_refused(shape, true):

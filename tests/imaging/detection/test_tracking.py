@@ -110,12 +110,12 @@ def test_a_single_frame_is_enough(shape, truths):
 
 def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     with pytest.raises(NoValveError, match="no valve") as told:
-        detect_valve(volume(), oracle_model(shape, truths, best=0.05), TOLD)
+        detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05), TOLD)
     message = str(told.value)
     assert "made up.nrrd" in message
     assert "0.0" in message
     assert "\n" not in message
-    detect_valve(volume(), oracle_model(shape, truths, best=0.05),
+    detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05),
                  replace(TOLD, least_confidence=0.01))  # fmt: skip
 
 
