@@ -13,7 +13,13 @@ import numpy as np
 
 from experiments.build import build_filter
 from experiments.gate import forward_record
-from experiments.joint import bound_entry, closed_frame, cycle_model
+from experiments.whole_cycle import (
+    bound_entry,
+    closed_frame,
+    cycle_model,
+    stored_cycle,
+    stored_frames,
+)
 from mvest.cycle import Beats, CycleModel, CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation import DriftSmoother, Log, Trajectory, identifiability
@@ -40,7 +46,7 @@ def run_cycle_study(
     settings = config["cycle"]
     truth = np.array(config["truth"]["values"], dtype=float)
     model = cycle_model(config)
-    prediction = model(truth)
+    prediction = stored_cycle(config, model)(truth)
     if not prediction.converged:
         raise ConfigurationError(f"the truth has no cycle: {prediction.reason}")
     protocol = model.protocol
@@ -115,7 +121,7 @@ def _time_steps(config: Values, truth: FloatArray, frames: FloatArray) -> dict[s
     ]
     found = [frames]
     for dt in dts[1:]:
-        found.append(cycle_model(config, dt=dt).frames(truth))
+        found.append(stored_frames(config, cycle_model(config, dt=dt), truth))
         print(f"time step {dt:g} s", file=sys.stderr, flush=True)
     change = [np.linalg.norm(b - a, axis=2).mean(axis=1) for a, b in pairwise(found)]
     whole = [float(np.sqrt(np.mean((b - a) ** 2))) for a, b in pairwise(found)]
@@ -142,14 +148,17 @@ def _drift(config: Values, truth: FloatArray) -> dict[str, Any]:
     path[:, 0] *= 1 + settings["drift"] * 0.5 * (1 - np.cos(np.pi * np.arange(beats) / (beats - 1)))
     maker, model = (cycle_model(changed, times=times) for _ in range(2))
     rng = np.random.default_rng(config["seed"])
-    seen = [CycleObservation.simulated(maker.frames(m), settings["noise_mm"], rng) for m in path]
+    seen = [
+        CycleObservation.simulated(stored_frames(changed, maker, m), settings["noise_mm"], rng)
+        for m in path
+    ]
     _, _, whole = build_filter(config["filter"], tuple(config["parameters"]))
     initial = type(whole)(whole.mean[moduli], whole.covariance[np.ix_(moduli, moduli)])
     smoother = DriftSmoother(
         tuple(sum(o.sizes) for o in seen), settings["drift_std"] ** 2, tolerance=0.1
     )
     y, R = (np.concatenate([getattr(o, name) for o in seen]) for name in ("y", "R"))
-    found = smoother(Beats(model), initial, y, R, transform=Log())
+    found = smoother(Beats(stored_cycle(changed, model)), initial, y, R, transform=Log())
     print(f"drift: {found.reason.value}, {found.forward_solves} runs", file=sys.stderr, flush=True)
     if found.smoothed is None:
         return {"status": "failed", "reason": found.detail, "runs": found.forward_solves}

@@ -11,14 +11,19 @@ from typing import Any
 import numpy as np
 
 from experiments.build import build_filter
-from experiments.gate import forward_record, model_of
-from experiments.mirror import build
-from mvest.cycle import CycleModel, CycleObservation, CycleProtocol, SeenFrames
+from experiments.gate import forward_record
+from experiments.whole_cycle import (
+    bound_entry,
+    closed_frame,
+    cycle_model,
+    stored_cycle,
+    stored_frames,
+)
+from mvest.cycle import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
 from mvest.estimation import (
     Estimate,
     Gaussian,
-    Identifiability,
     IteratedFilter,
     SequentialEstimate,
     SequentialFilter,
@@ -26,39 +31,11 @@ from mvest.estimation import (
     identifiability,
     nees,
 )
-from mvest.gate import GateCase
 from mvest.typing import FloatArray
 
-__all__ = ["bound_entry", "closed_frame", "cycle_model", "run_joint_study"]
+__all__ = ["run_joint_study"]
 
 Values = Mapping[str, Any]
-
-
-def cycle_model(config: Values, **changes: Any) -> CycleModel:
-    """The configured model of a cycle, its protocol with ``changes``."""
-    protocol = build(CycleProtocol, {**config["cycle"]["protocol"], **changes})
-    return CycleModel(model_of(config, GateCase("reference")), protocol)
-
-
-def closed_frame(protocol: CycleProtocol) -> int:
-    """The last frame in which the valve is held closed."""
-    held = [k for k, t in enumerate(protocol.times) if protocol.phase(t) > 1 - 1e-9]
-    if not held:
-        raise ConfigurationError("cycle.protocol.times has no frame on the plateau of the pressure")
-    return held[-1]
-
-
-def bound_entry(label: str, frames: list[int], bound: Identifiability) -> dict[str, Any]:
-    """Plain data of a Cramér-Rao bound; standard deviations relative to the parameters."""
-    relative = bound.std / bound.scale
-    return {
-        "frames": label,
-        "count": len(frames),
-        "std": [float(v) if np.isfinite(v) else None for v in relative],
-        "correlation": [[_finite(v) for v in row] for row in bound.correlation],
-        "condition_number": _finite(bound.condition_number),
-        "flat": list(bound.flat(0.05)),
-    }
 
 
 def run_joint_study(
@@ -71,12 +48,12 @@ def run_joint_study(
     truth = np.array(config["truth"]["values"], dtype=float)
     # The truth is made by an object of its own; the estimator gets the observation alone.
     maker, model = cycle_model(config), cycle_model(config)
-    at_truth = maker(truth)
+    at_truth = stored_cycle(config, maker)(truth)
     if not at_truth.converged:
         raise ConfigurationError(f"the truth has no cycle: {at_truth.reason}")
     frames = at_truth.y.reshape(len(maker.protocol.times), -1, 3)
     noise, told = settings["noise_mm"], settings["exact_told_mm"]
-    seen = CycleObservation(frames, noise).of(model)
+    seen = CycleObservation(frames, noise).of(stored_cycle(config, model))
     study = _Study(parameters, transform, prior, seen, truth)
 
     def rows_of(wanted: list[int]) -> FloatArray:
@@ -103,7 +80,7 @@ def run_joint_study(
             seeds.append(study.batch(observation, seeds[0].mean))
         _tell(f"seed {k}", seeds[-1], truth)
     assert first is not None
-    finer = _finer(config).frames(truth)
+    finer = _finer_frames(config, truth)
     other = study.batch(CycleObservation.simulated(finer, noise, _rng(config, 0)), seeds[0].mean)
     _tell("finer truth", other, truth)
 
@@ -189,16 +166,13 @@ class _Study:
         return rows
 
 
-def _finer(config: Values) -> CycleModel:
-    """The truth that the estimator's model cannot be."""
+def _finer_frames(config: Values, truth: FloatArray) -> FloatArray:
+    """Frames of a truth that the estimator's model cannot be."""
     settings = config["cycle"]
-    mesh = {
-        **config["mesh"],
-        "columns": settings["finer_columns"],
-        "rows": settings["finer_rows"],
-    }
+    cells = {"columns": settings["finer_columns"], "rows": settings["finer_rows"]}
+    changed = {**config, "mesh": {**config["mesh"], **cells}}
     dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
-    return cycle_model({**config, "mesh": mesh}, dt=dt)
+    return stored_frames(changed, cycle_model(changed, dt=dt), truth)
 
 
 def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:
@@ -219,10 +193,6 @@ def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:
 
 def _rng(config: Values, k: int) -> np.random.Generator:
     return np.random.default_rng(config["seed"] + k)
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _tell(label: str, found: Estimate, truth: FloatArray) -> None:

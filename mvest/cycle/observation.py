@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mvest.cycle.model import CycleModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
 from mvest.typing import BoolArray, FloatArray
@@ -131,11 +130,11 @@ class Beats:
 
     Attributes
     ----------
-    model : CycleModel
+    model : ObservationModel
         Of one beat; all its frames make up the observation of a beat.
     """
 
-    model: CycleModel
+    model: ObservationModel
 
     def frame(self, k: int, m: FloatArray, /) -> Prediction:
         """Predict beat ``k``, of which only the parameters differ from another's."""
