@@ -162,7 +162,7 @@ def joint_figure(record: Record) -> Figure:
         places = np.arange(len(names)) + (j - 0.5) * width
         right.bar(places, values, width, color=("0.65", "0.25")[j], label=entry["frames"])
     right.set_yscale("log")
-    right.set(ylabel="smallest possible std (%)")
+    right.set(ylabel="smallest possible std (%)", ylim=(None, 4 * right.get_ylim()[1]))
     right.set_title("two frames and the whole cycle", fontsize=10)
     right.legend(fontsize=8, frameon=False)
     for axes in (middle, right):
