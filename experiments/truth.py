@@ -72,7 +72,7 @@ def _code(path: Path, changed: int, size: int) -> str:
 
 
 class StoredModel:
-    """A model whose converged predictions are kept on disk, without their Jacobian.
+    """A model whose converged predictions are kept on disk.
 
     Of several processes that need the same one, the first simulates it and the others wait.
 
@@ -82,6 +82,8 @@ class StoredModel:
     folder : Path
     key : str
         See :func:`truth_key`; the parameters are added to it.
+    jacobian : bool
+        Whether the Jacobian is kept as well; that of a stored prediction is zero otherwise.
 
     Attributes
     ----------
@@ -89,22 +91,26 @@ class StoredModel:
         How often a prediction was read, and how often simulated.
     """
 
-    def __init__(self, model: ObservationModel, folder: Path, key: str) -> None:
+    def __init__(
+        self, model: ObservationModel, folder: Path, key: str, *, jacobian: bool = False
+    ) -> None:
         self._model = model
+        self._jacobian = jacobian
         self._folder = folder
         self._key = key
         self.hits = 0
         self.misses = 0
 
     def __call__(self, m: FloatArray, /) -> Prediction:
-        """Prediction at ``m (p,)``, read from disk if it is there; its Jacobian is zero.
+        """Prediction at ``m (p,)``, read from disk if it is there.
 
         Raises
         ------
         InputError
             If the store cannot be written.
         """
-        name = config_hash({"key": self._key, "m": [float(v).hex() for v in m]})
+        kept = {"jacobian": True} if self._jacobian else {}
+        name = config_hash({**kept, "key": self._key, "m": [float(v).hex() for v in m]})
         path = self._folder / f"{name}.npz"
         found = _read(path, len(m))
         if found is None:
@@ -128,7 +134,10 @@ class StoredModel:
             try:
                 try:
                     with part.open("xb") as stream:
-                        np.savez(stream, y=prediction.y)
+                        if self._jacobian:
+                            np.savez(stream, y=prediction.y, jacobian=prediction.jacobian)
+                        else:
+                            np.savez(stream, y=prediction.y)
                         stream.flush()
                         os.fsync(stream.fileno())
                     part.replace(path)
@@ -145,12 +154,15 @@ def _read(path: Path, parameters: int) -> Prediction | None:
         # Opened here: NumPy leaves what it opened and could not read to the garbage collector.
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             y = stored["y"]
+            jacobian = (
+                stored["jacobian"] if "jacobian" in stored else np.zeros((len(y), parameters))
+            )
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         print(f"note: {path} is damaged and is made again", file=sys.stderr)
         return None
-    return Prediction(y, np.zeros((len(y), parameters)))
+    return Prediction(y, jacobian)
 
 
 def _make(folder: Path) -> None:
