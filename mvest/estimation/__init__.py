@@ -7,6 +7,7 @@ covariance S, gain K.
 """
 
 from mvest.estimation.considered import SchmidtFilter
+from mvest.estimation.design import Design, together
 from mvest.estimation.diagnostics import (
     Consistency,
     ZTest,
@@ -19,16 +20,24 @@ from mvest.estimation.diagnostics import (
 )
 from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.identifiability import Identifiability, cramer_rao_bound, identifiability
+from mvest.estimation.identifiability import (
+    Confounded,
+    Identifiability,
+    cramer_rao_bound,
+    identifiability,
+)
 from mvest.estimation.iterated import IteratedFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.profile import Profile, profile
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [
+    "Confounded",
     "Consistency",
+    "Design",
     "Estimate",
     "Filter",
     "Gaussian",
@@ -42,6 +51,7 @@ __all__ = [
     "ObservationNoise",
     "PaperFilter",
     "Prediction",
+    "Profile",
     "Reason",
     "SchmidtFilter",
     "Transform",
@@ -56,5 +66,7 @@ __all__ = [
     "moran",
     "nees",
     "observation_noise",
+    "profile",
+    "together",
     "zero_mean",
 ]

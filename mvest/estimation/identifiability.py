@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -13,6 +14,27 @@ from mvest.typing import FloatArray
 
 RELEVANT_SHARE = 0.1
 """Smallest share of a parameter in a combination that is worth naming."""
+
+
+@dataclass(frozen=True, slots=True)
+class Confounded:
+    """Two parameters whose effects on the data are alike.
+
+    Attributes
+    ----------
+    first, second : str
+        The less well known one comes first.
+    correlation : float
+        At the Cramér-Rao bound.
+    exchange : float
+        Change of the first, in parts of its scale, that goes with a change of the second by one
+        scale: cov(first, second) / var(second), both in parts of their scales.
+    """
+
+    first: str
+    second: str
+    correlation: float
+    exchange: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +94,30 @@ class Identifiability:
             for i, width in enumerate(widths)
             if width > limit
         )
+
+    def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[Confounded, ...]:
+        """Pairs that the data hardly tell apart, the most correlated first.
+
+        Parameters
+        ----------
+        limit : float
+            Least size of the correlation at the bound.
+        width : float
+            Least standard deviation, in parts of the scale, of the one known less well: parameters
+            that are both known to better than this are told apart, however correlated they are.
+        """
+        relative = self.std / self.scale
+        correlation = self.correlation
+        found = []
+        for i, j in combinations(range(len(self.names)), 2):
+            k, other = (i, j) if relative[i] >= relative[j] else (j, i)
+            # NaN, of what is not determined at all, is no correlation: `flat` tells of it.
+            if abs(correlation[i, j]) >= limit and relative[k] >= width:
+                exchange = float(correlation[i, j] * relative[k] / relative[other])
+                found.append(
+                    Confounded(self.names[k], self.names[other], float(correlation[i, j]), exchange)
+                )
+        return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
 
 
 def identifiability(
