@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from typing import Any, cast
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -18,23 +20,22 @@ RELEVANT_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Confounded:
-    """Two parameters whose effects on the data are alike.
+    """Parameters that make up for each other in the data.
 
     Attributes
     ----------
-    first, second : str
-        The less well known one comes first.
+    names : tuple of str, (q,)
+        The first is the one that the others follow best.
+    exchange : tuple of float, (q,)
+        How they move together along the valley: change of each, in parts of its scale, that goes
+        with a change of the first by one scale, cov(i, first) / var(first). The first's own is 1.
     correlation : float
-        At the Cramér-Rao bound.
-    exchange : float
-        Change of the first, in parts of its scale, that goes with a change of the second by one
-        scale: cov(first, second) / var(second), both in parts of their scales.
+        Smallest size of the correlation of the first with one of the others, at the bound.
     """
 
-    first: str
-    second: str
+    names: tuple[str, ...]
+    exchange: tuple[float, ...]
     correlation: float
-    exchange: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,28 +97,36 @@ class Identifiability:
         )
 
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[Confounded, ...]:
-        """Pairs that the data hardly tell apart, the most correlated first.
+        """Groups of parameters that the data hardly tell apart, the largest group first.
 
-        Parameters
-        ----------
-        limit : float
-            Least size of the correlation at the bound.
-        width : float
-            Least standard deviation, in parts of the scale, of the one known less well: parameters
-            that are both known to better than this are told apart, however correlated they are.
+        Two belong to one group if the size of their correlation at the bound is at least `limit`,
+        and both are known to no better than `width` parts of their scales: what is known well is
+        told apart, however correlated it is. What is not determined at all has no correlation;
+        `flat` tells of it.
         """
-        relative = self.std / self.scale
-        correlation = self.correlation
+        uncertain = self.std / self.scale >= width
+        size = np.where(np.outer(uncertain, uncertain), np.abs(self.correlation), 0.0)
+        # NaN compares as false.
+        alike = sparse.coo_array(size >= limit)
+        count, group = connected_components(cast(Any, alike), directed=False)
         found = []
-        for i, j in combinations(range(len(self.names)), 2):
-            k, other = (i, j) if relative[i] >= relative[j] else (j, i)
-            # NaN, of what is not determined at all, is no correlation: `flat` tells of it.
-            if abs(correlation[i, j]) >= limit and relative[k] >= width:
-                exchange = float(correlation[i, j] * relative[k] / relative[other])
-                found.append(
-                    Confounded(self.names[k], self.names[other], float(correlation[i, j]), exchange)
+        for label in range(count):
+            members = np.flatnonzero(group == label)
+            if members.size < 2:
+                continue
+            first = members[np.argmax(size[np.ix_(members, members)].sum(axis=0))]
+            others = [int(i) for i in members[np.argsort(-size[first, members])] if i != first]
+            scaled = self.covariance[:, first] / (self.scale * self.scale[first])
+            exchange = scaled / scaled[first]
+            order = [int(first), *others]
+            found.append(
+                Confounded(
+                    tuple(self.names[i] for i in order),
+                    tuple(float(exchange[i]) for i in order),
+                    float(size[first, others].min()),
                 )
-        return tuple(sorted(found, key=lambda pair: -abs(pair.correlation)))
+            )
+        return tuple(sorted(found, key=lambda one: -len(one.names)))
 
 
 def identifiability(

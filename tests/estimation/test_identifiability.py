@@ -27,17 +27,36 @@ def test_parameters_that_act_alike_are_named_with_how_one_makes_up_for_the_other
     other = np.array([0.0, 0.03, 0.1, 0.05, 0.0])
     H = np.stack([x, 2.0 * x + other, np.eye(5)[4]], axis=1)
     found = identifiability(H, 0.01, np.ones(3), names=("a", "b", "c"))
-    (pair,) = found.confounded()
-    assert (pair.first, pair.second) == ("a", "b")
-    assert pair.correlation == pytest.approx(found.correlation[0, 1])
-    assert pair.correlation < -0.99
+    (group,) = found.confounded()
+    assert sorted(group.names) == ["a", "b"]
+    assert group.correlation == pytest.approx(-found.correlation[0, 1])
+    assert group.correlation > 0.99
+    first = "ab".index(group.names[0])
     C = found.covariance
-    assert pair.exchange == pytest.approx(C[0, 1] / C[1, 1])
-    assert pair.exchange == pytest.approx(-2.0, rel=0.05)
+    assert group.exchange == (1.0, pytest.approx(C[0, 1] / C[first, first]))
+    assert group.exchange[1] == pytest.approx(-2.0 if first == 1 else -0.5, rel=0.05)
+    # With 4 for a large change of a, the same change is a fourth of it.
+    (scaled,) = identifiability(
+        H, 0.01, np.array([4.0, 1.0, 1.0]), names=("a", "b", "c")
+    ).confounded(width=0.01)
+    b_per_a = scaled.exchange[1] ** (1 if scaled.names[0] == "a" else -1)
+    assert b_per_a == pytest.approx(4.0 * -0.5, rel=0.05)
     # However correlated: with a hundredth of the noise both are known to better than 5 %.
     exact = identifiability(H, 1e-6, np.ones(3), names=("a", "b", "c"))
     assert exact.confounded() == ()
-    assert exact.confounded(width=1e-4)[0].correlation == pytest.approx(pair.correlation)
+    assert exact.confounded(width=1e-4)[0].correlation == pytest.approx(group.correlation)
+
+
+def test_three_that_share_one_direction_are_one_group():
+    # Ratios of a and b to c are seen to 1 %, c itself to 50 %: whatever c is, a and b are as much.
+    # d is seen by itself.
+    H = np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, -1.0, 0.0], [0, 0, 0.02, 0], [0, 0, 0, 0.1]])
+    found = identifiability(H, 1e-4, np.ones(4), names=("a", "b", "c", "d"))
+    (group,) = found.confounded()
+    assert sorted(group.names) == ["a", "b", "c"]
+    assert group.exchange == pytest.approx((1.0, 1.0, 1.0), rel=1e-3)
+    # corr(a, c) = 0.5 / √(0.5² + 0.01²)
+    assert group.correlation == pytest.approx(0.5 / np.hypot(0.5, 0.01), rel=1e-3)
 
 
 def test_what_is_not_determined_is_told_as_such_and_not_as_a_correlation():
