@@ -22,6 +22,7 @@ from experiments.folder import (
     mark_done,
     require_writable,
 )
+from experiments.foresight import TwinForesight, foresee_own
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
@@ -76,8 +77,8 @@ def run_job(config: DictConfig) -> None:
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["check"]:
-        check = check_volume if values["study"] == "volume" else check_case
-        print(check(values, folder))
+        for check in study.checks() or (_nothing_to_check,):
+            print(check(values, folder), flush=True)
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
@@ -157,6 +158,14 @@ def _leave(values: Mapping[str, Any], record: Mapping[str, Any], folder: Path) -
     """Nothing more is done with a finished run."""
 
 
+def _nothing_to_check(values: Mapping[str, Any], folder: Path) -> str:
+    kinds = ", ".join(kind for kind, study in STUDIES.items() if study.checks())
+    raise ConfigurationError(
+        f"experiment {values['name']}: check=true has nothing to say of a study of the kind "
+        f"{values['study']}; expected one of {kinds}"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Study:
     """A kind of study: how it is run, told, tabulated and published.
@@ -177,6 +186,9 @@ class Study:
     finish : callable
         (configuration, record, output folder): what is done with a run that is on disk, also with
         one that was done before.
+    checks : callable
+        () -> what ``check=true`` says, one after another, without estimating anything, each
+        (configuration, output folder) -> text. Made once for all jobs of a sweep.
     """
 
     run: Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]]
@@ -185,6 +197,7 @@ class Study:
     publish: Callable[[Path, str, Mapping[str, Any], Path], list[Path]]
     keeps_failures: bool = False
     finish: Callable[[Mapping[str, Any], Mapping[str, Any], Path], None] = _leave
+    checks: Callable[[], tuple[Callable[[Mapping[str, Any], Path], str], ...]] = tuple
 
 
 STUDIES: dict[str, Study] = {
@@ -193,6 +206,7 @@ STUDIES: dict[str, Study] = {
         lambda record: text_table([record]),
         lambda folder, record: write_tables(folder, record["table"], [record]),
         lambda results, name, record, folder: publish(results, name, record, folder / "fields.npz"),
+        checks=lambda: (TwinForesight(),),
     ),
     "closure": Study(
         run_closure_study,
@@ -217,12 +231,14 @@ STUDIES: dict[str, Study] = {
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+        checks=lambda: (check_case, foresee_own),
     ),
     "volume": Study(
         run_volume,
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+        checks=lambda: (check_volume,),
     ),
     "imaged_patient": Study(
         run_imaged_patient,

@@ -63,6 +63,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.surface_observation",
     ),
+    "mvest.foresight": (*LEAVES, "mvest.estimation", "mvest.study"),
     "mvest.virtual_patient": (
         *LEAVES,
         "mvest.cases",
@@ -88,6 +89,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.valve",
         "mvest.mechanics",
         "mvest.estimation",
+        "mvest.foresight",
         "mvest.model",
         "mvest.observation",
         "mvest.observation_errors",
