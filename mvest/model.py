@@ -209,20 +209,7 @@ class ClosureModel:
                 result = self.close(between, sensitivities=False)
                 if not result.simulation.converged:
                     return result
-        values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
-        moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
-        factors = Factors(
-            values.get("pressure_scale", 1.0),
-            values.get("chord_stiffness", 1.0),
-            values.get("chord_rest_length", 1.0),
-        )
-        if self._system is None or self._solver is None:
-            self._solver = linear_solver(self.settings.solver)
-            self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, moduli
-            )
-        system = self._system
-        system.retune(material_law(self.mesh, self.settings, moduli), factors)
+        system, parameters = self.tuned(m)
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
@@ -235,7 +222,7 @@ class ClosureModel:
                 steps,
                 damping=self.settings.damping,
                 newton=self.settings.newton,
-                parameters=[Parameter(n, values[n]) for n in self.names] if sensitivities else [],
+                parameters=parameters if sensitivities else [],
                 final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
@@ -262,6 +249,39 @@ class ClosureModel:
         if simulation.converged:
             self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
         return ClosureResult(system, simulation)
+
+    def tuned(self, m: FloatArray) -> tuple[System, tuple[Parameter, ...]]:
+        """The system, set to parameters ``m (p,)``, and the parameters to differentiate by.
+
+        The system is built once and belongs to the model.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        values = {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
+        moduli = {k.partition(".")[2]: v for k, v in values.items() if k.startswith("E_f.")}
+        factors = Factors(
+            values.get("pressure_scale", 1.0),
+            values.get("chord_stiffness", 1.0),
+            values.get("chord_rest_length", 1.0),
+        )
+        if self._system is None or self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+            self._system = build_system(
+                self.valve, self.contact_valve, self.mesh, self.settings, moduli
+            )
+        system = self._system
+        system.retune(material_law(self.mesh, self.settings, moduli), factors)
+        return system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    @property
+    def solver(self) -> LinearSolver:
+        """The solver that goes with the system, made with it."""
+        if self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+        return self._solver
 
     def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
         """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.

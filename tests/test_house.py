@@ -42,6 +42,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.batch": (*LEAVES, "mvest.estimation", "mvest.model"),
     "mvest.gate": (*LEAVES, "mvest.model"),
     "mvest.closure": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.model"),
+    "mvest.cycle": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.estimation", "mvest.model"),
     "mvest.observation_errors": (*LEAVES, "mvest.valve", "mvest.estimation"),
     "mvest.observation": (*LEAVES, "mvest.estimation", "mvest.observation_errors"),
     "mvest.surface_observation": (

@@ -11,7 +11,13 @@ from mvest.mechanics.contact import ContactSettings
 from mvest.mechanics.law import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
-__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings"]
+__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings", "smooth_step"]
+
+
+def smooth_step(u: float) -> float:
+    """Quintic from 0 at ``u <= 0`` to 1 at ``u >= 1`` whose first two derivatives vanish there."""
+    u = min(max(u, 0.0), 1.0)
+    return u**3 * (10 - 15 * u + 6 * u * u)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +104,7 @@ class ClosureProtocol:
 
     def phase(self, t: float) -> float:
         """Share of the closure at time ``t``: quintic smooth step over the ramp."""
-        u = min(max(t / self.ramp, 0.0), 1.0)
-        return u**3 * (10 - 15 * u + 6 * u * u)
+        return smooth_step(t / self.ramp)
 
 
 @dataclass(frozen=True, slots=True)

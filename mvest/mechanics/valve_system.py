@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -25,7 +26,27 @@ from mvest.valve.anatomy import Valve
 from mvest.valve.embedding import Embedding, embed
 from mvest.valve.mesh import SolidMesh
 
-__all__ = ["HeldState", "boundary_loading", "build_system", "held_loading", "material_law"]
+__all__ = [
+    "HeldState",
+    "Pacing",
+    "boundary_loading",
+    "build_system",
+    "held_loading",
+    "material_law",
+]
+
+
+class Pacing(Protocol):
+    """How pressure and the motion of the boundary run in time."""
+
+    @property
+    def pressure_mmHg(self) -> float:
+        """Peak transmitral pressure."""
+        ...
+
+    def phase(self, t: float, /) -> float:
+        """Share of the closure at time ``t`` (s), from 0 (open) to 1 (closed)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,10 +182,14 @@ def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hing
 
 
 def boundary_loading(
-    system: System, valve: Valve, contact_valve: Valve, settings: MechanicsSettings
+    system: System,
+    valve: Valve,
+    contact_valve: Valve,
+    settings: MechanicsSettings,
+    pacing: Pacing | None = None,
 ) -> Callable[[float], Loads]:
-    """Time -> loads: pressure, annulus and papillary tips of the protocol."""
-    protocol = settings.protocol
+    """Time -> loads: pressure, annulus and papillary tips of ``pacing`` (default: the closure)."""
+    protocol: Pacing = settings.protocol if pacing is None else pacing
     assert system.hinge is not None
     start = system.hinge.points(system.solid.mesh.nodes)
     motion = contact_valve.motion

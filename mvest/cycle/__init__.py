@@ -1,0 +1,6 @@
+"""The whole cycle of a simulated valve: any number of frames, open to closed and back."""
+
+from mvest.cycle.model import CycleModel
+from mvest.cycle.protocol import CycleProtocol
+
+__all__ = ["CycleModel", "CycleProtocol"]
