@@ -25,6 +25,7 @@ from experiments.folder import (
 from experiments.foresight import TwinForesight, foresee_own
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.identifiability import run_identifiability
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.patient import run_patient
@@ -37,6 +38,11 @@ from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
+from mvest.reporting.identifiability import (
+    identifiability_text,
+    publish_identifiability,
+    write_identifiability_tables,
+)
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
@@ -219,6 +225,12 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "identifiability": Study(
+        run_identifiability,
+        identifiability_text,
+        write_identifiability_tables,
+        lambda results, _name, record, _folder: publish_identifiability(results, record),
     ),
     "donor": Study(
         run_donor,

@@ -11,6 +11,7 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
+from mvest.reporting.identifiability import write_identifiability_study
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.patient_tables import write_patient_tables
@@ -24,6 +25,7 @@ __all__ = ["main"]
 OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
+    "identifiability": write_identifiability_study,
     "donor": write_donor_tables,
     "imaging": write_imaging_study,
     "volume": write_volume_tables,

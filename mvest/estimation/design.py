@@ -26,6 +26,9 @@ __all__ = ["Design", "together"]
 NOISE_RANGE = (1e-6, 1e6)
 """Times the unit of the observation, between which a needed noise is looked for."""
 
+KNOWLEDGE_RANGE = (1e-5, 1e2)
+"""Relative standard deviations between which a needed knowledge is looked for."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
@@ -134,6 +137,30 @@ class Design:
         """
         needed = self.needed_noise(name, target, knowledge)
         return np.inf if needed == 0.0 else (noise / needed) ** 2
+
+    def needed_knowledge(
+        self,
+        name: str,
+        target: float,
+        noise: float,
+        about: str,
+        knowledge: Mapping[str, float] | None = None,
+    ) -> float:
+        """How well another parameter must be known beforehand, as a relative standard deviation.
+
+        Zero if knowing it exactly is not enough, infinite if nothing need be known of it.
+        """
+
+        def excess(log_std: float) -> float:
+            told = {**(knowledge or {}), about: float(np.exp(log_std))}
+            return float(np.log(self.std(name, noise, told) / target))
+
+        low, high = np.log(KNOWLEDGE_RANGE)
+        if excess(low) > 0.0:
+            return 0.0
+        if excess(high) < 0.0:
+            return np.inf
+        return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
 
 
 def together(*designs: Design) -> Design:

@@ -50,6 +50,11 @@ OTHERS = (
     ("strip", "Clamped strips", ()),
     ("gate", "One closed state", ()),
     ("closure", "A closing valve", ("closure",)),
+    (
+        "identifiability",
+        "What data can tell, before any are taken",
+        ("identifiability_designs", "identifiability_profiles", "identifiability_valley"),
+    ),
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
@@ -66,6 +71,13 @@ CAPTIONS = {
     "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
     "table1_valve": "The fitted valve, open and closed. Simulated.",
     "closure": "A valve closing. Simulated.",
+    "identifiability_designs": "Expected standard deviation of a modulus with each design: which "
+    "vertices are seen, with which errors, in which frames, and what is known of the nuisances. "
+    "Simulated.",
+    "identifiability_profiles": "Profile likelihoods: the least misfit with one parameter held, "
+    "and how the others then make up for it. Simulated.",
+    "identifiability_valley": "95 % regions of a modulus with a nuisance, for different frames; "
+    "the floor of the valley that the profile followed. Simulated.",
     "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",

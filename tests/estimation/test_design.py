@@ -58,6 +58,17 @@ def test_no_noise_is_small_enough_where_a_nuisance_hides_the_parameter():
     assert design.needed_noise("E", 0.05, {"E": 0.04}) == np.inf
 
 
+def test_the_needed_knowledge_put_back_in_gives_the_target():
+    alone = DESIGN.std("E", 0.2, {"rest": 0.0, "pressure": 0.0})
+    unknown = DESIGN.std("E", 0.2, {"rest": 0.0})
+    target = 0.5 * (alone + unknown)
+    needed = DESIGN.needed_knowledge("E", target, 0.2, "pressure", {"rest": 0.0})
+    found = DESIGN.std("E", 0.2, {"rest": 0.0, "pressure": needed})
+    assert found == pytest.approx(target, rel=1e-9)
+    assert DESIGN.needed_knowledge("E", 0.9 * alone, 0.2, "pressure", {"rest": 0.0}) == 0.0
+    assert DESIGN.needed_knowledge("E", 1.1 * unknown, 0.2, "pressure", {"rest": 0.0}) == np.inf
+
+
 def test_together_is_the_stacked_observation_with_its_own_noises():
     # The second observation's noise is correlated, and in units of twice the first's.
     C = np.array([[1.0, 0.6], [0.6, 1.0]])
