@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -80,6 +81,7 @@ def run_identifiability(
         "profiles": _profiles(told, config, names, values, sets),
         "forward_solves": len(closures) + len(cycle),
     }
+    record["seconds"] = record["seconds_total"] = time.time() - started
     if not config["figures"]:
         return record, []
     return record, write_identifiability_figures(folder, record)
@@ -263,10 +265,14 @@ def _profiles(
             replace(_closure(config, own, pressure), fixed=held)
             for pressure in chosen["pressures_mmHg"]
         )
+        model = _Closures(models, rows)
+        first = model(values[free])
+        closed = [m.closed for m in models]
         for k, name in enumerate(own):
-            # Each begins anew, so that the order of the profiles plays no part.
-            model = _Closures(tuple(m.fresh() for m in models), rows)
-            done = _followed(told, model, values[free], k, own)
+            # Each begins from the same closed states, so that their order plays no part.
+            for one, state in zip(models, closed, strict=True):
+                one.restart(state)
+            done = _followed(told, model, first, values[free], k, own)
             print(
                 f"{chosen['label']}, {name}: {done.low:.4g} to {done.high:.4g}",
                 file=sys.stderr,
@@ -277,9 +283,13 @@ def _profiles(
 
 
 def _followed(
-    told: Values, model: _Closures, start: FloatArray, k: int, names: tuple[str, ...]
+    told: Values,
+    model: _Closures,
+    first: Prediction,
+    start: FloatArray,
+    k: int,
+    names: tuple[str, ...],
 ) -> Profile:
-    first = model(start)
     variance = told["typical_mm"] ** 2
     design = Design.of(first.jacobian, variance, start, names)
     reach = min(told["reach"].get(names[k], np.inf), OFF * design.std(names[k], 1.0))

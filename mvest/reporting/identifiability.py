@@ -147,7 +147,7 @@ def _alike(record: Record) -> list[str]:
             continue
         words = [alike_words(group) for group in found["confounded"]]
         told = " ".join(words) or "The data tell all parameters apart."
-        lines.append(f"* {found['frames'].capitalize()}: {told}")
+        lines.append(f"* {found['frames'][0].upper()}{found['frames'][1:]}: {told}")
     return lines
 
 
@@ -186,15 +186,17 @@ def _readable(record: Record) -> list[str]:
             markdown_rows(pressures),
             "",
         ]
-    lines += [
-        "## How far the valleys go",
-        "",
-        f"Profile likelihoods of the noise-free observation, weighed as if with independent errors "
-        f"of {typical}, {_listed_known(told['known'])}. An interval is open where the profile does "
-        f"not reach the threshold as far as it was followed.",
-        "",
-        markdown_rows(_profile_rows(record)),
-    ]
+    profiles = _profile_rows(record)
+    if profiles:
+        lines += [
+            "## How far the valleys go",
+            "",
+            f"Profile likelihoods of the noise-free observation, weighed as if with independent "
+            f"errors of {typical}, {_listed_known(told['known'])}. An interval is open where the "
+            f"profile does not reach the threshold as far as it was followed.",
+            "",
+            markdown_rows(profiles),
+        ]
     return lines
 
 
@@ -215,7 +217,7 @@ def _known_words(knowledge: Mapping[str, Mapping[str, float]]) -> str:
         for words, stds in half.items()
         if stds
     ]
-    return "; ".join(told).capitalize() + "." if told else ""
+    return "; ".join(told) + "." if told else ""
 
 
 def _listed_known(known: Sequence[str]) -> str:

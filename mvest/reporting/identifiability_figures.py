@@ -83,14 +83,11 @@ def designs_figure(record: Record) -> Figure:
         axes.tick_params(labelsize=8)
     grid[0].set_yticks(range(len(lines)), [f"{v}, {e}" for v, e in lines])
     grid[0].invert_yaxis()
-    handles, texts = grid[0].get_legend_handles_labels()
-    figure.legend(
-        handles, texts, loc="outside lower center", ncols=len(frames), frameon=False, fontsize=8
-    )
-    figure.suptitle(
+    _titled_legend(
+        figure,
+        axes,
         f"How well {label(modulus)} would be known with {typical} mm of noise "
         f"(dashed: {100 * told['target']:g} %; simulated)",
-        fontsize=10,
     )
     return figure
 
@@ -117,26 +114,32 @@ def profiles_figure(record: Record) -> Figure:
         upper.axhline(one["threshold"], color="black", linestyle="--", linewidth=1)
         upper.set_ylim(-0.3, 10)
         upper.set_title(label(name), fontsize=10)
-        _draw_followers(lower, record, _widest(found, name), name)
+        _draw_followers(lower, record, _first_of(found, name), name)
         lower.set_xlabel(label(name) + (" [MPa]" if name.startswith("E_f.") else " [factor]"))
         for axes in (upper, lower):
             axes.grid(alpha=0.3)
             axes.spines[["top", "right"]].set_visible(False)
     grid[0, 0].set_ylabel("deviance (95 % below the dashed line)", fontsize=8)
     grid[1, 0].set_ylabel("change of the others [%]", fontsize=8)
-    handles, texts = grid[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, texts, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8
-    )
-    figure.suptitle(
-        "Profile likelihoods, and (below, first observation) how the other parameters make up for "
-        "the one that is held; simulated",
-        fontsize=10,
+    _titled_legend(
+        figure,
+        grid[0, 0],
+        f"Profile likelihoods, and (below, {labels[0]}) how the other parameters make up for the "
+        f"one that is held; simulated",
     )
     return figure
 
 
-def _widest(found: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
+def _titled_legend(figure: Figure, axes: Any, title: str, columns: int | None = None) -> None:
+    """One legend above all panels, with the figure's title: below is where provenance is told."""
+    handles, texts = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, texts, loc="outside upper center", ncols=columns or len(texts), frameon=False,
+        fontsize=8, title=title, title_fontsize=10,
+    )  # fmt: skip
+
+
+def _first_of(found: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
     """The first observation's profile."""
     return next(one for one in found if one["parameter"] == name)
 
@@ -186,12 +189,12 @@ def valley_figure(record: Record) -> Figure:
         axes.autoscale_view()
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    handles, texts = axes.get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
-    figure.suptitle(
+    _titled_legend(
+        figure,
+        axes,
         f"95 % regions with {record['settings']['typical_mm']:g} mm of independent noise, all "
         f"vertices; simulated",
-        fontsize=10,
+        columns=3,
     )
     return figure
 
