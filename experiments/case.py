@@ -93,13 +93,8 @@ def check_case(config: Values, folder: Path) -> str:
     Raises
     ------
     MvestError
-        If the study has no case, or the case is not in order.
+        If the case is not in order.
     """
-    if config["study"] != "case":
-        raise ConfigurationError(
-            f"check=true checks a case folder; experiment {config['name']} has none: expected "
-            "experiment=own_valve"
-        )
     case = read_configured(config)
     settings = settings_of(config)
     model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")

@@ -316,6 +316,36 @@ class CycleConfig:
 
 
 @dataclass
+class FollowedConfig:
+    """Observations of the closed valve from which profile likelihoods are followed."""
+
+    vertices: str = MISSING  # a set of experiments.observed_sets
+    pressures_mmHg: list[float] = MISSING
+    label: str = MISSING
+
+
+@dataclass
+class DesignsConfig:
+    """Which observations are compared before any is made, and how far valleys are followed."""
+
+    pressures_mmHg: list[float] = field(default_factory=lambda: [60.0])  # of one closed frame more
+    cycle_times: list[float] = field(default_factory=list)  # s, observed in a whole cycle
+    cycle_dt: float = 0.05  # s
+    noise_mm: list[float] = field(default_factory=lambda: [0.1, 0.25, 0.5, 1.0])
+    typical_mm: float = 0.5  # noise of profiles and of what tables say at one noise
+    correlation_length_mm: float = 5.0
+    target: float = 0.05  # relative standard deviation that is wanted of a modulus
+    # Relative standard deviations of the nuisances, by what is assumed to be known of them: 0
+    # for what is known, and nothing is known of what is not named.
+    knowledge: dict[str, dict[str, float]] = field(default_factory=dict)
+    believed: str = ""  # which of these holds where it is asked how well pressure must be known
+    followed: list[FollowedConfig] = field(default_factory=list)
+    known: list[str] = field(default_factory=list)  # parameters that profiles hold
+    reach: dict[str, float] = field(default_factory=dict)  # largest change of each logarithm
+    points: int = 8  # of a profile, on each side
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -387,6 +417,7 @@ class Config:
     imaging: ImagingConfig | None = None
     external: ExternalConfig = field(default_factory=ExternalConfig)
     models: ModelsConfig = field(default_factory=ModelsConfig)
+    designs: DesignsConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

@@ -14,7 +14,7 @@ from experiments.case import check_case, run_case
 from experiments.config import register
 from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
-from experiments.external import check_external, run_external
+from experiments.external import run_external
 from experiments.folder import (
     CONFIG,
     RESULT,
@@ -24,8 +24,10 @@ from experiments.folder import (
     mark_done,
     require_writable,
 )
+from experiments.foresight import TwinForesight, foresee_own
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
+from experiments.identifiability import run_identifiability
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.joint import run_joint_study
@@ -43,6 +45,11 @@ from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.external import external_text, write_external_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
+from mvest.reporting.identifiability import (
+    identifiability_text,
+    publish_identifiability,
+    write_identifiability_tables,
+)
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.joint import joint_text, publish_joint, write_joint
@@ -86,9 +93,8 @@ def run_job(config: DictConfig) -> None:
     require_no_password(values["tracking"]["uri"])
     require_writable(folder)
     if values["check"]:
-        checks = {"volume": check_volume, "external": check_external}
-        check = checks.get(values["study"], check_case)
-        print(check(values, folder))
+        for check in study.checks() or (_nothing_to_check,):
+            print(check(values, folder), flush=True)
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
@@ -168,6 +174,14 @@ def _leave(values: Mapping[str, Any], record: Mapping[str, Any], folder: Path) -
     """Nothing more is done with a finished run."""
 
 
+def _nothing_to_check(values: Mapping[str, Any], folder: Path) -> str:
+    kinds = ", ".join(kind for kind, study in STUDIES.items() if study.checks())
+    raise ConfigurationError(
+        f"experiment {values['name']}: check=true has nothing to say of a study of the kind "
+        f"{values['study']}; expected one of {kinds}"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Study:
     """A kind of study: how it is run, told, tabulated and published.
@@ -188,6 +202,9 @@ class Study:
     finish : callable
         (configuration, record, output folder): what is done with a run that is on disk, also with
         one that was done before.
+    checks : callable
+        () -> what ``check=true`` says, one after another, without estimating anything, each
+        (configuration, output folder) -> text. Made once for all jobs of a sweep.
     """
 
     run: Callable[[Mapping[str, Any], str, Path, float], tuple[dict[str, Any], list[Path]]]
@@ -196,6 +213,7 @@ class Study:
     publish: Callable[[Path, str, Mapping[str, Any], Path], list[Path]]
     keeps_failures: bool = False
     finish: Callable[[Mapping[str, Any], Mapping[str, Any], Path], None] = _leave
+    checks: Callable[[], tuple[Callable[[Mapping[str, Any], Path], str], ...]] = tuple
 
 
 STUDIES: dict[str, Study] = {
@@ -204,6 +222,7 @@ STUDIES: dict[str, Study] = {
         lambda record: text_table([record]),
         lambda folder, record: write_tables(folder, record["table"], [record]),
         lambda results, name, record, folder: publish(results, name, record, folder / "fields.npz"),
+        checks=lambda: (TwinForesight(),),
     ),
     "closure": Study(
         run_closure_study,
@@ -235,6 +254,12 @@ STUDIES: dict[str, Study] = {
         write_cycle,
         lambda results, _name, record, _folder: publish_cycle(results, record),
     ),
+    "identifiability": Study(
+        run_identifiability,
+        identifiability_text,
+        write_identifiability_tables,
+        lambda results, _name, record, _folder: publish_identifiability(results, record),
+    ),
     "donor": Study(
         run_donor,
         donor_text,
@@ -246,12 +271,14 @@ STUDIES: dict[str, Study] = {
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+        checks=lambda: (check_case, foresee_own),
     ),
     "volume": Study(
         run_volume,
         case_text,
         write_case_tables,
         lambda _results, _name, _record, _folder: [],
+        checks=lambda: (check_volume,),
     ),
     "imaged_patient": Study(
         run_imaged_patient,
@@ -287,6 +314,7 @@ STUDIES: dict[str, Study] = {
         external_text,
         write_external_tables,
         lambda _results, _name, _record, _folder: [],
+        checks=lambda: (check_external,),
     ),
 }
 """Kinds of studies that a configuration can name."""

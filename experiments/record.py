@@ -13,6 +13,7 @@ import numpy as np
 
 from mvest.errors import MvestError, cannot_write
 from mvest.provenance import provenance
+from mvest.reporting.foresight import confounded_record
 from mvest.study import Observation, StudyResult
 from mvest.typing import FloatArray
 from mvest.valve.anatomy import LeafletSurface, Valve
@@ -240,4 +241,5 @@ def _identifiability(result: StudyResult) -> dict[str, Any] | None:
         "cramer_rao_std": bound,
         "condition_number": condition if np.isfinite(condition) else None,
         "flat": list(found.flat()),
+        "confounded": confounded_record(found),
     }

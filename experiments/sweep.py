@@ -31,7 +31,7 @@ from experiments.check import require_admissible
 from experiments.collect import collect
 from experiments.folder import is_done, require_writable, write_failure
 from experiments.guard import run_guarded
-from experiments.job import FailedRunError, run_job
+from experiments.job import FailedRunError, require_study, run_job
 from experiments.plan import Plan, PlannedJob, make_plan, plan_run
 from experiments.progress import SweepBar, announce_compilation
 from experiments.request import Request, as_published
@@ -95,6 +95,8 @@ class PlanRuns(Callback):
             _check(job.values, job.overrides)
         if config.dry_run:
             _tell(plan)
+        if config.check:
+            _foresee(plan)
         require_writable(plan.folder)
         plan.write()
         print(plan.summary())
@@ -252,6 +254,16 @@ def _tell(plan: Plan) -> NoReturn:
     """Say what would run, and end."""
     print(plan.summary())
     print(plan.listing())
+    raise StopApplication(0)
+
+
+def _foresee(plan: Plan) -> NoReturn:
+    """Say what the data of each job will tell, and end."""
+    checks = require_study(plan.jobs[0].values).checks()
+    for job in plan.jobs:
+        if not checks or job.values["study"] != plan.jobs[0].values["study"]:
+            raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")
+        print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")
     raise StopApplication(0)
 
 

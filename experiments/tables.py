@@ -12,6 +12,7 @@ from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.cycle import write_cycle
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
+from mvest.reporting.identifiability import write_identifiability_study
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.joint import write_joint
@@ -30,6 +31,7 @@ OTHER_TABLES = {
     "closure": write_closure_tables,
     "joint": write_joint,
     "cycle": write_cycle,
+    "identifiability": write_identifiability_study,
     "donor": write_donor_tables,
     "law": write_law_tables,
     "imaging": write_imaging_study,

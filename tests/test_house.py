@@ -64,6 +64,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.observation_errors",
         "mvest.surface_observation",
     ),
+    "mvest.foresight": (*LEAVES, "mvest.estimation", "mvest.study"),
     "mvest.virtual_patient": (
         *LEAVES,
         "mvest.cases",
@@ -89,6 +90,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.valve",
         "mvest.mechanics",
         "mvest.estimation",
+        "mvest.foresight",
         "mvest.model",
         "mvest.observation",
         "mvest.observation_errors",

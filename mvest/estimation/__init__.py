@@ -7,6 +7,7 @@ covariance S, gain K.
 """
 
 from mvest.estimation.considered import SchmidtFilter
+from mvest.estimation.design import Design, together
 from mvest.estimation.diagnostics import (
     Consistency,
     ZTest,
@@ -26,11 +27,17 @@ from mvest.estimation.frames import (
     smooth_frames,
 )
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.identifiability import Identifiability, cramer_rao_bound, identifiability
+from mvest.estimation.identifiability import (
+    Confounded,
+    Identifiability,
+    cramer_rao_bound,
+    identifiability,
+)
 from mvest.estimation.iterated import IteratedFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.profile import Profile, profile
 from mvest.estimation.sequential import (
     DriftEstimate,
     DriftSmoother,
@@ -42,7 +49,9 @@ from mvest.estimation.transform import Identity, Log, Transform
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [
+    "Confounded",
     "Consistency",
+    "Design",
     "DriftEstimate",
     "DriftSmoother",
     "Estimate",
@@ -60,6 +69,7 @@ __all__ = [
     "ObservationNoise",
     "PaperFilter",
     "Prediction",
+    "Profile",
     "Reason",
     "SchmidtFilter",
     "SequentialEstimate",
@@ -78,7 +88,9 @@ __all__ = [
     "moran",
     "nees",
     "observation_noise",
+    "profile",
     "random_walk",
     "smooth_frames",
+    "together",
     "zero_mean",
 ]

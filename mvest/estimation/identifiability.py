@@ -2,8 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -13,6 +16,26 @@ from mvest.typing import FloatArray
 
 RELEVANT_SHARE = 0.1
 """Smallest share of a parameter in a combination that is worth naming."""
+
+
+@dataclass(frozen=True, slots=True)
+class Confounded:
+    """Parameters that make up for each other in the data.
+
+    Attributes
+    ----------
+    names : tuple of str, (q,)
+        The first is the one that the others follow best.
+    exchange : tuple of float, (q,)
+        How they move together along the valley: change of each, in parts of its scale, that goes
+        with a change of the first by one scale, cov(i, first) / var(first). The first's own is 1.
+    correlation : float
+        Smallest size of the correlation of the first with one of the others, at the bound.
+    """
+
+    names: tuple[str, ...]
+    exchange: tuple[float, ...]
+    correlation: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +95,38 @@ class Identifiability:
             for i, width in enumerate(widths)
             if width > limit
         )
+
+    def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[Confounded, ...]:
+        """Groups of parameters that the data hardly tell apart, the largest group first.
+
+        Two belong to one group if the size of their correlation at the bound is at least `limit`,
+        and both are known to no better than `width` parts of their scales: what is known well is
+        told apart, however correlated it is. What is not determined at all has no correlation;
+        `flat` tells of it.
+        """
+        uncertain = self.std / self.scale >= width
+        size = np.where(np.outer(uncertain, uncertain), np.abs(self.correlation), 0.0)
+        # NaN compares as false.
+        alike = sparse.coo_array(size >= limit)
+        count, group = connected_components(cast(Any, alike), directed=False)
+        found = []
+        for label in range(count):
+            members = np.flatnonzero(group == label)
+            if members.size < 2:
+                continue
+            first = members[np.argmax(size[np.ix_(members, members)].sum(axis=0))]
+            others = [int(i) for i in members[np.argsort(-size[first, members])] if i != first]
+            scaled = self.covariance[:, first] / (self.scale * self.scale[first])
+            exchange = scaled / scaled[first]
+            order = [int(first), *others]
+            found.append(
+                Confounded(
+                    tuple(self.names[i] for i in order),
+                    tuple(float(exchange[i]) for i in order),
+                    float(size[first, others].min()),
+                )
+            )
+        return tuple(sorted(found, key=lambda one: -len(one.names)))
 
 
 def identifiability(

@@ -7,7 +7,7 @@ considered, or left fixed, as each unknown says. Frames that are held out are pr
 shown.
 """
 
-from mvest.personalise.chain import personalise
+from mvest.personalise.chain import foresee_case, personalise
 from mvest.personalise.model import build_model
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import (
@@ -27,5 +27,6 @@ __all__ = [
     "Treatment",
     "Unknown",
     "build_model",
+    "foresee_case",
     "personalise",
 ]

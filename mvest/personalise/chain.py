@@ -26,6 +26,7 @@ from mvest.estimation import (
 )
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import to_filter
+from mvest.foresight import Foresight, foresee
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation import Observation
 from mvest.observation_errors import SpatialCorrelation
@@ -50,7 +51,7 @@ from mvest.surface_observation import (
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.band import Band
 
-__all__ = ["personalise"]
+__all__ = ["foresee_case", "personalise"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
@@ -144,6 +145,21 @@ def personalise(
         chain.geometry,
         chain.image_share(result),
     )
+
+
+def foresee_case(
+    case: ValveCase,
+    settings: PersonaliseSettings,
+    *,
+    store: Path | None = None,
+    on_step: OnStep | None = None,
+) -> Foresight:
+    """What the closed frame of a case will tell, found out with one closure; see `personalise`.
+
+    Errors that samples of the frames tell of are left out: each sample would be a closure.
+    """
+    chain = _Chain(case, settings, store, on_step)
+    return foresee(chain.study_case(chain.filter), chain.plain_observation())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,7 +272,11 @@ class _Chain:
 
     def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
         """All unknowns."""
-        case = Case(
+        return self._widened(estimate(self.study_case(filter_), observation), observation)
+
+    def study_case(self, filter_: Filter) -> Case:
+        """The estimation of all unknowns, without its observation."""
+        return Case(
             self.names,
             self.shared,
             self.prior,
@@ -264,7 +284,6 @@ class _Chain:
             self.transform,
             self.settings.mechanics.tissue,
         )
-        return self._widened(estimate(case, observation), observation)
 
     def _widened(self, result: StudyResult, observation: Observed) -> StudyResult:
         """The result with the covariance that the error samples give it, if there are any."""

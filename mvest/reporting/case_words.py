@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from mvest.reporting.case_information import columns_of
+from mvest.reporting.foresight import alike_words
 from mvest.reporting.markup import MISSING, number
 
 __all__ = [
@@ -226,6 +227,7 @@ def identifiability_words(record: Record) -> list[str]:
             "The data alone do not determine: " + ", ".join(flat) + ". What is said of them rests "
             "on what was believed beforehand."
         )
+    words += [alike_words(group, moduli) for group in found.get("confounded") or []]
     bound = found.get("cramer_rao_std")
     columns = columns_of(record.get("parameters") or [], len(bound or []))
     if bound and columns:

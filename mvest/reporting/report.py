@@ -51,6 +51,11 @@ OTHERS = (
     ("gate", "One closed state", ()),
     ("closure", "A closing valve", ("closure",)),
     ("law", "Two material laws on the same valve (simulated)", ("law", "law_biaxial")),
+    (
+        "identifiability",
+        "What data can tell, before any are taken",
+        ("identifiability_designs", "identifiability_profiles", "identifiability_valley"),
+    ),
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
@@ -73,6 +78,13 @@ CAPTIONS = {
     "law": "Stress of each leaflet under equibiaxial stretch: true, as estimated with the "
     "exponential law, and with the linear law from the same data. Simulated.",
     "law_biaxial": "The exponential law with the coefficients of excised leaflets.",
+    "identifiability_designs": "Expected standard deviation of a modulus with each design: which "
+    "vertices are seen, with which errors, in which frames, and what is known of the nuisances. "
+    "Simulated.",
+    "identifiability_profiles": "Profile likelihoods: the least misfit with one parameter held, "
+    "and how the others then make up for it. Simulated.",
+    "identifiability_valley": "95 % regions of a modulus with a nuisance, for different frames; "
+    "the floor of the valley that the profile followed. Simulated.",
     "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",

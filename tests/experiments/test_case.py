@@ -270,9 +270,10 @@ def test_an_unknown_treatment_names_the_known_ones(config):
         settings_of(config)
 
 
-def test_a_check_draws_the_case_and_computes_nothing(run, folder, tmp_path, monkeypatch):
+def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
+    (built,) = [use(monkeypatch)]
     monkeypatch.setattr(
-        "mvest.model.ClosureModel.close", lambda *a, **k: pytest.fail("a closure was computed")
+        "mvest.personalise.chain.estimate", lambda *a, **k: pytest.fail("something was estimated")
     )
     status, out, err = run(*OWN, f"case={folder}", "check=true")
     assert status == 0, err
@@ -282,12 +283,23 @@ def test_a_check_draws_the_case_and_computes_nothing(run, folder, tmp_path, monk
     assert "In order; drawn in" in out
     written = {path.name for path in (tmp_path / "outputs").rglob("*") if path.is_file()}
     assert {name for name in written if not name.startswith(".")} == {"case.png", "case.pdf"}
+    # One closure, at the prior's means; the values that were seen play no part.
+    (model,) = built
+    (at,) = model.calls
+    assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
+    assert "864 numbers of closed; 0.3 mm of noise stated, alike over 8 mm" in out
+    assert "No estimation was run." in out
+    # The formula's belly is pressure over stiffness, and its other parts tell the pressure.
+    rows = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
+    for name in model.names:
+        assert rows[name][0] == name
 
 
-def test_only_a_case_can_be_checked(run):
-    status, _, err = run("experiment=table1", "check=true")
+def test_a_study_without_data_cannot_be_checked(run):
+    status, _, err = run("experiment=gate", "check=true")
     assert status == 2
-    assert "check=true checks a case folder; experiment table1 has none" in err
+    assert "experiment gate: check=true has nothing to say of a study of the kind gate" in err
+    assert "expected one of twin, case, volume" in err
 
 
 def test_a_check_is_no_part_of_the_result(folder):

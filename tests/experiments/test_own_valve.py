@@ -16,6 +16,7 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 from experiments.run import main
+from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.model import ClosureModel
 from mvest.valve.io import write_surface
@@ -213,7 +214,9 @@ def run(tmp_path, monkeypatch, capsys):
     # Merged vertices are numbered anew, which two frames must be alike.
     [*((kind, False) for kind in FORMATS), ("stl", True), ("obj objects", True)],
 )
-def test_every_format_is_checked_and_drawn(run, tmp_path, seen, kind, corresponds):
+def test_every_format_is_checked_and_drawn(run, tmp_path, monkeypatch, seen, kind, corresponds):
+    # What is read is tested here, not what a closure would tell of it.
+    monkeypatch.setattr(ClosureModel, "__call__", lambda *_: Prediction.failed("not closed here"))
     # A closed leaflet lies across the annulus' axis: without a table of chordae its own angle round
     # the valve is needed, and an angle about that axis has the wrong period.
     folder = write(tmp_path / "mine", seen, FORMATS[kind], Scanner(3), corresponds)
@@ -224,6 +227,7 @@ def test_every_format_is_checked_and_drawn(run, tmp_path, seen, kind, correspond
     assert "34 chordae from 2 papillary tips" in out
     assert ("matched to the reference" in out) is not corresponds
     assert list((tmp_path / "outputs" / "own_valve").glob("*/case.png"))
+    assert "is not known, the model has no prediction at the assumed parameters" in out
 
 
 @pytest.mark.slow

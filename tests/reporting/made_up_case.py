@@ -180,6 +180,14 @@ def _record(fields: dict[str, np.ndarray]) -> dict[str, Any]:
             "cramer_rao_std": [0.9, 0.32, 0.009],
             "condition_number": 48.0,
             "flat": [],
+            "confounded": [
+                {
+                    "parameters": ["E_f.anterior", "chord_slack"],
+                    "changes": [0.58, -0.0031],
+                    "relative": [0.1, -0.031],
+                    "correlation": 0.9578,
+                }
+            ],
             "shares": [
                 {
                     "parameter": "E_f.anterior",

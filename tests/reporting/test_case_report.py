@@ -97,6 +97,14 @@ def test_the_answer_stands_at_the_top(html) -> None:
     assert told.index("E_f anterior 5.8 MPa") < told.index("Contents")
 
 
+def test_what_the_data_hardly_tell_apart_is_named(html) -> None:
+    assert (
+        "The data hardly tell apart E_f anterior and slack of the chordae (correlations of at "
+        "least 0.957): +10 % of E_f anterior with −3.1 % of slack of the chordae looks almost the "
+        "same."
+    ) in Page(html).text
+
+
 def test_the_page_loads_nothing_and_is_not_too_large(written, html) -> None:
     local = {path.name for path in written}
     outside = [

@@ -1,0 +1,162 @@
+"""Identifiability in words: what data will tell, and which parameters they cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import norm
+
+from mvest.estimation import Confounded, Gaussian, Identifiability, Transform
+from mvest.reporting.markup import MISSING, number
+from mvest.typing import FloatArray
+
+__all__ = ["alike_words", "confounded_record", "confounded_words", "foresight_text"]
+
+STEP = 0.1
+"""Change by which it is shown how parameters make up for each other, in parts of a scale."""
+
+UNITS = {"E_f": "MPa", "G": "MPa", "shift": "mm", "turn": "degrees"}
+"""Of parameters by the first part of their name; the others are factors."""
+
+
+def foresight_text(
+    title: str,
+    assumed: FloatArray,
+    prior: Gaussian,
+    transform: Transform,
+    data: Identifiability,
+    informed: Identifiability | None,
+    observed: str,
+) -> str:
+    """The answer of the Fisher information as text for a terminal.
+
+    Parameters
+    ----------
+    title : str
+    assumed : (p,) in the units of the parameters
+    prior : Gaussian
+        Of the parameters.
+    transform : Transform
+        Coordinates in which intervals are symmetric.
+    data, informed : Identifiability
+        Of the data alone, and with the prior (None where that holds a parameter fixed).
+    observed : str
+        What is observed, and how well.
+    """
+    z = transform.forward(assumed)
+    rows = []
+    for k, name in enumerate(data.names):
+        low = high = None
+        if informed is not None:
+            reach = np.zeros_like(z)
+            reach[k] = norm.ppf(0.975) * informed.std[k] / transform.derivative(z)[k]
+            low, high = (float(transform.inverse(z + s * reach)[k]) for s in (-1.0, 1.0))
+        rows.append(
+            {
+                "parameter": name,
+                "unit": _unit(name) or MISSING,
+                "assumed": number(float(assumed[k])),
+                "± beforehand": number(float(prior.std[k]), 2),
+                "± from the data alone": _width(float(data.std[k])),
+                "[%]": _percent(data, k, assumed),
+                "± with both": MISSING if informed is None else _width(float(informed.std[k])),
+                "95 % interval to expect": MISSING
+                if low is None or high is None
+                else f"{number(low)} to {number(high)}",
+            }
+        )
+    condition = data.condition_number
+    lines = [
+        f"{title}: what the data will tell (Cramér-Rao bound at the assumed values)",
+        f"Observed: {observed}",
+        "",
+        pd.DataFrame(rows).to_string(index=False),
+        "",
+        "Condition number of the information: "
+        + (number(condition) if np.isfinite(condition) else "infinite")
+        + " (1: all parameters, in parts of their size, are told equally well)",
+        *(confounded_words(data) or ["The data tell all parameters apart."]),
+        *(f"Known badly from the data alone: {words}" for words in data.flat()),
+        "No estimation was run.",
+    ]
+    return "\n".join(lines)
+
+
+def confounded_words(found: Identifiability) -> list[str]:
+    """One sentence for each group of parameters that the data hardly tell apart."""
+    return [alike_words(group) for group in confounded_record(found)]
+
+
+def confounded_record(found: Identifiability) -> list[dict[str, Any]]:
+    """The same as plain data, for a record: parameters and a change of each that hardly shows.
+
+    Changes are in the parameters' own units, for a change of the first by a tenth of its scale.
+    """
+    return [_plain(group, found) for group in found.confounded()]
+
+
+def _plain(group: Confounded, found: Identifiability) -> dict[str, Any]:
+    at = [found.names.index(name) for name in group.names]
+    return {
+        "parameters": list(group.names),
+        "changes": [
+            STEP * exchange * float(found.scale[k])
+            for exchange, k in zip(group.exchange, at, strict=True)
+        ],
+        "relative": [STEP * exchange for exchange in group.exchange],
+        "correlation": group.correlation,
+    }
+
+
+def alike_words(group: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> str:
+    """``The data hardly tell apart A and B: +10 % of A with −5 % of B looks almost the same``.
+
+    Parameters
+    ----------
+    group : mapping
+        Of `confounded_record`.
+    labels : mapping, optional
+        What parameters are called.
+    """
+    names: Sequence[str] = group["parameters"]
+    told = [(labels or {}).get(name, name) for name in names]
+    moved = [
+        f"{_change(name, change, relative)} of {label}"
+        for name, label, change, relative in zip(
+            names, told, group["changes"], group["relative"], strict=True
+        )
+    ]
+    return (
+        f"The data hardly tell apart {_listed(told)} (correlations of at least "
+        f"{np.floor(1000 * group['correlation']) / 1000:.3g}): {moved[0]} with "
+        f"{_listed(moved[1:])} looks almost the same."
+    )
+
+
+def _change(name: str, change: float, relative: float) -> str:
+    if _unit(name) in ("mm", "degrees"):
+        return f"{change:+.2g} {_unit(name)}".replace("-", "−")
+    return f"{100 * relative:+.2g} %".replace("-", "−")
+
+
+def _listed(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _unit(name: str) -> str:
+    return UNITS.get(name.partition(".")[0], "")
+
+
+def _width(std: float) -> str:
+    return number(std, 2) if np.isfinite(std) else "not determined"
+
+
+def _percent(data: Identifiability, k: int, assumed: FloatArray) -> str:
+    """Of the assumed value; a dash for a parameter without size."""
+    std = float(data.std[k])
+    if assumed[k] == 0.0 or not np.isfinite(std):
+        return MISSING
+    return number(100.0 * std / abs(float(assumed[k])), 2)
