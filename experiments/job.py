@@ -27,6 +27,7 @@ from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.patient import run_patient
+from experiments.prediction import run_prediction
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
@@ -39,6 +40,11 @@ from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
+from mvest.reporting.prediction import (
+    prediction_text,
+    publish_prediction,
+    write_prediction_tables,
+)
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
 
@@ -205,6 +211,14 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "prediction": Study(
+        run_prediction,
+        prediction_text,
+        write_prediction_tables,
+        lambda results, _, record, folder: publish_prediction(
+            results, record, folder / "fields.npz"
+        ),
     ),
     "donor": Study(
         run_donor,

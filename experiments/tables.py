@@ -15,6 +15,7 @@ from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
+from mvest.reporting.prediction import write_prediction_tables
 from mvest.reporting.publish import RECORDS, regenerate
 from mvest.reporting.report import write_report
 from mvest.reporting.sweeps import read_sweeps, write_sweep
@@ -26,6 +27,7 @@ OTHER_TABLES = {
     "closure": write_closure_tables,
     "donor": write_donor_tables,
     "imaging": write_imaging_study,
+    "prediction": write_prediction_tables,
     "volume": write_volume_tables,
 }
 """Tables of studies with records of their own."""

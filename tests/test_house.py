@@ -95,6 +95,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.study",
         "mvest.surface_observation",
     ),
+    "mvest.prediction": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.estimation",
+        "mvest.model",
+    ),
     "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
     "mvest.imaged_case": (
         *LEAVES,

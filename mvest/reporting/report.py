@@ -58,6 +58,7 @@ OTHERS = (
         "Leaflets found in simulated echo volumes",
         ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
     ),
+    ("prediction", "What an estimated valve would do (simulated)", ("prediction",)),
     ("donor", "A recorded donor valve", ("donor",)),
     ("benchmark", "How fast", ("benchmark",)),
 )
@@ -74,6 +75,8 @@ CAPTIONS = {
     "imaging_training": "Errors of each stage against the number of training volumes. Simulated.",
     "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
     "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
+    "prediction": "A leaking valve closed as observed and under changed conditions, seen from the "
+    "atrium, and measures of it with their 95 % intervals. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "benchmark": "Where the time goes.",
 }
