@@ -8,7 +8,7 @@ its posterior. Only then are the same scenarios computed with the true parameter
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,15 @@ from mvest.prediction.measures import contact_reach, meaning_of
 from mvest.prediction.predict import Sample, closed_valve
 from mvest.study import StudyResult, estimate, simulate_observation
 from mvest.typing import FloatArray
+from mvest.valve.anatomy import Valve
 
 __all__ = ["run_prediction"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
+
+MEASURED_ON = (96, 22)
+"""Vertices around and along the leaflets of the surface on which shapes are measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,20 +57,23 @@ def run_prediction(config: Values, config_hash: str, folder: Path, started: floa
     settings = config["prediction"]
     scenarios = _scenarios(settings)
     twin = build_twin(config)
+    # Measured on more points than are observed, which cost time where their errors are correlated.
+    valve = template_of(config).valve(*MEASURED_ON)
     seeds = [config["seed"] + k for k in range(settings["patients"])]
     patients = []
     total = sum(len(scenarios) * (2 + _count(settings, k == 0)) + 1 for k in range(len(seeds)))
     with PartBar("prediction", total, "closure") as bar:
         for number, seed in enumerate(seeds):
             count = _count(settings, number == 0)
-            patients.append(_predicted(twin, seed, settings, scenarios, count, bar.step))
+            patients.append(_predicted(twin, seed, settings, scenarios, valve, count, bar.step))
         truths = {p.seed: _true_scenarios(twin, p, scenarios, bar.step) for p in patients}
+    usual = replace(twin.model, valve=valve)
     record = record_of(config, config_hash, twin.model, patients[0].truth, started, 0)
     record |= {
         "patients": [_told(p, truths[p.seed]) for p in patients],
         "scenarios": {name: scenario.title for name, scenario in scenarios.items()},
-        "stress_meshes": _stress_on_meshes(config, twin, patients[0].truth),
-        "reach_mm": contact_reach(twin.model),
+        "stress_meshes": _stress_on_meshes(config, usual, patients[0].truth),
+        "reach_mm": contact_reach(usual),
         "observed": {
             "vertices": len(twin.valve.surface.vertices),
             "truth_cells": [config["truth"][k] for k in ("columns", "rows")],
@@ -89,7 +96,7 @@ def run_prediction(config: Values, config_hash: str, folder: Path, started: floa
     if not first.scenarios:
         return record | {"status": "failed", "reason": first.result.reason}, []
     fields = folder / "fields.npz"
-    _write_fields(fields, twin, first, scenarios)
+    _write_fields(fields, valve, first, scenarios)
     if not config["figures"]:
         return record, []
     return record, save_figure(folder / "prediction", prediction_figure(record, fields), record)
@@ -118,8 +125,9 @@ def _predicted(
     seed: int,
     settings: Values,
     scenarios: Mapping[str, Scenario],
+    valve: Valve,
     count: int,
-    step: Any,
+    step: Callable[[], None],
 ) -> _Patient:
     rng = np.random.default_rng(seed)
     spread = np.array(settings["spread"], dtype=float)
@@ -148,7 +156,8 @@ def _predicted(
     if result.filtered is None or not result.converged:
         return _Patient(seed, truth, result, {}, {})
     samples = posterior_samples(result.filtered, count, seed)
-    models = {name: model_under(twin.model, scenario) for name, scenario in scenarios.items()}
+    measured = replace(twin.model, valve=valve)
+    models = {name: model_under(measured, scenario) for name, scenario in scenarios.items()}
     found = {}
     for name, model in models.items():
         found[name] = predict(model, result.filtered, samples, lambda _: step())
@@ -157,12 +166,12 @@ def _predicted(
 
 
 def _true_scenarios(
-    twin: Twin, patient: _Patient, scenarios: Mapping[str, Scenario], step: Any
+    twin: Twin, patient: _Patient, scenarios: Mapping[str, Scenario], step: Callable[[], None]
 ) -> dict[str, dict[str, Sample]]:
     """Every scenario with the true parameters: on the truth's mesh, and on the estimator's."""
     found = {}
     for name, model in patient.models.items():
-        own = model_under(twin.truth_model, scenarios[name])
+        own = model_under(replace(twin.truth_model, valve=model.valve), scenarios[name])
         found[name] = {
             "own": closed_valve(own, patient.truth)[0],
             "same": closed_valve(model, patient.truth)[0],
@@ -171,7 +180,9 @@ def _true_scenarios(
     return found
 
 
-def _stress_on_meshes(config: Values, twin: Twin, truth: FloatArray) -> list[dict[str, Any]]:
+def _stress_on_meshes(
+    config: Values, usual: ClosureModel, truth: FloatArray
+) -> list[dict[str, Any]]:
     """Peak stress of the first patient as observed, on finer and finer meshes."""
     rows = []
     for columns, count in config["prediction"]["stress_meshes"]:
@@ -181,7 +192,7 @@ def _stress_on_meshes(config: Values, twin: Twin, truth: FloatArray) -> list[dic
             config["mechanics"]["element"],
             Path(config["paths"]["outputs"]) / "meshes",
         )
-        model: ClosureModel = replace(twin.model.fresh(), mesh=mesh, guide=None)
+        model = replace(usual.fresh(), mesh=mesh, guide=None)
         sample = closed_valve(model, truth)[0]
         stress = {k: v for k, v in sample.measures.items() if k.startswith("stress")}
         gap = sample.measures.get("gap_mm2")
@@ -265,10 +276,10 @@ def _known(value: float) -> float | None:
 
 
 def _write_fields(
-    path: Path, twin: Twin, patient: _Patient, scenarios: Mapping[str, Scenario]
+    path: Path, valve: Valve, patient: _Patient, scenarios: Mapping[str, Scenario]
 ) -> None:
     """Closed shapes of the first patient at the estimate, NaN where there is none."""
-    surface = twin.valve.surface
+    surface = valve.surface
     blank = np.full(surface.vertices.shape, np.nan)
     shapes = [patient.scenarios[name].shape for name in scenarios]
     np.savez_compressed(
@@ -278,7 +289,7 @@ def _write_fields(
         rest=surface.vertices.astype(np.float32),
         triangles=surface.triangles.astype(np.int32),
         region=surface.region.astype(np.int8),
-        annulus=twin.valve.annulus.astype(np.int32),
-        free_edge=twin.valve.free_edge.astype(np.int32),
-        tips=twin.valve.papillary_tips.astype(np.float32),
+        annulus=valve.annulus.astype(np.int32),
+        free_edge=valve.free_edge.astype(np.int32),
+        tips=valve.papillary_tips.astype(np.float32),
     )

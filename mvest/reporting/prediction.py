@@ -146,7 +146,7 @@ def _mesh_table(record: Record) -> str:
                 value = entry.get(f"stress_{which}_{region}_mpa")
                 row[f"{region} {label} (MPa)"] = number(value)
         rows.append(row)
-    return markdown_rows(rows)
+    return markdown_rows(rows) if rows else "Not computed."
 
 
 def _failures(record: Record) -> str:

@@ -75,7 +75,7 @@ def prediction_figure(record: Record, fields: Path) -> Figure:
     _draw_valves(upper, valve, shapes, titles, record)
     _draw_measures(lower, record)
     figure.suptitle(
-        "An estimated valve as observed and under changed conditions (simulated)", fontsize=12
+        "An estimated valve as observed and under changed conditions (simulated)\n", fontsize=12
     )
     return figure
 
@@ -88,9 +88,9 @@ def _valve(arrays: Mapping[str, Any]) -> CaseFields:
         rest=arrays["rest"].astype(float),
         annulus=arrays["annulus"].astype(np.int64),
         free_edge=arrays["free_edge"].astype(np.int64),
-        frames=(),
-        seen=np.zeros(0, dtype=bool),
-        tips=arrays["tips"].astype(float)[None],
+        frames=("closed",),
+        seen=np.ones(1, dtype=bool),
+        tips=np.stack([arrays["tips"].astype(float)] * 2),
         chord_tip=none,
         chord_insertion=none,
         observed_points={},
@@ -167,8 +167,8 @@ def _draw_measures(part: Any, record: Record) -> None:
         for number, patient in enumerate(patients):
             shift = 0.0 if number == 0 else 0.14 + 0.13 * number
             _dots(panel, patient, names, measure, shift, COLOURS[0] if number == 0 else OTHER)
-        panel.set_xticks(range(len(names)), list(record["scenarios"].values()), fontsize=8)
-        panel.tick_params(axis="x", rotation=20)
+        panel.set_xticks(range(len(names)), list(record["scenarios"].values()))
+        panel.set_xticklabels(panel.get_xticklabels(), fontsize=8, rotation=20, ha="right")
         panel.set_ylabel(label, fontsize=9)
         panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
         panel.grid(axis="y", alpha=0.3)
