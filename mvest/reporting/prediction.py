@@ -55,11 +55,17 @@ def _predicted(record: Record) -> Iterator[tuple[int, str, str, Mapping[str, Any
 
 
 def coverage(record: Record, measure: str, mesh: str) -> tuple[int, int]:
-    """How many intervals hold the truth computed on a mesh (own, same), and of how many."""
+    """How many intervals hold the truth computed on a mesh (own, same), and of how many.
+
+    Where all samples and the truth are one number (no gap at all) there is no uncertainty that
+    could be right or wrong: such an interval is not counted.
+    """
     inside = [
         row[f"inside_{mesh}_mesh"]
         for _, _, name, row in _predicted(record)
-        if name == measure and row[f"inside_{mesh}_mesh"] is not None
+        if name == measure
+        and row[f"inside_{mesh}_mesh"] is not None
+        and not row["low"] == row["high"] == row[f"truth_{mesh}_mesh"]
     ]
     return sum(inside), len(inside)
 
@@ -204,7 +210,8 @@ def _readable(record: Record) -> str:
             "Standard deviation of the samples / to first order (derivative of the closed shape), "
             f"of the same patient; and how many intervals of all {len(record['patients'])} "
             "patients and conditions hold the truth: computed on its own mesh, and on the mesh of "
-            "the estimate, where only the uncertainty of the parameters is left.",
+            "the estimate, where only the uncertainty of the parameters is left. Intervals in "
+            "which all samples and the truth are the same number are not counted.",
             "",
             _uncertainty_table(record),
             "",
