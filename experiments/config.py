@@ -21,6 +21,7 @@ from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.personalise import CaseMesh, PaperSettings
+from mvest.prediction import Scenario
 from mvest.provenance import config_hash
 from mvest.sheet.sheet import Sheet
 from mvest.simulated_motion import PopulationSettings
@@ -61,6 +62,7 @@ CycleProtocolConfig = schema(CycleProtocol)
 TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
 SheetConfig = schema(Sheet)
+ScenarioConfig = schema(Scenario)
 
 
 @dataclass
@@ -346,6 +348,19 @@ class DesignsConfig:
 
 
 @dataclass
+class PredictionConfig:
+    """What is predicted of estimated valves, and how well their truth is hit."""
+
+    scenarios: dict[str, ScenarioConfig] = field(default_factory=dict)  # type: ignore[valid-type]
+    samples: int = 32  # of the first patient's posterior; a power of two
+    patients: int = 1  # simulated, with the seeds seed, seed + 1, ...
+    further_samples: int = 8  # of the posterior of every other patient
+    spread: list[float] = field(default_factory=list)  # SD of the logarithms of true parameters
+    # Cells [around, annulus to edge] of further meshes on which peak stress is computed.
+    stress_meshes: list[Any] = field(default_factory=list)
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -418,6 +433,7 @@ class Config:
     external: ExternalConfig = field(default_factory=ExternalConfig)
     models: ModelsConfig = field(default_factory=ModelsConfig)
     designs: DesignsConfig | None = None
+    prediction: PredictionConfig = field(default_factory=PredictionConfig)
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

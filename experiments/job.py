@@ -14,7 +14,7 @@ from experiments.case import check_case, run_case
 from experiments.config import register
 from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
-from experiments.external import run_external
+from experiments.external import check_external, run_external
 from experiments.folder import (
     CONFIG,
     RESULT,
@@ -34,6 +34,7 @@ from experiments.joint import run_joint_study
 from experiments.law import run_law_study
 from experiments.models import run_models
 from experiments.patient import run_patient
+from experiments.prediction import run_prediction
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
 from experiments.twin import run_twin
@@ -56,6 +57,11 @@ from mvest.reporting.joint import joint_text, publish_joint, write_joint
 from mvest.reporting.law import law_text, publish_law, write_law_tables
 from mvest.reporting.models import models_text, publish_models, write_models_tables
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
+from mvest.reporting.prediction import (
+    prediction_text,
+    publish_prediction,
+    write_prediction_tables,
+)
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
 
@@ -259,6 +265,14 @@ STUDIES: dict[str, Study] = {
         identifiability_text,
         write_identifiability_tables,
         lambda results, _name, record, _folder: publish_identifiability(results, record),
+    ),
+    "prediction": Study(
+        run_prediction,
+        prediction_text,
+        write_prediction_tables,
+        lambda results, _, record, folder: publish_prediction(
+            results, record, folder / "fields.npz"
+        ),
     ),
     "donor": Study(
         run_donor,

@@ -20,6 +20,7 @@ from mvest.reporting.law import write_law_tables
 from mvest.reporting.models import write_models_tables
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
+from mvest.reporting.prediction import write_prediction_tables
 from mvest.reporting.publish import RECORDS, regenerate
 from mvest.reporting.report import write_report
 from mvest.reporting.sweeps import read_sweeps, write_sweep
@@ -35,6 +36,7 @@ OTHER_TABLES = {
     "donor": write_donor_tables,
     "law": write_law_tables,
     "imaging": write_imaging_study,
+    "prediction": write_prediction_tables,
     "volume": write_volume_tables,
     "models": write_models_tables,
 }

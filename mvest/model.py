@@ -21,6 +21,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Damping, Simulation, Step
 from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.ties import TiedPoints
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
@@ -109,6 +110,8 @@ class ClosureModel:
         that lies millimetres away.
     on_step : callable, optional
         Progress: called with (time, Newton iterations).
+    ties : TiedPoints, optional
+        Pairs of points that are held together while the valve closes, as by a clip.
     """
 
     valve: Valve
@@ -123,6 +126,7 @@ class ClosureModel:
     repeat: bool = True
     largest_change: float = np.inf
     on_step: Callable[[float, int], None] | None = None
+    ties: TiedPoints | None = None
 
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
     _in_guide: Embedding | None = field(default=None, init=False, repr=False)
@@ -296,7 +300,7 @@ class ClosureModel:
         if self._system is None or self._solver is None:
             self._solver = linear_solver(self.settings.solver)
             self._system = build_system(
-                self.valve, self.contact_valve, self.mesh, self.settings, values
+                self.valve, self.contact_valve, self.mesh, self.settings, values, ties=self.ties
             )
         system = self._system
         retune(system, self.settings, values)

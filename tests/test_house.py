@@ -106,6 +106,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.estimation",
         "mvest.external",
     ),
+    "mvest.prediction": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.mechanics",
+        "mvest.estimation",
+        "mvest.model",
+    ),
     "mvest.imaged_valve": (*LEAVES, "mvest.valve", "mvest.imaging"),
     "mvest.imaged_case": (
         *LEAVES,

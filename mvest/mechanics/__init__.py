@@ -10,7 +10,7 @@ What is here, in the order data flows:
 
 * ``law``: transversely isotropic moduli and the law in Biot strain; ``solid``: strains, forces and
   tangents of all elements of a mesh;
-* ``pressure``, ``cables`` (chordae, annular hinge), ``contact``: what acts on the solid;
+* ``pressure``, ``cables`` (chordae, annular hinge), ``ties``, ``contact``: what acts on the solid;
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
   time steps, Newton's method, sensitivities;

@@ -1,8 +1,8 @@
 """All forces of a body at one instant: residual, consistent tangent and partial derivatives.
 
 The residual is written as internal minus external force, so that equilibrium is ``r(x) = 0``:
-``r = f_solid + f_cables + f_contact + f_hinge - p f_pressure``; the time integrator adds inertia
-and mass-proportional damping. The tangent is dr/dx, exact in every term.
+``r = f_solid + f_cables + f_contact + f_hinge + f_ties - p f_pressure``; the time integrator adds
+inertia and mass-proportional damping. The tangent is dr/dx, exact in every term.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mvest.mechanics.contact import Contact, ContactPairs
 from mvest.mechanics.parameters import Parameter, Part, kind_of
 from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Law, Solid, SolidState
+from mvest.mechanics.ties import Ties
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
@@ -52,6 +53,8 @@ class Loads:
         ``(n_fixed, 3)`` mm positions of the fixed nodes.
     body_force : ndarray or None
         ``(n, 3)`` N dead nodal forces.
+    tie_lengths : ndarray or None
+        ``(k,)`` mm lengths at which ties are without force; None where nothing is tied.
     """
 
     pressure: float = 0.0
@@ -59,6 +62,7 @@ class Loads:
     hinge: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     body_force: FloatArray | None = None
+    tie_lengths: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +103,7 @@ class System:
     hinge : Hinge or None
     fixed_nodes : ndarray
         Nodes whose positions are prescribed.
+    ties : Ties or None
     """
 
     def __init__(
@@ -111,6 +116,7 @@ class System:
         hinge: Hinge | None = None,
         fixed_nodes: IntArray = _NO_NODES,
         factors: Factors | None = None,
+        ties: Ties | None = None,
     ) -> None:
         self.solid = solid
         self.pressure = pressure
@@ -119,6 +125,7 @@ class System:
         self.hinge = hinge
         self.fixed_nodes = np.asarray(fixed_nodes, dtype=np.int64)
         self.factors = factors or Factors()
+        self.ties = ties
         self.n = solid.n_nodes
         if self.fixed_nodes.size and (
             self.fixed_nodes.min() < 0 or self.fixed_nodes.max() >= self.n
@@ -145,6 +152,7 @@ class System:
         for part in (
             self.cables.patches if self.cables else None,
             self.hinge.points if self.hinge else None,
+            self.ties.spans if self.ties else None,
         ):
             if part is not None:
                 groups.append(part.nodes)
@@ -164,6 +172,9 @@ class System:
         if self.hinge is not None:
             nodes = self.hinge.points.nodes
             self._at_hinge = self.pattern.positions(nodes, nodes)
+        if self.ties is not None:
+            nodes = self.ties.spans.nodes
+            self._at_ties = self.pattern.positions(nodes, nodes)
         first, second = elements[hosts[:, 0]], elements[hosts[:, 1]]
         self._forward = self.pattern.positions(first, second)
         self._backward = self.pattern.positions(second, first)
@@ -236,6 +247,12 @@ class System:
             add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
             if blocks is not None:
                 scatter_blocks(blocks, self._at_hinge, points.weights, self.hinge.blocks)
+        if self.ties is not None and loads.tie_lengths is not None:
+            force, stiffness = self.ties.forces(x, loads.tie_lengths)
+            spans = self.ties.spans
+            add_forces(residual, spans.nodes, spans.weights[:, :, None] * force[:, None, :])
+            if blocks is not None:
+                scatter_blocks(blocks, self._at_ties, spans.weights, stiffness)
         if self.contact is not None and pairs is not None:
             points = self.contact.points
             y = points(x)

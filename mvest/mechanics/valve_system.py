@@ -25,6 +25,7 @@ from mvest.mechanics.regional import RegionalLaw
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
+from mvest.mechanics.ties import TiedPoints
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa
 from mvest.valve.anatomy import Valve
@@ -98,6 +99,7 @@ def build_system(
     mesh: SolidMesh,
     settings: MechanicsSettings,
     values: Mapping[str, float],
+    ties: TiedPoints | None = None,
 ) -> System:
     """A system of the valve in the given mesh.
 
@@ -112,6 +114,8 @@ def build_system(
     values : mapping
         Parameter (:data:`mvest.mechanics.parameters.KINDS`) -> value, at least the modulus of each
         region.
+    ties : TiedPoints, optional
+        Pairs of points that are held together, as by a clip.
 
     Raises
     ------
@@ -149,6 +153,7 @@ def build_system(
         contact=contact,
         hinge=_support(mesh, contact_valve, settings),
         factors=factors_of(cables, values),
+        ties=None if ties is None else ties.within(mesh),
     )
 
 
@@ -336,6 +341,7 @@ def boundary_loading(
             pressure=peak * phase,
             tips=_interpolate(motion.phase, motion.papillary_tips, phase),
             hinge=start + _interpolate(motion.phase, shift, phase),
+            tie_lengths=_tie_lengths(system, phase),
         )
 
     return loading
@@ -362,9 +368,20 @@ def held_loading(
     start = system.hinge.points(system.solid.mesh.nodes)
     shift = np.tile(state.annulus - rest, (len(start) // len(rest), 1))
     loads = Loads(
-        pressure=mmhg_to_mpa(state.pressure_mmHg), tips=state.papillary_tips, hinge=start + shift
+        pressure=mmhg_to_mpa(state.pressure_mmHg),
+        tips=state.papillary_tips,
+        hinge=start + shift,
+        tie_lengths=_tie_lengths(system, 1.0),
     )
     return lambda t: loads
+
+
+def _tie_lengths(system: System, phase: float) -> FloatArray | None:
+    """Lengths ``(k,)`` mm of the ties: from those at rest, without force, to that when closed."""
+    if system.ties is None:
+        return None
+    rest = system.ties.lengths(system.solid.mesh.nodes)
+    return (1 - phase) * rest + phase * system.ties.closed_length
 
 
 def _interpolate(phases: FloatArray, frames: FloatArray, phase: float) -> FloatArray:

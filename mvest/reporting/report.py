@@ -66,6 +66,7 @@ OTHERS = (
     ),
     ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
     ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
+    ("prediction", "What an estimated valve would do (simulated)", ("prediction",)),
     ("donor", "A recorded donor valve", ("donor",)),
     ("models", "Other biomechanical models (simulated)", ("models",)),
     ("benchmark", "How fast", ("benchmark",)),
@@ -97,6 +98,8 @@ CAPTIONS = {
     "cycle could tell. Simulated.",
     "cycle": "The cycle and its frames, what they tell of each parameter, and a modulus that "
     "drifts over beats, filtered and smoothed. Simulated.",
+    "prediction": "A leaking valve closed as observed and under changed conditions, seen from the "
+    "atrium, and measures of it with their 95 % intervals. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "models": "A pressed sheet in two finite-element codes: deformed, its moduli iterate by "
     "iterate under each model, and how the codes differ on finer meshes. Simulated.",

@@ -1,0 +1,168 @@
+"""One scenario at the estimate and at samples of its posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import Estimate, Gaussian
+from mvest.mechanics.system import Parameter, System
+from mvest.model import ClosureModel
+from mvest.prediction.measures import Measured, measure_closed
+from mvest.prediction.posterior import Spread, spread_of
+from mvest.typing import FloatArray
+
+__all__ = ["PredictedScenario", "Sample", "closed_valve", "predict_scenario"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One closed valve, or the reason why there is none.
+
+    Attributes
+    ----------
+    at : ndarray
+        ``(p,)`` parameters.
+    measures : dict
+        Empty where the valve was not closed.
+    reason : str
+    """
+
+    at: FloatArray
+    measures: Measured
+    reason: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether no closed valve was found."""
+        return not self.measures
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictedScenario:
+    """What is predicted of a valve under one scenario.
+
+    Attributes
+    ----------
+    at_estimate : Sample
+    shape : ndarray or None
+        ``(n, 3)`` mm, observed vertices at the estimate.
+    first_order : dict
+        Measure -> its standard deviation by the derivative of the closed shape; empty where the
+        valve at the estimate failed.
+    samples : tuple of Sample
+        Of the posterior, failed ones among them.
+    """
+
+    at_estimate: Sample
+    shape: FloatArray | None
+    first_order: Measured
+    samples: tuple[Sample, ...]
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Reasons of the samples that gave no closed valve."""
+        return tuple(sample.reason for sample in self.samples if sample.failed)
+
+    def spread(self, name: str) -> Spread:
+        """What the samples say of a measure; failed samples say nothing, and are counted apart."""
+        return spread_of([s.measures.get(name, float("nan")) for s in self.samples])
+
+
+def closed_valve(
+    model: ClosureModel, m: FloatArray, *, sensitivities: bool = False
+) -> tuple[Sample, System | None, FloatArray | None, FloatArray | None]:
+    """A closed valve measured: the sample, its system, nodal positions and their derivatives.
+
+    A closure that fails is a failed sample without any of them.
+    """
+    try:
+        result = model.close(m, sensitivities=sensitivities)
+    except MaterialError as error:
+        return Sample(m, {}, str(error)), None, None, None
+    simulation = result.simulation
+    if not simulation.converged:
+        return Sample(m, {}, simulation.reason.value), None, None, None
+    x = simulation.frames[-1]
+    measures = measure_closed(model, result.system, x)
+    derivatives = simulation.sensitivities[-1] if sensitivities else None
+    return Sample(m, measures), result.system, x, derivatives
+
+
+def predict_scenario(
+    model: ClosureModel,
+    estimate: Estimate,
+    samples: FloatArray,
+    on_sample: Callable[[int], None] | None = None,
+) -> PredictedScenario:
+    """Predict a valve under a scenario, with the uncertainty of its estimate.
+
+    Parameters
+    ----------
+    model : ClosureModel
+        Under the scenario; with ``continuation`` every sample is an equilibrium that is sought
+        from the one at the estimate.
+    estimate : Estimate
+    samples : ndarray
+        ``(k, p)`` of its posterior.
+    on_sample : callable, optional
+        Called with the number of each sample that is done, for progress.
+
+    Raises
+    ------
+    InputError
+        If estimate and model do not have the same parameters.
+    """
+    if estimate.names != model.names:
+        raise InputError(
+            f"the estimate is of {', '.join(estimate.names)}, the model has "
+            f"{', '.join(model.names)}"
+        )
+    first, system, x, dx = closed_valve(model, estimate.mean, sensitivities=True)
+    shape, spread = None, {}
+    if system is not None and x is not None and dx is not None:
+        shape = model.observed(x)
+        spread = _first_order(model, system, x, dx, estimate)
+    start = model.closed
+    found = []
+    for number, m in enumerate(samples):
+        # Each from the same start, so that no sample depends on the one before.
+        model.restart(start)
+        found.append(closed_valve(model, m)[0])
+        if on_sample is not None:
+            on_sample(number)
+    return PredictedScenario(first, shape, spread, tuple(found))
+
+
+def _first_order(
+    model: ClosureModel, system: System, x: FloatArray, dx: FloatArray, estimate: Estimate
+) -> Measured:
+    """Standard deviations by the derivative: ``sqrt(sum_k (df/dm L_k)^2)`` with ``L L^T = P``.
+
+    The derivative of the shape is exact. Measures that are counted in pixels have none, and are
+    differenced over one standard deviation to either side along it.
+    """
+    root = Gaussian(estimate.mean, estimate.covariance).factor
+    parameters = [
+        Parameter(name, float(value))
+        for name, value in zip(estimate.names, estimate.mean, strict=True)
+    ]
+    variance: Measured = {}
+    for direction in root.T:
+        move = np.tensordot(direction, dx, axes=1)
+        sides = [
+            measure_closed(
+                model,
+                system,
+                x + sign * move,
+                {p: sign * float(d) for p, d in zip(parameters, direction, strict=True)},
+            )
+            for sign in (1.0, -1.0)
+        ]
+        for name, ahead in sides[0].items():
+            slope = 0.5 * (ahead - sides[1][name])
+            variance[name] = variance.get(name, 0.0) + slope**2
+    return {name: float(np.sqrt(value)) for name, value in variance.items()}
