@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
+from mvest.estimation import EnsembleFilter, MonteCarloFilter
 from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
@@ -54,6 +55,8 @@ DeviationsConfig = schema(Deviations)
 PopulationSettingsConfig = schema(PopulationSettings)
 TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
+EnsembleFilterConfig = schema(EnsembleFilter)
+MonteCarloFilterConfig = schema(MonteCarloFilter)
 
 
 @dataclass
@@ -79,7 +82,7 @@ class ContactPointsConfig:
 class FilterConfig:
     """The filter and what it is told."""
 
-    mode: str = MISSING  # paper or iterated
+    mode: str = MISSING  # paper, extended, iterated, unscented, ensemble or monte_carlo
     initial: list[float] = MISSING  # prior mean of the parameters
     P0: Any = MISSING  # variance, variances or matrix
     Q: Any = 0.01  # the same, added each round of the paper's mode
@@ -88,6 +91,9 @@ class FilterConfig:
     transform: str = "identity"  # or log
     tolerance: float = 1e-4
     max_iterations: int = 30
+    spread: float = 1.0  # of sigma points, in parts of the simplex whose covariance is P
+    ensemble: EnsembleFilterConfig = field(default_factory=EnsembleFilterConfig)  # type: ignore[valid-type]
+    monte_carlo: MonteCarloFilterConfig = field(default_factory=MonteCarloFilterConfig)  # type: ignore[valid-type]
 
 
 @dataclass

@@ -17,19 +17,26 @@ from mvest.estimation.diagnostics import (
     nees,
     zero_mean,
 )
+from mvest.estimation.ensemble import EnsembleFilter
 from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
+from mvest.estimation.extended import ExtendedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.identifiability import Identifiability, cramer_rao_bound, identifiability
 from mvest.estimation.iterated import IteratedFilter
+from mvest.estimation.monte_carlo import MonteCarloFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.sampler import SamplerSettings
 from mvest.estimation.transform import Identity, Log, Transform
+from mvest.estimation.unscented import UnscentedFilter
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [
     "Consistency",
+    "EnsembleFilter",
     "Estimate",
+    "ExtendedFilter",
     "Filter",
     "Gaussian",
     "Identifiability",
@@ -37,14 +44,17 @@ __all__ = [
     "InnovationSummary",
     "IteratedFilter",
     "Log",
+    "MonteCarloFilter",
     "NoiseCovariance",
     "ObservationModel",
     "ObservationNoise",
     "PaperFilter",
     "Prediction",
     "Reason",
+    "SamplerSettings",
     "SchmidtFilter",
     "Transform",
+    "UnscentedFilter",
     "Update",
     "ZTest",
     "chi_square_band",
