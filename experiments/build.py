@@ -48,7 +48,7 @@ from mvest.valve.template import Template, TemplateParameters
 from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
 from mvest.valve.tetrahedralize import TetwildSettings
 
-__all__ = ["Twin", "build_mesh", "build_twin", "mechanics_of", "template_of"]
+__all__ = ["Twin", "build_mesh", "build_twin", "filter_of", "mechanics_of", "template_of"]
 
 Values = Mapping[str, Any]
 OnStep = Callable[[float, int], None]
@@ -328,11 +328,11 @@ def build_filter(
         )
     transform = transforms[settings["transform"]]
     transform.forward(mean)
-    return _filter(settings, mean), transform, prior
+    return filter_of(settings, mean), transform, prior
 
 
-def _filter(settings: Values, mean: FloatArray) -> Filter:
-    """The filter of the configured mode."""
+def filter_of(settings: Values, mean: FloatArray) -> Filter:
+    """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
     tolerance, most = settings["tolerance"], settings["max_iterations"]
     match settings["mode"]:
         case "paper":

@@ -15,7 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
-from mvest.estimation import EnsembleFilter, MonteCarloFilter
+from mvest.estimation import EnsembleFilter, MonteCarloFilter, SamplerSettings
 from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
@@ -57,6 +57,7 @@ TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
 EnsembleFilterConfig = schema(EnsembleFilter)
 MonteCarloFilterConfig = schema(MonteCarloFilter)
+SamplerSettingsConfig = schema(SamplerSettings)
 
 
 @dataclass
@@ -109,6 +110,43 @@ class ObservationConfig:
     correlation_length_mm: float = 5.0
     dropout_mm: float = 0.0  # closed vertices this near to another leaflet are not seen
     annulus_offset_mm: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+
+@dataclass
+class FilterProblemConfig:
+    """One problem on which filters are compared; unknowns are normal in their logarithms."""
+
+    title: str = MISSING
+    parameters: list[str] = MISSING
+    truth: list[float] = MISSING
+    initial: list[float] = MISSING  # prior median
+    log_std: list[float] = MISSING  # prior standard deviation of the logarithms
+    columns: int = 28
+    rows: int = 8
+    every: int = 1  # of the vertices, every so many is seen, in the closed frame
+    noise_mm: float = MISSING  # of each coordinate
+
+
+@dataclass
+class SurrogateDesignConfig:
+    """Runs of the model to which the surrogate for repeats is fitted."""
+
+    surrogate_runs: int = 32
+    held_out: int = 8
+    reach: float = 3.2  # standard deviations of the prior
+    degree: int = 6  # at most
+    surrogate_seed: int = 1
+
+
+@dataclass
+class FilterStudyConfig:
+    """All filters on the same problems."""
+
+    problems: dict[str, FilterProblemConfig] = field(default_factory=dict)
+    methods: dict[str, FilterConfig] = field(default_factory=dict)
+    design: SurrogateDesignConfig = field(default_factory=SurrogateDesignConfig)
+    repeats: int = 100  # observations, each of a truth drawn from the prior
+    sampler: SamplerSettingsConfig = field(default_factory=SamplerSettingsConfig)  # type: ignore[valid-type]  # of repeats
 
 
 @dataclass
@@ -321,6 +359,7 @@ class Config:
     patient: PatientConfig | None = None
     echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
+    filters: FilterStudyConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from experiments.case import check_case, run_case
 from experiments.config import register
 from experiments.donor import run_donor
+from experiments.filters import run_filter_study
 from experiments.folder import (
     CONFIG,
     RESULT,
@@ -35,6 +36,7 @@ from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
+from mvest.reporting.filters import filters_text, publish_filters, write_filter_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
@@ -205,6 +207,12 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "filters": Study(
+        run_filter_study,
+        filters_text,
+        write_filter_tables,
+        lambda results, _name, record, _folder: publish_filters(results, record),
     ),
     "donor": Study(
         run_donor,

@@ -10,6 +10,7 @@ from pathlib import Path
 from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.donor import write_donor_tables
+from mvest.reporting.filters import write_filter_study
 from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
@@ -24,6 +25,7 @@ __all__ = ["main"]
 OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
+    "filters": write_filter_study,
     "donor": write_donor_tables,
     "imaging": write_imaging_study,
     "volume": write_volume_tables,

@@ -206,7 +206,8 @@ class _Runs:
     def fill(self, region: Region, count: int, rng: np.random.Generator) -> None:
         """Run the model at points that fill a region evenly."""
         sobol = qmc.Sobol(region.centre.size, rng=rng)
-        for x in region.points(2.0 * sobol.random(count) - 1.0):
+        drawn = sobol.random_base2((count - 1).bit_length())[:count]
+        for x in region.points(2.0 * drawn - 1.0):
             if np.linalg.norm(x) <= FURTHEST:
                 self.run.predict(self.run.prior.mean + self._L @ x, derivatives=False)
 

@@ -50,6 +50,7 @@ OTHERS = (
     ("strip", "Clamped strips", ()),
     ("gate", "One closed state", ()),
     ("closure", "A closing valve", ("closure",)),
+    ("filters", "Filters and the posterior itself (simulated)", ("filters",)),
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
@@ -66,6 +67,8 @@ CAPTIONS = {
     "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
     "table1_valve": "The fitted valve, open and closed. Simulated.",
     "closure": "A valve closing. Simulated.",
+    "filters": "Posterior of each unknown by Monte Carlo, and what each filter takes it for. "
+    "Simulated.",
     "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",

@@ -43,9 +43,7 @@ def test_after_k_of_n_steps_the_ensemble_has_seen_k_nths() -> None:
 def test_perturbed_observations_have_the_exact_mean() -> None:
     # The perturbations are centred, so that the mean is moved by K d̄ whatever they are.
     problem = Linear()
-    found = EnsembleFilter(9, kind="perturbed")(
-        problem.plain, problem.prior, problem.y, problem.R
-    )
+    found = EnsembleFilter(9, kind="perturbed")(problem.plain, problem.prior, problem.y, problem.R)
     np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-10)
 
 
@@ -84,9 +82,7 @@ def test_more_steps_are_nearer_to_the_posterior_of_a_non_linear_model() -> None:
     # for a part of the noise; four take it from where they have come to.
     prior, y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 0.02
     reference = IteratedFilter()(square, prior, y, R)
-    one, four = (
-        EnsembleFilter(20, steps)(square, prior, y, R) for steps in (1, 4)
-    )
+    one, four = (EnsembleFilter(20, steps)(square, prior, y, R) for steps in (1, 4))
     assert abs(four.mean[0] - reference.mean[0]) < 0.5 * abs(one.mean[0] - reference.mean[0])
     assert abs(four.std[0] / reference.std[0] - 1) < abs(one.std[0] / reference.std[0] - 1)
 

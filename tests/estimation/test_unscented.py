@@ -132,7 +132,8 @@ def test_it_works_in_logarithms() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}, {"max_rejections": -1}]
+    "settings",
+    [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}, {"max_rejections": -1}],
 )
 def test_inadmissible_settings_are_refused(settings) -> None:
     with pytest.raises(InputError):
