@@ -128,6 +128,14 @@ class FilterProblemConfig:
 
 
 @dataclass
+class FilterMethodConfig(FilterConfig):
+    """A filter that is told its prior by each problem."""
+
+    initial: list[float] = field(default_factory=list)
+    P0: Any = None
+
+
+@dataclass
 class SurrogateDesignConfig:
     """Runs of the model to which the surrogate for repeats is fitted."""
 
@@ -143,7 +151,7 @@ class FilterStudyConfig:
     """All filters on the same problems."""
 
     problems: dict[str, FilterProblemConfig] = field(default_factory=dict)
-    methods: dict[str, FilterConfig] = field(default_factory=dict)
+    methods: dict[str, FilterMethodConfig] = field(default_factory=dict)
     design: SurrogateDesignConfig = field(default_factory=SurrogateDesignConfig)
     repeats: int = 100  # observations, each of a truth drawn from the prior
     sampler: SamplerSettingsConfig = field(default_factory=SamplerSettingsConfig)  # type: ignore[valid-type]  # of repeats

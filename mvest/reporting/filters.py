@@ -221,7 +221,7 @@ def filters_figure(record: Record) -> Figure:
         row[0].set_ylabel("density of the logarithm")
         row[0].set_title(problem["title"], loc="left", fontsize=9)
     figure.legend(
-        list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8
+        list(handles.values()), list(handles), loc="outside upper center", ncols=5, fontsize=8
     )
     return figure
 
