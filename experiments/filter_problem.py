@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from mvest.estimation import (
 from mvest.estimation.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
 from mvest.estimation.transform import to_filter
 from mvest.observation import ObservedFrames
+from mvest.reporting.files import write_with
 from mvest.typing import FloatArray
 
 __all__ = ["Problem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
@@ -39,7 +41,7 @@ SPARE = 2.0
 """Numbers to which a surrogate is fitted for each of its terms."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """What is estimated from what, for every filter.
 
@@ -55,6 +57,8 @@ class Problem:
         Of the one observation that every filter is given. No filter is.
     noise : float
         Standard deviation of each coordinate, mm.
+    observations : int
+        n.
     mesh_hash : str
     """
 
@@ -64,7 +68,23 @@ class Problem:
     prior: Gaussian
     truth: FloatArray
     noise: float
+    observations: int
     mesh_hash: str
+
+    @cached_property
+    def exact(self) -> FloatArray:
+        """The observation ``y (n,)`` mm of the truth without errors.
+
+        Raises
+        ------
+        ConfigurationError
+            If the true valve does not close.
+        """
+        self.model.restart()
+        prediction = self.model(self.truth)
+        if not prediction.converged:
+            raise ConfigurationError(f"{self.name}: the true valve fails: {prediction.reason}")
+        return prediction.y
 
     @property
     def log_prior(self) -> Gaussian:
@@ -157,6 +177,7 @@ def build_problem(config: Values, name: str) -> Problem:
         prior,
         twin.truth_values,
         float(settings["noise_mm"]),
+        3 * int(seen.sum()),
         model.mesh.sha256,
     )
 
@@ -186,7 +207,7 @@ class FittedSurrogate:
 def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurrogate:
     """A polynomial over the prior out to ``reach`` standard deviations.
 
-    The runs of the model are kept in ``store`` and read from there if they are there.
+    Each run of the model is kept in the folder ``store`` and read from there if it is there.
     """
     p, count = len(problem.parameters), settings["surrogate_runs"]
     wanted = count + settings["held_out"]
@@ -194,16 +215,15 @@ def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurro
     sobol = qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
     # The first of Sobol's points are a design by themselves; the further ones lie between them.
     points = region.points(2.0 * sobol.random_base2((wanted - 1).bit_length())[:wanted] - 1.0)
-    if not store.is_file():
-        store.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(store, **_run_all(problem, points))
-    with np.load(store, allow_pickle=False) as stored:
-        number, y, by_x = stored["number"], stored["y"], stored["by_x"]
+    _run_all(problem, points, store)
+    kept = {k: run for k in range(wanted) if (run := _read(store, k))[0].size}
+    number = np.array(sorted(kept), dtype=np.int64)
     at, fitted = points[number], int(np.sum(number < count))
     if fitted < 3 * p or len(number) == fitted:
         raise ConfigurationError(
             f"{problem.name}: the model fails at too many of {wanted} points of the prior"
         )
+    y, by_x = (np.array([kept[k][part] for k in number]) for part in (0, 1))
     degree = affordable_degree(fitted * (1 + p), p, settings["degree"], SPARE)
     surrogate = fit_surrogate(at[:fitted], y[:fitted], by_x[:fitted], region, degree)
     error = surrogate(at[fitted:]) - y[fitted:]
@@ -216,25 +236,27 @@ def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurro
     )
 
 
-def _run_all(problem: Problem, points: FloatArray) -> dict[str, Any]:
-    """Predictions at points of the logarithms' prior, N(0, I), of those that do not fail.
+def _run_all(problem: Problem, points: FloatArray, store: Path) -> None:
+    """Run the model at points of the logarithms' prior, N(0, I), that are not in the store.
 
     They are run from neighbour to neighbour, since a closure goes on from the one before.
     """
+    store.mkdir(parents=True, exist_ok=True)
     log_prior = problem.log_prior
-    found: dict[int, tuple[FloatArray, FloatArray]] = {}
-    left, at = set(range(len(points))), np.zeros(points.shape[1])
+    left = {k for k in range(len(points)) if not (store / f"{k}.npz").is_file()}
+    at = np.zeros(points.shape[1])
     while left:
         k = min(left, key=lambda i: float(np.linalg.norm(points[i] - at)))
         left.remove(k)
         at = points[k]
         m = np.exp(log_prior.mean + log_prior.std * at)
         prediction = problem.model(m)
-        if prediction.converged:
-            found[k] = prediction.y, prediction.jacobian * (m * log_prior.std)
-    number = np.array(sorted(found), dtype=np.int64)
-    return {
-        "number": number,
-        "y": np.array([found[k][0] for k in number]),
-        "by_x": np.array([found[k][1] for k in number]),
-    }
+        scale = m * log_prior.std if prediction.converged else 1.0
+        arrays = {"y": prediction.y, "by_x": prediction.jacobian * scale}
+        write_with(store / f"{k}.npz", partial(np.savez, **arrays))
+
+
+def _read(store: Path, number: int) -> tuple[FloatArray, FloatArray]:
+    """Prediction of a stored run and its derivatives; empty if it failed."""
+    with np.load(store / f"{number}.npz", allow_pickle=False) as stored:
+        return stored["y"], stored["by_x"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,57 +52,59 @@ def run_filter_study(
     settings = config["filters"]
     if settings is None or REFERENCE not in settings["methods"]:
         raise ConfigurationError(f"filters.methods needs {REFERENCE}, to compare the others with")
-    problems = []
-    for name in settings["problems"]:
-        path = _store(config, name, "json")
-        if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, _solve(config, name))
-        problems.append(json.loads(path.read_text(encoding="utf-8")))
+    problems = [_solve(config, name) for name in settings["problems"]]
     record = _record(config, config_hash, problems, started)
     return record, save_figure(folder / "filters", filters_figure(record), record)
 
 
-def _store(config: Values, name: str, ending: str) -> Path:
-    """Where what is computed of a problem is kept: under a key of all that decides it."""
-    settings = config["filters"]
+def _store(config: Values, name: str, part: str, decisive: Any) -> Path:
+    """Where a part of what is computed of a problem is kept: under a key of all that decides it."""
     described = {k: config[k] for k in ("valve", "mesh", "mechanics", "fixed", "seed")}
-    described |= {"problem": settings["problems"][name], "design": settings["design"]}
-    more: tuple[str, ...] = ()
-    if ending == "json":
-        described |= {"methods": settings["methods"], "repeats": settings["repeats"]}
-        described |= {"sampler": settings["sampler"]}
-        more = ("estimation", "observation.py")
-    key = truth_key(described, more)
-    return Path(config["paths"]["outputs"]) / "filter_store" / f"{name}_{key[:16]}.{ending}"
+    problem = config["filters"]["problems"][name]
+    described["problem"] = {k: v for k, v in problem.items() if k != "title"}
+    described["decisive"] = decisive
+    key = truth_key(described, () if part == "runs" else ("estimation",))
+    return Path(config["paths"]["outputs"]) / "filter_store" / f"{name}_{part}_{key[:16]}"
+
+
+def _kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What was made before, or is made and kept now."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, make())
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
 
 
 def _solve(config: Values, name: str) -> dict[str, Any]:
-    """All that the study tells of one problem."""
+    """All that the study tells of one problem; what was computed before is read."""
     settings = config["filters"]
     problem = build_problem(config, name)
-    fitted = fit_to_prior(problem, settings["design"], _store(config, name, "npz"))
+    methods = settings["methods"]
     filters = {
         method: filter_of(_told(values, problem), problem.prior.mean)
-        for method, values in settings["methods"].items()
+        for method, values in methods.items()
     }
-    rng = np.random.default_rng(config["seed"])
-    y = problem.model(problem.truth).y
-    y = y + problem.noise * rng.standard_normal(y.shape)
     found = {}
     for method, filter_ in filters.items():
-        found[method] = _estimate(problem, filter_, y)
+        path = _store(config, name, method, methods[method]).with_suffix(".json")
+        found[method] = _kept(path, partial(_estimate, problem, filter_, config["seed"]))
         row = found[method]
         _say(f"{name}, {method}: {row['forward_solves']} runs, {row['seconds']:.0f} s")
-    repeats = _repeats(problem, fitted, filters, settings, config["seed"])
-    _say(f"{name}: {settings['repeats']} repeats")
+    design = {k: v for k, v in settings["design"].items() if k != "degree"}
+    fitted = fit_to_prior(problem, settings["design"], _store(config, name, "runs", design))
+    decisive = {k: settings[k] for k in ("methods", "design", "repeats", "sampler")}
+    repeats = _kept(
+        _store(config, name, "repeats", decisive).with_suffix(".json"),
+        lambda: _repeats(problem, fitted, filters, settings, config["seed"]),
+    )
     described = settings["problems"][name]
     log_prior = problem.log_prior
     return {
         "name": name,
         **{k: described[k] for k in ("title", "parameters", "truth", "initial", "noise_mm")},
         "log_prior": {"mean": log_prior.mean.tolist(), "std": log_prior.std.tolist()},
-        "observations": y.size,
+        "observations": problem.observations,
         "mesh_hash": problem.mesh_hash,
         "surrogate": {
             "runs": fitted.runs,
@@ -120,8 +123,11 @@ def _told(values: Values, problem: Problem) -> dict[str, Any]:
     return {**values, "Q": np.diag(problem.prior.covariance)}
 
 
-def _estimate(problem: Problem, filter_: Filter, y: FloatArray) -> dict[str, Any]:
+def _estimate(problem: Problem, filter_: Filter, seed: int) -> dict[str, Any]:
     """One estimate with the model itself, from the open valve on."""
+    problem.model.restart()
+    y = problem.exact
+    y = y + problem.noise * np.random.default_rng(seed).standard_normal(y.shape)
     problem.model.restart()
     began, before = time.process_time(), problem.model.seconds
     found = filter_(

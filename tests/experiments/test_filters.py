@@ -65,7 +65,7 @@ def test_a_filter_that_does_not_exist_is_refused_with_those_that_do() -> None:
 
 def made_up(model) -> Problem:
     prior = Gaussian.from_variance(np.array([2.0, 3.0]), np.array([1.0, 0.81]))
-    return Problem("made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, "none")
+    return Problem("made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, 3, "none")
 
 
 def quadratic(m):
@@ -80,7 +80,7 @@ DESIGN = {"surrogate_runs": 8, "held_out": 3, "reach": 3.0, "degree": 3, "surrog
 
 def test_a_surrogate_over_the_prior_is_a_model_of_the_parameters(tmp_path: Path) -> None:
     problem = made_up(quadratic)
-    fitted = fit_to_prior(problem, DESIGN, tmp_path / "runs.npz")
+    fitted = fit_to_prior(problem, DESIGN, tmp_path / "runs")
     assert (fitted.runs, fitted.held_out, problem.model.runs) == (8, 3, 11)
     assert fitted.largest_mm < 1e-10
     m = np.array([2.5, 2.0])
@@ -93,9 +93,9 @@ def test_a_surrogate_over_the_prior_is_a_model_of_the_parameters(tmp_path: Path)
 
 
 def test_runs_of_the_model_are_read_where_they_are(tmp_path: Path) -> None:
-    fit_to_prior(made_up(quadratic), DESIGN, tmp_path / "runs.npz")
+    fit_to_prior(made_up(quadratic), DESIGN, tmp_path / "runs")
     again = made_up(quadratic)
-    fitted = fit_to_prior(again, DESIGN, tmp_path / "runs.npz")
+    fitted = fit_to_prior(again, DESIGN, tmp_path / "runs")
     assert again.model.runs == 0
     assert isinstance(fitted.model, SurrogateModel)
 
@@ -106,13 +106,13 @@ def test_an_error_of_the_surrogate_is_told(tmp_path: Path) -> None:
         a = np.log(m[0]) - np.log(2.0)
         return Prediction(np.abs([a, a]), np.array([[np.sign(a) / m[0], 0.0]] * 2))
 
-    fitted = fit_to_prior(made_up(kinked), DESIGN, tmp_path / "runs.npz")
+    fitted = fit_to_prior(made_up(kinked), DESIGN, tmp_path / "runs")
     assert fitted.rms_mm > 0.02
 
 
 def test_a_model_that_fails_too_often_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="fails at too many of 11 points"):
-        fit_to_prior(made_up(lambda m: Prediction.failed("leaks")), DESIGN, tmp_path / "runs.npz")
+        fit_to_prior(made_up(lambda m: Prediction.failed("leaks")), DESIGN, tmp_path / "runs")
 
 
 def test_coverage_counts_failures_as_misses() -> None:
@@ -174,10 +174,11 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     said = capsys.readouterr().out
     assert "iterated extended" in said
     # The second run of the same reads what the first computed.
-    store = next((tmp_path / "outputs" / "filter_store").glob("*.json"))
+    store = next((tmp_path / "outputs" / "filter_store").glob("moduli_iterated_*.json"))
     changed = json.loads(store.read_text())
-    changed["title"] = "from the store"
+    changed["detail"] = "from the store"
     store.write_text(json.dumps(changed))
     monkeypatch.setattr(sys, "argv", [*arguments, "force=true"])
     assert main() == 0
-    assert "from the store" in capsys.readouterr().out
+    again = json.loads((folder / "result.json").read_text())
+    assert again["problems"][0]["filters"]["iterated"]["detail"] == "from the store"
