@@ -121,6 +121,7 @@ class FilterProblemConfig:
     truth: list[float] = MISSING
     initial: list[float] = MISSING  # prior median
     log_std: list[float] = MISSING  # prior standard deviation of the logarithms
+    fixed: dict[str, float] = field(default_factory=dict)  # what is known
     columns: int = 28
     rows: int = 8
     every: int = 1  # of the vertices, every so many is seen, in the closed frame

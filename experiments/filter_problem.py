@@ -156,6 +156,7 @@ def build_problem(config: Values, name: str) -> Problem:
     values = {
         **config,
         "parameters": list(parameters),
+        "fixed": {**config["fixed"], **settings["fixed"]},
         "truth": {**config["truth"], "values": settings["truth"]},
         "filter": {**config["filter"], "initial": mean.tolist(), "P0": np.diag(prior.covariance)},
         "observation": {
@@ -252,8 +253,8 @@ def _run_all(problem: Problem, points: FloatArray, store: Path) -> None:
         m = np.exp(log_prior.mean + log_prior.std * at)
         prediction = problem.model(m)
         scale = m * log_prior.std if prediction.converged else 1.0
-        arrays = {"y": prediction.y, "by_x": prediction.jacobian * scale}
-        write_with(store / f"{k}.npz", partial(np.savez, **arrays))
+        write = partial(np.savez, y=prediction.y, by_x=prediction.jacobian * scale)
+        write_with(store / f"{k}.npz", write)
 
 
 def _read(store: Path, number: int) -> tuple[FloatArray, FloatArray]:
