@@ -117,6 +117,7 @@ class FilterProblemConfig:
     """One problem on which filters are compared; unknowns are normal in their logarithms."""
 
     title: str = MISSING
+    about: str = ""
     parameters: list[str] = MISSING
     truth: list[float] = MISSING
     initial: list[float] = MISSING  # prior median
@@ -143,7 +144,7 @@ class SurrogateDesignConfig:
     surrogate_runs: int = 32
     held_out: int = 8
     reach: float = 3.2  # standard deviations of the prior
-    degree: int = 6  # at most
+    degree: int = 5  # at most
     surrogate_seed: int = 1
 
 

@@ -61,7 +61,7 @@ def _store(config: Values, name: str, part: str, decisive: Any) -> Path:
     """Where a part of what is computed of a problem is kept: under a key of all that decides it."""
     described = {k: config[k] for k in ("valve", "mesh", "mechanics", "fixed", "seed")}
     problem = config["filters"]["problems"][name]
-    described["problem"] = {k: v for k, v in problem.items() if k != "title"}
+    described["problem"] = {k: v for k, v in problem.items() if k not in ("title", "about")}
     described["decisive"] = decisive
     key = truth_key(described, () if part == "runs" else ("estimation",))
     return Path(config["paths"]["outputs"]) / "filter_store" / f"{name}_{part}_{key[:16]}"
@@ -102,7 +102,10 @@ def _solve(config: Values, name: str) -> dict[str, Any]:
     log_prior = problem.log_prior
     return {
         "name": name,
-        **{k: described[k] for k in ("title", "parameters", "truth", "initial", "noise_mm")},
+        **{
+            k: described[k]
+            for k in ("title", "about", "parameters", "truth", "initial", "noise_mm")
+        },
         "log_prior": {"mean": log_prior.mean.tolist(), "std": log_prior.std.tolist()},
         "observations": problem.observations,
         "mesh_hash": problem.mesh_hash,

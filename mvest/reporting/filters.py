@@ -129,7 +129,7 @@ def _problem_text(problem: Record, table: pd.DataFrame) -> str:
         f"## {problem['title']}",
         "",
         f"Truth: {truth}. Prior: {prior}. {problem['observations']} coordinates of the closed "
-        f"valve with errors of {problem['noise_mm']:g} mm.",
+        f"valve with errors of {problem['noise_mm']:g} mm. {problem['about']}".strip(),
         "",
         "| filter | error (%) | width of the 95 % interval over that of Monte Carlo | "
         f"coverage of 95 % intervals, {table['repeats'].iloc[0]} repeats | RMS error of the "

@@ -136,7 +136,7 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
         "experiments.run",
         "experiment=filters",
         *SMALL,
-        "~filters.problems.weak",
+        "~filters.problems.chordae",
         "~filters.problems.rest_length",
         "~filters.methods.paper",
         "~filters.methods.perturbed",

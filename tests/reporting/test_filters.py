@@ -33,6 +33,7 @@ def study(skewness: float, width: float, **repeats) -> dict:
     problem = {
         "name": "made_up",
         "title": "One modulus",
+        "about": "",
         "parameters": ["E_f.anterior"],
         "truth": [5.0],
         "initial": [4.5],
