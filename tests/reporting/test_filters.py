@@ -57,9 +57,9 @@ def row(text: str, start: str) -> str:
 
 
 def test_error_width_coverage_and_cost_of_a_filter() -> None:
-    text = filters_text(study(0.0, 0.42))
-    # 4 of 5 MPa: -20 %; 0.42/0.4 = 1.05.
-    expected = "| iterated extended | -20.0 | 1.05 | 94 % | 10.0 | 7 | 3 | converged |"
+    text = filters_text(study(0.0, 0.44))
+    # 4 of 5 MPa: -20 %; 0.44/0.4 = 1.10; each end 0.02 farther out, 5 % of 0.4.
+    expected = "| iterated extended | -20.0 | 1.10 | -5 / +5 | 94 % | 10.0 | 7 | 3 | converged |"
     assert row(text, "| iterated extended | -20") == expected
 
 
