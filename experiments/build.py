@@ -13,13 +13,17 @@ from experiments.mirror import build
 from experiments.truth import StoredModel, truth_key
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import (
+    EnsembleFilter,
+    ExtendedFilter,
     Filter,
     Gaussian,
     Identity,
     IteratedFilter,
     Log,
+    MonteCarloFilter,
     PaperFilter,
     Transform,
+    UnscentedFilter,
     observation_noise,
 )
 from mvest.mechanics.parameters import is_positive, kind_of
@@ -45,7 +49,7 @@ from mvest.valve.template import Template, TemplateParameters
 from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
 from mvest.valve.tetrahedralize import TetwildSettings
 
-__all__ = ["Twin", "build_mesh", "build_twin", "mechanics_of", "template_of"]
+__all__ = ["Twin", "build_mesh", "build_twin", "filter_of", "mechanics_of", "template_of"]
 
 Values = Mapping[str, Any]
 OnStep = Callable[[float, int], None]
@@ -55,6 +59,9 @@ ENVELOPE_SHARE = 0.05
 
 COARSEST = (24, 3)
 """Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
+
+MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo")
+"""Filters that a configuration can name."""
 
 UNSTRUCTURED_SURFACE = (112, 29)
 """Vertices of the surface that an unstructured mesh fills, whatever is observed."""
@@ -314,7 +321,6 @@ def build_filter(
     mean = np.array(settings["initial"], dtype=float)
     _one_each("filter.initial", mean, parameters)
     prior = _gaussian("filter.P0", mean, settings["P0"])
-    tolerance, most = settings["tolerance"], settings["max_iterations"]
     transforms: dict[str, Transform] = {
         "identity": Identity(),
         "log": Log(tuple(map(is_positive, parameters))),
@@ -325,12 +331,29 @@ def build_filter(
         )
     transform = transforms[settings["transform"]]
     transform.forward(mean)
-    if settings["mode"] == "paper":
-        Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
-        return PaperFilter(Q, tolerance, most), transform, prior
-    if settings["mode"] == "iterated":
-        return IteratedFilter(tolerance, max_iterations=most), transform, prior
-    raise ConfigurationError(f"filter.mode = {settings['mode']!r}, expected paper or iterated")
+    return filter_of(settings, mean), transform, prior
+
+
+def filter_of(settings: Values, mean: FloatArray) -> Filter:
+    """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
+    tolerance, most = settings["tolerance"], settings["max_iterations"]
+    match settings["mode"]:
+        case "paper":
+            Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
+            return PaperFilter(Q, tolerance, most)
+        case "extended":
+            return ExtendedFilter()
+        case "iterated":
+            return IteratedFilter(tolerance, max_iterations=most)
+        case "unscented":
+            return UnscentedFilter(tolerance, most, settings["spread"])
+        case "ensemble":
+            return build(EnsembleFilter, settings["ensemble"])
+        case "monte_carlo":
+            return build(MonteCarloFilter, settings["monte_carlo"])
+    raise ConfigurationError(
+        f"filter.mode = {settings['mode']!r}, expected one of {', '.join(MODES)}"
+    )
 
 
 def _one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:

@@ -16,6 +16,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
 from mvest.cycle import CycleProtocol
+from mvest.estimation import EnsembleFilter, MonteCarloFilter, SamplerSettings
 from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
@@ -63,6 +64,9 @@ TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
 SheetConfig = schema(Sheet)
 ScenarioConfig = schema(Scenario)
+EnsembleFilterConfig = schema(EnsembleFilter)
+MonteCarloFilterConfig = schema(MonteCarloFilter)
+SamplerSettingsConfig = schema(SamplerSettings)
 
 
 @dataclass
@@ -88,7 +92,7 @@ class ContactPointsConfig:
 class FilterConfig:
     """The filter and what it is told."""
 
-    mode: str = MISSING  # paper or iterated
+    mode: str = MISSING  # paper, extended, iterated, unscented, ensemble or monte_carlo
     initial: list[float] = MISSING  # prior mean of the parameters
     P0: Any = MISSING  # variance, variances or matrix
     Q: Any = 0.01  # the same, added each round of the paper's mode
@@ -97,6 +101,9 @@ class FilterConfig:
     transform: str = "identity"  # or log
     tolerance: float = 1e-4
     max_iterations: int = 30
+    spread: float = 1.0  # of sigma points, in parts of the simplex whose covariance is P
+    ensemble: EnsembleFilterConfig = field(default_factory=EnsembleFilterConfig)  # type: ignore[valid-type]
+    monte_carlo: MonteCarloFilterConfig = field(default_factory=MonteCarloFilterConfig)  # type: ignore[valid-type]
 
 
 @dataclass
@@ -112,6 +119,53 @@ class ObservationConfig:
     correlation_length_mm: float = 5.0
     dropout_mm: float = 0.0  # closed vertices this near to another leaflet are not seen
     annulus_offset_mm: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+
+@dataclass
+class FilterProblemConfig:
+    """One problem on which filters are compared; unknowns are normal in their logarithms."""
+
+    title: str = MISSING
+    about: str = ""
+    parameters: list[str] = MISSING
+    truth: list[float] = MISSING
+    initial: list[float] = MISSING  # prior median
+    log_std: list[float] = MISSING  # prior standard deviation of the logarithms
+    fixed: dict[str, float] = field(default_factory=dict)  # what is known
+    columns: int = 28
+    rows: int = 8
+    every: int = 1  # of the vertices, every so many is seen, in the closed frame
+    noise_mm: float = MISSING  # of each coordinate
+
+
+@dataclass
+class FilterMethodConfig(FilterConfig):
+    """A filter that is told its prior by each problem."""
+
+    initial: list[float] = field(default_factory=list)
+    P0: Any = None
+
+
+@dataclass
+class SurrogateDesignConfig:
+    """Runs of the model to which the surrogate for repeats is fitted."""
+
+    surrogate_runs: int = 32
+    held_out: int = 8
+    reach: float = 3.2  # standard deviations of the prior
+    degree: int = 5  # at most
+    surrogate_seed: int = 1
+
+
+@dataclass
+class FilterStudyConfig:
+    """All filters on the same problems."""
+
+    problems: dict[str, FilterProblemConfig] = field(default_factory=dict)
+    methods: dict[str, FilterMethodConfig] = field(default_factory=dict)
+    design: SurrogateDesignConfig = field(default_factory=SurrogateDesignConfig)
+    repeats: int = 100  # observations, each of a truth drawn from the prior
+    sampler: SamplerSettingsConfig = field(default_factory=SamplerSettingsConfig)  # type: ignore[valid-type]  # of repeats
 
 
 @dataclass
@@ -434,6 +488,7 @@ class Config:
     models: ModelsConfig = field(default_factory=ModelsConfig)
     designs: DesignsConfig | None = None
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
+    filters: FilterStudyConfig | None = None
     continuation: bool = True  # later closures start from the last closed state
     continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes

@@ -15,6 +15,7 @@ from experiments.config import register
 from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
 from experiments.external import check_external, run_external
+from experiments.filters import run_filter_study
 from experiments.folder import (
     CONFIG,
     RESULT,
@@ -45,6 +46,7 @@ from mvest.reporting.closure import closure_text, publish_closure, write_closure
 from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.external import external_text, write_external_tables
+from mvest.reporting.filters import filters_text, publish_filters, write_filter_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.identifiability import (
     identifiability_text,
@@ -273,6 +275,12 @@ STUDIES: dict[str, Study] = {
         lambda results, _, record, folder: publish_prediction(
             results, record, folder / "fields.npz"
         ),
+    ),
+    "filters": Study(
+        run_filter_study,
+        filters_text,
+        write_filter_tables,
+        lambda results, _name, record, _folder: publish_filters(results, record),
     ),
     "donor": Study(
         run_donor,

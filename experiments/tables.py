@@ -11,6 +11,7 @@ from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.cycle import write_cycle
 from mvest.reporting.donor import write_donor_tables
+from mvest.reporting.filters import write_filter_study
 from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.identifiability import write_identifiability_study
 from mvest.reporting.imaging_study import write_imaging_study
@@ -33,6 +34,7 @@ OTHER_TABLES = {
     "joint": write_joint,
     "cycle": write_cycle,
     "identifiability": write_identifiability_study,
+    "filters": write_filter_study,
     "donor": write_donor_tables,
     "law": write_law_tables,
     "imaging": write_imaging_study,

@@ -18,7 +18,9 @@ from mvest.estimation.diagnostics import (
     nees,
     zero_mean,
 )
+from mvest.estimation.ensemble import EnsembleFilter
 from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
+from mvest.estimation.extended import ExtendedFilter
 from mvest.estimation.frames import (
     FrameState,
     Trajectory,
@@ -34,10 +36,12 @@ from mvest.estimation.identifiability import (
     identifiability,
 )
 from mvest.estimation.iterated import IteratedFilter
+from mvest.estimation.monte_carlo import MonteCarloFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.profile import Profile, profile
+from mvest.estimation.sampler import SamplerSettings
 from mvest.estimation.sequential import (
     DriftEstimate,
     DriftSmoother,
@@ -46,6 +50,7 @@ from mvest.estimation.sequential import (
     SequentialFilter,
 )
 from mvest.estimation.transform import Identity, Log, Transform
+from mvest.estimation.unscented import UnscentedFilter
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [
@@ -54,7 +59,9 @@ __all__ = [
     "Design",
     "DriftEstimate",
     "DriftSmoother",
+    "EnsembleFilter",
     "Estimate",
+    "ExtendedFilter",
     "Filter",
     "FrameModel",
     "FrameState",
@@ -64,6 +71,7 @@ __all__ = [
     "InnovationSummary",
     "IteratedFilter",
     "Log",
+    "MonteCarloFilter",
     "NoiseCovariance",
     "ObservationModel",
     "ObservationNoise",
@@ -71,11 +79,13 @@ __all__ = [
     "Prediction",
     "Profile",
     "Reason",
+    "SamplerSettings",
     "SchmidtFilter",
     "SequentialEstimate",
     "SequentialFilter",
     "Trajectory",
     "Transform",
+    "UnscentedFilter",
     "Update",
     "ZTest",
     "chi_square_band",

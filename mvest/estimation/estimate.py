@@ -27,12 +27,14 @@ class Reason(Enum):
     CONVERGED = "converged: the change of every parameter is below the tolerance"
     MAX_ITERATIONS = "not converged: the largest permitted number of iterations is reached"
     NO_DECREASE = "not converged: no step along the search direction lowers the objective"
+    COMPLETED = "completed: every update that was planned is done"
+    NOT_SAMPLED = "not converged: the draws from the posterior do not yet agree with each other"
     MODEL_FAILED = "not converged: the model gives no prediction where the filter needs one"
 
     @property
     def converged(self) -> bool:
         """Whether the estimate is one."""
-        return self is Reason.CONVERGED
+        return self in (Reason.CONVERGED, Reason.COMPLETED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,15 +102,19 @@ class Estimate:
     transformed_iterates : (k, p), filter coordinates
     transformed_iterate_covariances : (k, p, p), filter coordinates
         Paper's filter: covariance after round k, row 0 the prior's. Iterated filter: covariance of
-        the posterior linearised at iterate k.
+        the posterior linearised at iterate k. Filters of points and ensembles: as in each filter's
+        own words.
     objective : (k,)
-        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). Iterated filter: the same plus the prior's term. NaN
-        in the last row if the model failed there.
+        Paper's filter: ½ (y − h)ᵀ R⁻¹ (y − h). All others: the same plus the prior's term; filters
+        that do not run the model at an iterate but around it put the mean of these predictions in
+        the place of h there. NaN in the last row if the model failed there.
     log_likelihood : (k,)
-        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`.
+        log N(e; 0, S) of the innovation at each iterate; NaN as in `objective`, and where a filter
+        does not compute it.
     prediction : Prediction or None
         Observation predicted at the estimate itself and its Jacobian with respect to the
-        parameters; None if the model failed there.
+        parameters; None if the model failed there. Of a model without derivatives the Jacobian is
+        the slope that the filter found with its points.
     innovation : InnovationSummary or None
         Innovation at the last iterate; None if the model failed there.
     reason : Reason
@@ -116,6 +122,8 @@ class Estimate:
         Numbers to the reason, or the failed model's own words.
     forward_solves : int
         How often the model was run, failed runs included.
+    transformed_samples : (s, p), filter coordinates, or None
+        Draws from the posterior, of a filter that makes them; intervals are then their quantiles.
     """
 
     names: tuple[str, ...]
@@ -130,6 +138,7 @@ class Estimate:
     reason: Reason
     detail: str
     forward_solves: int
+    transformed_samples: FloatArray | None = None
 
     @property
     def converged(self) -> bool:
@@ -186,10 +195,15 @@ class Estimate:
         """Lower and upper ends (p,) of each parameter's central credible interval.
 
         The interval is symmetric in filter coordinates, so that of a positive parameter that is
-        estimated by its logarithm stays positive.
+        estimated by its logarithm stays positive. With `transformed_samples` its ends are their
+        quantiles, and the interval is as skew as the posterior.
         """
         if not 0.0 < level < 1.0:
             raise InputError(f"an interval's level must lie between 0 and 1; got {level:g}")
+        if self.transformed_samples is not None:
+            tails = (0.5 - 0.5 * level, 0.5 + 0.5 * level)
+            low, high = np.quantile(self.transformed_samples, tails, axis=0)
+            return self.transform.inverse(low), self.transform.inverse(high)
         z = self.transformed
         half_width = float(ndtri(0.5 + 0.5 * level)) * z.std
         return self.transform.inverse(z.mean - half_width), self.transform.inverse(

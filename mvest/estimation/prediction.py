@@ -18,7 +18,8 @@ class Prediction:
     y : (n,) in units of the observation
         Predicted observation; empty where the model failed.
     jacobian : (n, p) in units of the observation per unit of each parameter
-        Derivative of `y`; empty where the model failed.
+        Derivative of `y`; empty where the model failed, and of shape (n, 0) where the model does
+        not differentiate (`Prediction.undifferentiated`).
     converged : bool
         False if the model found no answer. Filters then read nothing but `reason`.
     reason : str
@@ -58,6 +59,16 @@ class Prediction:
                 raise InputError("a failed prediction must say why; its reason is empty")
         object.__setattr__(self, "y", y)
         object.__setattr__(self, "jacobian", jacobian)
+
+    @classmethod
+    def undifferentiated(cls, y: FloatArray) -> "Prediction":
+        """The prediction of a model without derivatives, for filters that need none."""
+        return cls(y, np.empty((np.size(y), 0)))
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether the Jacobian is there."""
+        return self.jacobian.shape[1] > 0
 
     @classmethod
     def failed(cls, reason: str) -> "Prediction":

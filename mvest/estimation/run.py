@@ -15,7 +15,7 @@ from mvest.estimation.prediction import (
     require_finite,
 )
 from mvest.estimation.transform import Identity, Transform, to_filter
-from mvest.estimation.update import Update
+from mvest.estimation.update import Update, kalman_update
 from mvest.typing import FloatArray
 
 
@@ -68,8 +68,10 @@ class FilterRun:
         self._objectives: list[float] = []
         self._log_likelihoods: list[float] = []
 
-    def predict(self, z: FloatArray) -> Prediction:
+    def predict(self, z: FloatArray, *, derivatives: bool = True) -> Prediction:
         """Run the model at filter coordinates z (p,), unless it was just run there.
+
+        A filter that needs no ``derivatives`` also takes a model that has none.
 
         Raises
         ------
@@ -84,7 +86,10 @@ class FilterRun:
         self.forward_solves += 1
         prediction = self._model(m.copy())
         n, p = self.y.size, self.prior.size
-        if prediction.converged and prediction.jacobian.shape != (n, p):
+        fits = prediction.jacobian.shape == (n, p)
+        if not derivatives and not prediction.differentiated:
+            fits = prediction.y.size == n
+        if prediction.converged and not fits:
             raise InputError(
                 f"the model must predict {n} observations and their derivatives with respect to "
                 f"{p} parameters; got y of shape {prediction.y.shape} and jacobian of shape "
@@ -130,9 +135,53 @@ class FilterRun:
         prediction: Prediction,
         innovation: FloatArray,
         update: Update,
+        samples: FloatArray | None = None,
     ) -> Estimate:
-        """The estimate at the last recorded iterate, at which `prediction` was made."""
-        return self._estimate(reason, detail, prediction, InnovationSummary.of(innovation, update))
+        """The estimate at the last recorded iterate, at which `prediction` was made.
+
+        ``samples (s, p)`` are draws from the posterior in filter coordinates, if there are any.
+        """
+        summary = InnovationSummary.of(innovation, update)
+        return self._estimate(reason, detail, prediction, summary, samples)
+
+    def finish_with_slope(
+        self,
+        z: FloatArray,
+        P: FloatArray,
+        slope: FloatArray,
+        reason: Reason,
+        detail: str,
+        samples: FloatArray | None = None,
+    ) -> Estimate:
+        """Run the model at the estimate N(z, P), record it, and end there.
+
+        Parameters
+        ----------
+        z : (p,)
+            Filter coordinates.
+        P : (p, p)
+        slope : (n, p)
+            dh/dz as the filter's points say. The model's own derivative is used where it has one.
+        reason, detail, samples
+            See `finish`.
+        """
+        prediction = self.predict(z, derivatives=False)
+        if not prediction.converged:
+            return self.fail(z, P, prediction)
+        if not prediction.differentiated:
+            jacobian = slope / self.transform.derivative(z)
+            prediction = Prediction(prediction.y, jacobian, reason=prediction.reason)
+        H = self.jacobian(z, prediction)
+        innovation = self.y - prediction.y + H @ (z - self.prior.mean)
+        update = kalman_update(self.prior, innovation, H, self.noise)
+        objective = self.misfit(prediction) + self.prior_term(z)
+        self.record(z, P, objective, update.log_likelihood)
+        return self.finish(reason, detail, prediction, innovation, update, samples)
+
+    def prior_term(self, z: FloatArray) -> float:
+        """½ (z − m)ᵀ P⁻¹ (z − m), of what the prior does not hold fixed."""
+        x = np.linalg.lstsq(self.prior.factor, z - self.prior.mean, rcond=None)[0]
+        return 0.5 * float(x @ x)
 
     def fail(self, z: FloatArray, P: FloatArray, prediction: Prediction) -> Estimate:
         """The end of a run whose next iterate (z, P) has no prediction."""
@@ -146,6 +195,7 @@ class FilterRun:
         detail: str,
         prediction: Prediction | None,
         innovation: InnovationSummary | None,
+        samples: FloatArray | None = None,
     ) -> Estimate:
         return Estimate(
             names=self.names,
@@ -160,7 +210,13 @@ class FilterRun:
             reason=reason,
             detail=detail,
             forward_solves=self.forward_solves,
+            transformed_samples=None if samples is None else read_only(samples),
         )
+
+
+def by_filter(slope: FloatArray, L: FloatArray) -> FloatArray:
+    """dh/dz (n, p) from dh/dx where z = m + L x; 0 for what the prior holds fixed."""
+    return np.asarray(np.linalg.lstsq(L.T, slope.T, rcond=None)[0].T, dtype=np.float64)
 
 
 def require_settings(*, tolerance: float, max_iterations: int) -> None:

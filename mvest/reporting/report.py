@@ -56,6 +56,7 @@ OTHERS = (
         "What data can tell, before any are taken",
         ("identifiability_designs", "identifiability_profiles", "identifiability_valley"),
     ),
+    ("filters", "Filters and the posterior itself (simulated)", ("filters",)),
     ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
     ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
     ("population", "Virtual patients drawn at random (simulated)", ("population",)),
@@ -86,6 +87,8 @@ CAPTIONS = {
     "and how the others then make up for it. Simulated.",
     "identifiability_valley": "95 % regions of a modulus with a nuisance, for different frames; "
     "the floor of the valley that the profile followed. Simulated.",
+    "filters": "Posterior of each unknown by Monte Carlo, and what each filter takes it for. "
+    "Simulated.",
     "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
     "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
     "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",

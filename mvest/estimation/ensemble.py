@@ -1,0 +1,178 @@
+"""Ensemble Kalman filter and smoother: the covariances of the update are those of many runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.run import FilterRun
+from mvest.estimation.transform import Transform
+from mvest.typing import FloatArray
+
+__all__ = ["EnsembleFilter", "exact_ensemble"]
+
+KINDS = ("square_root", "perturbed")
+
+
+@dataclass(frozen=True, slots=True)
+class EnsembleFilter:
+    """Conditions an ensemble on the observation, at once or in several smaller steps.
+
+    N members xⱼ are drawn from the prior, which is N(0, I) in these coordinates. One step with the
+    noise α R, in whitened observations (W R Wᵀ = I), is::
+
+        dⱼ = W (y − h(xⱼ))                       N runs of the model
+        A  = (xⱼ − x̄) / √(N−1),  S = (d̄ − dⱼ) / √(N−1)      anomalies, (p, N) and (n, N)
+        K  = A Sᵀ (S Sᵀ + α I)⁻¹ = A (Sᵀ S + α I)⁻¹ Sᵀ      gain
+
+    and then, with observations perturbed for each member (Evensen 1994, J. Geophys. Res. 99:10143;
+    Burgers, van Leeuwen and Evensen 1998, Mon. Weather Rev. 126:1719)::
+
+        xⱼ⁺ = xⱼ + K (dⱼ + √α εⱼ),   εⱼ ~ N(0, I), centred
+
+    or by a square root without random numbers (Bishop, Etherton and Majumdar 2001, Mon. Weather
+    Rev. 129:420; symmetric as Hunt, Kostelich and Szunyogh 2007, Physica D 230:112)::
+
+        x̄⁺ = x̄ + K d̄,   A⁺ = A (I + Sᵀ S / α)^(−1/2)
+
+    One step with α = 1 is the ensemble Kalman filter. k steps with α = k each are the ensemble
+    smoother with multiple data assimilation (Emerick and Reynolds 2013, Comput. Geosci. 55:3): each
+    step takes a k-th of the observation's information, Σ 1/α = 1, so that it is counted once, and
+    a non-linear model is linearised anew where the ensemble has come to.
+
+    Members are drawn with exactly the prior's mean and covariance (second-order exact sampling,
+    Pham 2001, Mon. Weather Rev. 129:1194). For a linear model the square root is then the Kalman
+    filter exactly, in any number of steps, if N > p; the perturbed form has its mean in one step,
+    and its covariance up to the error of N draws. Members whose model fails are left out.
+
+    The covariance of an iterate is that of the ensemble.
+
+    Attributes
+    ----------
+    members : int
+        N.
+    steps : int
+        1: filter; more: smoother.
+    kind : str
+        ``square_root`` or ``perturbed``.
+    seed : int
+        Of all random numbers.
+
+    Raises
+    ------
+    InputError
+        If a setting, a shape or a covariance is not admissible; never for a failing model.
+    """
+
+    members: int = 30
+    steps: int = 1
+    kind: str = "square_root"
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if self.members < 3 or self.steps < 1:
+            raise InputError(
+                f"an ensemble needs at least 3 members and 1 step; got {self.members} and "
+                f"{self.steps}"
+            )
+        if self.kind not in KINDS:
+            raise InputError(f"kind of ensemble = {self.kind!r}, expected {' or '.join(KINDS)}")
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Condition an ensemble; see `Filter` for the arguments."""
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        if self.members < prior.size + 2:
+            raise InputError(
+                f"{prior.size} parameters need at least {prior.size + 2} members; got "
+                f"{self.members}"
+            )
+        L, rng = run.prior.factor, np.random.default_rng(self.seed)
+        X = exact_ensemble(self.members, prior.size, rng)
+        for _ in range(self.steps):
+            X, predicted, failure = _run_members(run, L, X)
+            z, P = _moments(run, L, X)
+            if failure is not None and len(X) < prior.size + 2:
+                return run.fail(z, P, failure)
+            D = run.noise.whiten((run.y - predicted).T)
+            x, d = X.mean(axis=0), D.mean(axis=1)
+            run.record(z, P, 0.5 * float(d @ d + x @ x), np.nan)
+            slope = _slope(L @ (X - x).T, (predicted - predicted.mean(axis=0)).T)
+            X = self._condition(X, D, float(self.steps), rng)
+        z, P = _moments(run, L, X)
+        detail = f"{len(X)} of {self.members} members, {self.steps} steps"
+        return run.finish_with_slope(z, P, slope, Reason.COMPLETED, detail)
+
+    def _condition(
+        self, X: FloatArray, D: FloatArray, alpha: float, rng: np.random.Generator
+    ) -> FloatArray:
+        """Members (N, p) after one step from members ``X`` and their innovations ``D (n, N)``."""
+        N = len(X)
+        root = np.sqrt(N - 1.0)
+        x, d = X.mean(axis=0), D.mean(axis=1)
+        A, S = (X - x).T / root, (d[:, None] - D) / root
+        values, V = np.linalg.eigh(S.T @ S)
+        values = np.maximum(values, 0.0)
+        if self.kind == "perturbed":
+            noise = rng.standard_normal(D.shape)
+            noise = (noise - noise.mean(axis=1, keepdims=True)) * np.sqrt(N / (N - 1.0))
+            moved = (V / (values + alpha)) @ (V.T @ (S.T @ (D + np.sqrt(alpha) * noise)))
+            return X + (A @ moved).T
+        weights = (V / (values + alpha)) @ (V.T @ (S.T @ d))
+        square_root = (V / np.sqrt(1.0 + values / alpha)) @ V.T
+        return x + (A @ weights) + root * (A @ square_root).T
+
+
+def exact_ensemble(members: int, size: int, rng: np.random.Generator) -> FloatArray:
+    """Members (N, p) whose mean is 0 and whose covariance, divided by N − 1, is I."""
+    drawn = rng.standard_normal((members, size))
+    # Orthonormal columns, all orthogonal to the column of ones.
+    Q = np.linalg.qr(drawn - drawn.mean(axis=0))[0]
+    return np.asarray(np.sqrt(members - 1.0) * Q)
+
+
+def _run_members(
+    run: FilterRun, L: FloatArray, X: FloatArray
+) -> tuple[FloatArray, FloatArray, Prediction | None]:
+    """Members with a prediction, their predictions (N, n), and the last failure if any failed."""
+    kept: list[FloatArray] = []
+    predicted: list[FloatArray] = []
+    failure: Prediction | None = None
+    for x in X:
+        prediction = run.predict(run.prior.mean + L @ x, derivatives=False)
+        if prediction.converged:
+            kept.append(x)
+            predicted.append(prediction.y)
+        else:
+            failure = prediction
+    if not kept:
+        return X[:1], np.empty((0, run.y.size)), failure
+    return np.array(kept), np.array(predicted), failure
+
+
+def _moments(run: FilterRun, L: FloatArray, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (p,) and covariance (p, p) of members in filter coordinates."""
+    x = X.mean(axis=0)
+    A = L @ (X - x).T / np.sqrt(max(len(X) - 1.0, 1.0))
+    return run.prior.mean + L @ x, A @ A.T
+
+
+def _slope(Z: FloatArray, Y: FloatArray) -> FloatArray:
+    """Regression (n, p) of anomalies ``Y (n, N)`` of the prediction on ``Z (p, N)``."""
+    return np.asarray(np.linalg.lstsq(Z.T, Y.T, rcond=None)[0].T)

@@ -1,0 +1,151 @@
+"""The reduced-order unscented Kalman filter: p + 1 runs of the model in the place of a Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import helmert
+
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.run import FilterRun, by_filter, require_settings
+from mvest.estimation.transform import Transform
+from mvest.estimation.update import kalman_update
+from mvest.typing import FloatArray
+
+__all__ = ["UnscentedFilter", "simplex_points"]
+
+
+@dataclass(frozen=True, slots=True)
+class UnscentedFilter:
+    """Statistical linearisation with the corners of a simplex, iterated about the posterior.
+
+    In coordinates x in which the prior is N(0, I), and with the p + 1 corners σⱼ of a regular
+    simplex, whose mean is 0 and whose covariance is I, one round about N(x, C Cᵀ) is::
+
+        xⱼ = x + C σⱼ,   yⱼ = h(xⱼ)                  p + 1 runs of the model
+        ȳ  = 1/(p+1) Σ yⱼ
+        G  = 1/(p+1) Σ yⱼ σⱼᵀ                         slope of h, times C
+        H  = G C⁻¹
+        x⁺, P⁺ = update of 0, I with y − ȳ + H x, H, R     see `kalman_update`
+
+    The first round, about the prior, is the reduced-order unscented Kalman filter of Moireau and
+    Chapelle (2011), ESAIM: Control, Optimisation and Calculus of Variations 17:380-405, for
+    parameters that do not move (there L = dθ/dx, U = I + Gᵀ R⁻¹ G, θ⁺ = θ + L U⁻¹ Gᵀ R⁻¹ (y − ȳ)).
+    Further rounds place the points about the posterior found so far, N(x⁺, P⁺), and update the
+    prior anew, so that each observation is counted once (García-Fernández, Svensson, Morelande and
+    Särkkä 2015, IEEE Trans. Signal Process. 63:5561). The fixed point is that posterior which the
+    mean slope over itself gives. With p + 1 points the predictions lie on a plane, so that no
+    covariance of the linearisation's error is left to be added to R.
+
+    Where a point has no prediction the points are drawn together, and towards the mean before, by
+    half; as they close up the slope becomes a Jacobian by differences. A round that changes the
+    mean by no less than the round before did is taken by half only.
+
+    Attributes
+    ----------
+    tolerance : float
+        Stop when a further round changes no parameter by more than this part of its size (or of its
+        standard deviation if that is larger).
+    max_iterations : int
+        Rounds. 1 is the filter of Moireau and Chapelle.
+    spread : float
+        Distance of the points from their mean, in parts of the simplex whose covariance is P.
+    max_rejections : int
+        How often the points are drawn together in one round.
+
+    Raises
+    ------
+    InputError
+        If a setting, a shape or a covariance is not admissible; never for a failing model.
+    """
+
+    tolerance: float = 1e-3
+    max_iterations: int = 15
+    spread: float = 1.0
+    max_rejections: int = 6
+
+    def __post_init__(self) -> None:
+        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
+        if not (np.isfinite(self.spread) and self.spread > 0.0):
+            raise InputError(f"the spread of sigma points must be positive; got {self.spread}")
+        if self.max_rejections < 0:
+            raise InputError(f"max_rejections must not be negative; got {self.max_rejections}")
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Estimate without derivatives; see `Filter` for the arguments."""
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        L = run.prior.factor
+        unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
+        at, before = unit, unit
+        share, change = 1.0, np.inf
+        for rounds in range(1, self.max_iterations + 1):
+            found = self._linearise(run, L, at, before.mean)
+            if isinstance(found, Prediction):
+                z = run.prior.mean + L @ at.mean
+                return run.fail(z, L @ at.covariance @ L.T, found)
+            at, mean, H = found
+            z, e = run.prior.mean + L @ at.mean, run.y - mean
+            update = kalman_update(unit, e + H @ at.mean, H, run.noise)
+            white = run.noise.whiten(e)
+            objective = 0.5 * float(white @ white + at.mean @ at.mean)
+            run.record(z, L @ at.covariance @ L.T, objective, update.log_likelihood)
+
+            posterior = update.posterior
+            step = posterior.mean - at.mean
+            size = float(np.linalg.norm(np.linalg.solve(posterior.factor, step)))
+            P = L @ posterior.covariance @ L.T
+            converged = run.negligible(L @ step, z, P, self.tolerance)
+            if converged or rounds == self.max_iterations:
+                break
+            share = 0.5 * share if size >= change else share
+            change = size
+            before, at = at, Gaussian(at.mean + share * step, posterior.covariance)
+        reason = Reason.CONVERGED if converged else Reason.MAX_ITERATIONS
+        if self.max_iterations == 1:
+            reason = Reason.COMPLETED
+        detail = f"{rounds} rounds of {prior.size + 1} points, tolerance {self.tolerance:g}"
+        z = run.prior.mean + L @ posterior.mean
+        return run.finish_with_slope(z, P, by_filter(H, L), reason, detail)
+
+    def _linearise(
+        self, run: FilterRun, L: FloatArray, at: Gaussian, before: FloatArray
+    ) -> tuple[Gaussian, FloatArray, FloatArray] | Prediction:
+        """Where the points could be placed, their mean prediction and the slope dh/dx (n, p)."""
+        C, x, spread = at.factor, at.mean, self.spread
+        for _ in range(self.max_rejections + 1):
+            points = simplex_points(at.mean.size)
+            predicted: list[FloatArray] = []
+            for point in x + spread * points @ C.T:
+                prediction = run.predict(run.prior.mean + L @ point, derivatives=False)
+                if not prediction.converged:
+                    break
+                predicted.append(prediction.y)
+            else:
+                values = np.array(predicted)
+                G = values.T @ points / len(points)
+                H = np.asarray(np.linalg.solve(spread * C.T, G.T).T, dtype=np.float64)
+                return Gaussian(x, at.covariance), values.mean(axis=0), H
+            spread *= 0.5
+            x = 0.5 * (x + before)
+        return prediction
+
+
+def simplex_points(size: int) -> FloatArray:
+    """Corners (p + 1, p) of a regular simplex with mean 0 and covariance I, divided by p + 1."""
+    return np.sqrt(size + 1.0) * np.asarray(helmert(size + 1), dtype=np.float64).T

@@ -1,0 +1,313 @@
+"""Filters compared: a table of what each finds and costs, and a figure of their posteriors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+from mvest.errors import InputError
+from mvest.provenance import write_json
+from mvest.reporting.figures import save_figure
+from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.typing import FloatArray
+
+__all__ = [
+    "REFERENCE",
+    "filters_figure",
+    "filters_text",
+    "publish_filters",
+    "write_filter_study",
+    "write_filter_tables",
+]
+
+Record = Mapping[str, Any]
+
+REFERENCE = "monte_carlo"
+"""The filter with which all others are compared."""
+
+TARGET = 0.1
+"""Largest difference of an interval's width from that of Monte Carlo where this is near normal."""
+
+NEAR_NORMAL = 0.25
+"""Largest skewness of the draws of a posterior that is near normal."""
+
+STYLES = {
+    "paper": ("#999999", (0, (1, 1))),
+    "extended": ("#E69F00", "--"),
+    "iterated": ("#0072B2", "-"),
+    "unscented": ("#D55E00", (0, (5, 2))),
+    "ensemble": ("#CC79A7", "-."),
+    "perturbed": ("#56B4E9", (0, (3, 1, 1, 1))),
+    "smoother": ("#009E73", (0, (2, 1))),
+}
+"""Colour and line of each filter; colours of Okabe and Ito, and no two lines alike."""
+
+LABELS = {
+    "paper": "paper's (cycled)",
+    "extended": "extended, one update",
+    "iterated": "iterated extended",
+    "unscented": "unscented, iterated",
+    "ensemble": "ensemble, one update",
+    "perturbed": "ensemble, perturbed",
+    "smoother": "ensemble smoother",
+    REFERENCE: "Monte Carlo",
+}
+
+
+def _label(method: str) -> str:
+    return LABELS.get(method, method)
+
+
+def _rows(record: Record) -> list[dict[str, Any]]:
+    """One row for each problem, filter and parameter."""
+    rows = []
+    for problem in record["problems"]:
+        reference = problem["filters"][REFERENCE]
+        ends = np.log([reference["low"], reference["high"]])
+        width = ends[1] - ends[0]
+        for method, found in problem["filters"].items():
+            repeats = problem["repeats"][method]
+            for k, parameter in enumerate(problem["parameters"]):
+                own = np.log([found["low"][k], found["high"][k]])
+                off = 100 * (own - ends[:, k]) / width[k]
+                rows.append(
+                    {
+                        "problem": problem["name"],
+                        "filter": method,
+                        "parameter": parameter,
+                        "truth": problem["truth"][k],
+                        "estimate": found["estimate"][k],
+                        "low": found["low"][k],
+                        "high": found["high"][k],
+                        "error_percent": 100 * (found["estimate"][k] / problem["truth"][k] - 1),
+                        "width_ratio": (own[1] - own[0]) / width[k],
+                        "lower_end_off_percent": off[0],
+                        "upper_end_off_percent": off[1],
+                        "shift_in_std": (found["log_mean"][k] - reference["log_mean"][k])
+                        / reference["log_std"][k],
+                        "skewness": reference["skewness"][k],
+                        "repeats": repeats["runs"],
+                        "failed": repeats["failed"],
+                        "coverage": _of(repeats["coverage"], k),
+                        "rms_error_percent": 100 * _of(repeats["log_rms_error"], k),
+                        "repeats_width_ratio": _of(repeats["width_ratio"], k),
+                        "forward_solves": found["forward_solves"],
+                        "cpu_seconds": found["seconds"],
+                        "model_seconds": found["model_seconds"],
+                        "ended": found["reason"],
+                        "detail": found["detail"],
+                    }
+                )
+    return rows
+
+
+def _of(values: list[float] | None, k: int) -> float:
+    return float("nan") if values is None else values[k]
+
+
+def _readable(record: Record) -> str:
+    """Markdown: one table for each problem, and the words around them."""
+    table = pd.DataFrame(_rows(record))
+    parts = []
+    for problem in record["problems"]:
+        parts += [_problem_text(problem, table[table["problem"] == problem["name"]]), ""]
+    return "\n".join([*parts, _conclusion(table), "", _notes(record)])
+
+
+def _problem_text(problem: Record, table: pd.DataFrame) -> str:
+    parameters = problem["parameters"]
+    surrogate = problem["surrogate"]
+    truth = ", ".join(f"{n} {v:g}" for n, v in zip(parameters, problem["truth"], strict=True))
+    prior = ", ".join(
+        f"{n} {v:g} (± {100 * s:.0f} %)"
+        for n, v, s in zip(parameters, problem["initial"], problem["log_prior"]["std"], strict=True)
+    )
+    lines = [
+        f"## {problem['title']}",
+        "",
+        f"Truth: {truth}. Prior: {prior}. {problem['observations']} coordinates of the closed "
+        f"valve with errors of {problem['noise_mm']:g} mm. {problem['about']}".strip(),
+        "",
+        "| filter | error (%) | width of the 95 % interval over that of Monte Carlo | its ends "
+        "against those of Monte Carlo (% of the width) | "
+        f"coverage of 95 % intervals, {table['repeats'].iloc[0]} repeats | RMS error of the "
+        "repeats (%) | runs of the model | CPU time (s) | ended |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for method, rows in table.groupby("filter", sort=False):
+        first = rows.iloc[0]
+        ended = str(first["ended"]).partition(":")[0]
+        if first["failed"]:
+            ended += f"; {first['failed']} of {first['repeats']} repeats failed"
+        lines.append(
+            f"| {_label(str(method))} | {_list(rows['error_percent'], '+.1f')} | "
+            f"{_list(rows['width_ratio'], '.2f')} | {_ends(rows)} | "
+            f"{_list(100 * rows['coverage'], '.0f')} % | "
+            f"{_list(rows['rms_error_percent'], '.1f')} | {first['forward_solves']} | "
+            f"{first['cpu_seconds']:.0f} | {ended} |"
+        )
+    reference = table[table["filter"] == REFERENCE]
+    lines += [
+        "",
+        f"Numbers of {', '.join(parameters)}, in this order. Skewness of the posterior: "
+        f"{_list(reference['skewness'], '.2f')}. Monte Carlo: "
+        f"{reference['detail'].iloc[0]}. Surrogate of the repeats: degree {surrogate['degree']}, "
+        f"fitted to {surrogate['runs']} runs and their derivatives; error of a coordinate over "
+        f"{surrogate['held_out']} further runs {surrogate['rms_mm']:.2g} mm RMS, at most "
+        f"{surrogate['largest_mm']:.2g} mm.",
+    ]
+    return "\n".join(lines)
+
+
+def _ends(rows: pd.DataFrame) -> str:
+    pairs = zip(rows["lower_end_off_percent"], rows["upper_end_off_percent"], strict=True)
+    return ", ".join(f"{low:+.0f} / {high:+.0f}" for low, high in pairs)
+
+
+def _list(values: pd.Series, form: str) -> str:
+    return ", ".join("–" if pd.isna(v) else format(v, form) for v in values)
+
+
+def _conclusion(table: pd.DataFrame) -> str:
+    """Which intervals are within the target of Monte Carlo's, where that is near normal."""
+    lines = [
+        "## Gaussian intervals against Monte Carlo",
+        "",
+        f"A posterior counts as near normal where the skewness of its draws is at most "
+        f"{NEAR_NORMAL:g}; there a Gaussian interval should be as wide as that of Monte Carlo to "
+        f"{100 * TARGET:.0f} %.",
+        "",
+        "| filter | near normal: within the target | largest difference | elsewhere: within | "
+        "largest difference |",
+        "|---|---|---|---|---|",
+    ]
+    others = table[table["filter"] != REFERENCE]
+    for method, rows in others.groupby("filter", sort=False):
+        near = rows["skewness"].abs() <= NEAR_NORMAL
+        cells = [_within(rows[near]["width_ratio"]), _within(rows[~near]["width_ratio"])]
+        lines.append(f"| {_label(str(method))} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _within(ratios: pd.Series) -> str:
+    if ratios.empty:
+        return "– | –"
+    off = (ratios - 1).abs()
+    return f"{int((off <= TARGET).sum())} of {len(ratios)} | {100 * off.max():.0f} %"
+
+
+def _notes(record: Record) -> str:
+    return (
+        "Simulated. Unknowns are estimated by their logarithms. Errors, widths, runs and CPU time "
+        "are of one observation that all filters were given, with the finite-element model itself "
+        f"({record['model']['element']}, {' x '.join(map(str, record['model']['cells']))} cells), "
+        "each filter starting from the open valve; every run of the model computes its "
+        "derivatives, also for filters that do not read them. Coverage and RMS errors are of "
+        "repeats in each of which the truth is drawn from the prior, with a surrogate in the place "
+        "of the model; there the Monte Carlo posterior covers 95 % but for chance. The paper's "
+        "filter counts the observation in each round and adds process noise, here as large as the "
+        "prior: its covariance is not that of a posterior."
+    )
+
+
+def filters_figure(record: Record) -> Figure:
+    """Monte Carlo posterior of every unknown, with the density that each filter gives it."""
+    problems = record["problems"]
+    columns = max(len(problem["parameters"]) for problem in problems)
+    figure = Figure(figsize=(3.9 * columns, 2.7 * len(problems) + 0.8), layout="constrained")
+    every = figure.subplots(len(problems), columns, squeeze=False)
+    handles: dict[str, Any] = {}
+    for row, problem in zip(every, problems, strict=True):
+        for axes in row[len(problem["parameters"]) :]:
+            axes.set_visible(False)
+        for k, axes in enumerate(row[: len(problem["parameters"])]):
+            _posterior(axes, problem, k, handles)
+        row[0].set_ylabel("density of the logarithm")
+        row[0].set_title(problem["title"], loc="left", fontsize=9)
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside upper center", ncols=5, fontsize=8
+    )
+    return figure
+
+
+def _posterior(axes: Axes, problem: Record, k: int, handles: dict[str, Any]) -> None:
+    """One unknown of one problem, on a logarithmic axis."""
+    histogram = problem["filters"][REFERENCE]["histogram"][k]
+    edges, density = np.array(histogram["edges"]), np.array(histogram["density"])
+    handles["Monte Carlo"] = axes.stairs(density, np.exp(edges), fill=True, color="0.85")
+    # A few draws far out need not be seen.
+    share = np.cumsum(density) * np.diff(edges)
+    shown = edges[:-1][(share > 5e-4) & (share < 1 - 5e-4)]
+    low, high = shown[0], shown[-1]
+    low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
+    z = np.linspace(low, high, 400)
+    for method, (colour, line) in STYLES.items():
+        found = problem["filters"].get(method)
+        if found is None:
+            continue
+        curve = _normal(z, found["log_mean"][k], found["log_std"][k])
+        handles[_label(method)] = axes.plot(
+            np.exp(z), curve, color=colour, linestyle=line, linewidth=1.4
+        )[0]
+    prior = problem["log_prior"]
+    curve = _normal(z, prior["mean"][k], prior["std"][k])
+    handles["prior"] = axes.plot(np.exp(z), curve, color="0.4", linestyle=":", linewidth=1.0)[0]
+    handles["truth"] = axes.axvline(problem["truth"][k], color="black", linewidth=1.0)
+    axes.set_xscale("log")
+    axes.set_xlim(np.exp(low), np.exp(high))
+    axes.set_ylim(0.0, 1.6 * density.max())
+    name = problem["parameters"][k]
+    axes.set_xlabel(f"{name} [MPa]" if name.startswith("E_f.") else name)
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    ticks = _ticks(np.exp(low), np.exp(high))
+    axes.set_xticks(ticks)
+
+
+def _normal(z: FloatArray, mean: float, std: float) -> FloatArray:
+    return np.exp(-0.5 * ((z - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi))
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """About four round numbers, evenly on a logarithmic axis."""
+    digits = 3 if high / low < 1.2 else 2
+    inside = np.exp(np.linspace(np.log(low), np.log(high), 6)[1:-1])
+    return [float(f"{value:.{digits}g}") for value in inside]
+
+
+def filters_text(record: Record) -> str:
+    """The tables for the terminal."""
+    return _readable(record)
+
+
+def write_filter_tables(folder: Path, record: Record) -> list[Path]:
+    """``filters.csv`` and ``filters.md`` in ``folder``."""
+    table = pd.DataFrame(_rows(record))
+    text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
+    return [
+        write_with(folder / "filters.csv", lambda path: table.to_csv(path, index=False)),
+        write_text(folder / "filters.md", text),
+    ]
+
+
+def write_filter_study(folder: Path, record: Record) -> list[Path]:
+    """The tables and the figure."""
+    figure = save_figure(folder / "filters", filters_figure(record), record)
+    return write_filter_tables(folder, record) + figure
+
+
+def publish_filters(results: Path, record: Record) -> list[Path]:
+    """Keep the record, its tables and its figure."""
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {results}: {error.strerror}") from error
+    write_json(results / "filters.json", record)
+    return write_filter_study(results, record)

@@ -1,0 +1,39 @@
+"""Problems whose posteriors are known on paper, for all filters."""
+
+import numpy as np
+
+from mvest.estimation import Gaussian, Prediction
+
+
+class Linear:
+    """h(m) = H m with and without its derivative, and the posterior in covariance form."""
+
+    def __init__(self, n=15, p=3, seed=3):
+        rng = np.random.default_rng(seed)
+        self.H = rng.standard_normal((n, p))
+        A = rng.standard_normal((p, p))
+        self.prior = Gaussian(rng.standard_normal(p), A @ A.T + np.eye(p))
+        self.R = rng.uniform(0.2, 1.0, n)
+        self.y = self.H @ rng.standard_normal(p) + np.sqrt(self.R) * rng.standard_normal(n)
+        P = self.prior.covariance
+        S = self.H @ P @ self.H.T + np.diag(self.R)
+        K = P @ self.H.T @ np.linalg.inv(S)
+        self.mean = self.prior.mean + K @ (self.y - self.H @ self.prior.mean)
+        self.covariance = P - K @ S @ K.T
+
+    def differentiated(self, m):
+        return Prediction(self.H @ m, self.H)
+
+    def plain(self, m):
+        return Prediction.undifferentiated(self.H @ m)
+
+
+def square(m):
+    """h(m) = m²."""
+    return Prediction(m**2, 2.0 * m[:, None])
+
+
+def saturating(m):
+    """Two numbers that tell little of a large m and much of a small one."""
+    x = np.exp(-m)
+    return Prediction(np.concatenate([x, 2.0 * x]), np.concatenate([-x, -2.0 * x])[:, None])
