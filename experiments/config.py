@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.mirror import schema
+from mvest.cycle import CycleProtocol
 from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.training import TrainingSettings
@@ -52,6 +53,7 @@ PaperSettingsConfig = schema(PaperSettings)
 SimulationConfig = schema(Simulation)
 DeviationsConfig = schema(Deviations)
 PopulationSettingsConfig = schema(PopulationSettings)
+CycleProtocolConfig = schema(CycleProtocol)
 TrainingSettingsConfig = schema(TrainingSettings)
 DetectionSettingsConfig = schema(TrackingSettings)
 
@@ -248,6 +250,24 @@ class EchoConfig:
 
 
 @dataclass
+class CycleConfig:
+    """What the studies of a whole cycle add."""
+
+    protocol: CycleProtocolConfig = field(default_factory=CycleProtocolConfig)  # type: ignore[valid-type]
+    noise_mm: float = 0.5  # SD of each coordinate
+    exact_told_mm: float = 0.1  # SD that the filter is told of coordinates without noise
+    seeds: int = 8
+    finer_columns: int = 40  # cells of the mesh of a truth that is not the estimator's
+    finer_rows: int = 5
+    finer_dt_factor: float = 0.5
+    halvings: int = 2  # of the time step, to see what depends on it
+    beats: int = 10  # over which a modulus drifts
+    beat_times: list[float] = field(default_factory=lambda: [0.1, 0.2, 0.3, 0.4])  # s
+    drift: float = -0.3  # of the first parameter, from the first beat to the last
+    drift_std: float = 0.04  # that the filter is told of the logarithm from beat to beat
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -313,6 +333,7 @@ class Config:
     check: bool = False  # only check the case, or the image step of a volume, and draw it
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
+    cycle: CycleConfig = field(default_factory=CycleConfig)
     echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
     continuation: bool = True  # later closures start from the last closed state

@@ -20,7 +20,7 @@ from mvest.typing import FloatArray
 from mvest.valve.embedding import embed
 from mvest.valve.surfaces import thicken
 
-__all__ = ["run_closure_study", "run_gate_study"]
+__all__ = ["forward_record", "model_of", "run_closure_study", "run_gate_study"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -73,7 +73,7 @@ def run_gate_study(config: Values, config_hash: str, folder: Path, started: floa
     reference = model_of(config, GateCase("reference"))
     report = run_gate(lambda case: model_of(config, case), values, on_case=tell)
     rows = [_plain(asdict(row)) for row in report.rows]
-    record = _record(config, config_hash, reference, values, started, len(rows))
+    record = forward_record(config, config_hash, reference, values, started, len(rows))
     record |= {
         "passed": report.passed,
         "rows": rows,
@@ -102,7 +102,7 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
     observed = config["observation"]
     normals = _normals(config, observed["columns"], observed["rows"])
     steps = measure_steps(model, result, distance, normals)
-    record = _record(config, config_hash, model, values, started, 1)
+    record = forward_record(config, config_hash, model, values, started, 1)
     record |= {"rows": [_plain(asdict(s)) for s in steps], "contact_distance_mm": distance}
     if not result.simulation.converged:
         record |= {"status": "failed", "reason": result.simulation.reason.value}
@@ -130,7 +130,7 @@ def _plain(row: dict[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
-def _record(
+def forward_record(
     config: Values,
     config_hash: str,
     model: ClosureModel,
@@ -138,6 +138,7 @@ def _record(
     started: float,
     solves: int,
 ) -> dict[str, Any]:
+    """What every record of a study says that estimates nothing in the usual way."""
     return {
         "schema": 1,
         "experiment": config["name"],

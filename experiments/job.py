@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from experiments.case import check_case, run_case
 from experiments.config import register
+from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
 from experiments.folder import (
     CONFIG,
@@ -26,6 +27,7 @@ from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
+from experiments.joint import run_joint_study
 from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
@@ -34,10 +36,12 @@ from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
+from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
+from mvest.reporting.joint import joint_text, publish_joint, write_joint
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -205,6 +209,18 @@ STUDIES: dict[str, Study] = {
         gate_text,
         write_gate_tables,
         lambda results, _name, record, _folder: publish_gate(results, record),
+    ),
+    "joint": Study(
+        run_joint_study,
+        joint_text,
+        write_joint,
+        lambda results, _name, record, _folder: publish_joint(results, record),
+    ),
+    "cycle": Study(
+        run_cycle_study,
+        cycle_text,
+        write_cycle,
+        lambda results, _name, record, _folder: publish_cycle(results, record),
     ),
     "donor": Study(
         run_donor,

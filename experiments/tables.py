@@ -9,10 +9,12 @@ from pathlib import Path
 
 from mvest.errors import MvestError
 from mvest.reporting.closure import write_closure_tables
+from mvest.reporting.cycle import write_cycle
 from mvest.reporting.donor import write_donor_tables
 from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
+from mvest.reporting.joint import write_joint
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
 from mvest.reporting.publish import RECORDS, regenerate
@@ -24,6 +26,8 @@ __all__ = ["main"]
 OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
+    "joint": write_joint,
+    "cycle": write_cycle,
     "donor": write_donor_tables,
     "imaging": write_imaging_study,
     "volume": write_volume_tables,

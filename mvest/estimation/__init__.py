@@ -18,19 +18,37 @@ from mvest.estimation.diagnostics import (
     zero_mean,
 )
 from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
+from mvest.estimation.frames import (
+    FrameState,
+    Trajectory,
+    filter_frames,
+    random_walk,
+    smooth_frames,
+)
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.identifiability import Identifiability, cramer_rao_bound, identifiability
 from mvest.estimation.iterated import IteratedFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.sequential import (
+    DriftEstimate,
+    DriftSmoother,
+    FrameModel,
+    SequentialEstimate,
+    SequentialFilter,
+)
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [
     "Consistency",
+    "DriftEstimate",
+    "DriftSmoother",
     "Estimate",
     "Filter",
+    "FrameModel",
+    "FrameState",
     "Gaussian",
     "Identifiability",
     "Identity",
@@ -44,17 +62,23 @@ __all__ = [
     "Prediction",
     "Reason",
     "SchmidtFilter",
+    "SequentialEstimate",
+    "SequentialFilter",
+    "Trajectory",
     "Transform",
     "Update",
     "ZTest",
     "chi_square_band",
     "consistency",
     "cramer_rao_bound",
+    "filter_frames",
     "identifiability",
     "kalman_update",
     "lag_one_autocorrelation",
     "moran",
     "nees",
     "observation_noise",
+    "random_walk",
+    "smooth_frames",
     "zero_mean",
 ]

@@ -58,6 +58,8 @@ OTHERS = (
         "Leaflets found in simulated echo volumes",
         ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
     ),
+    ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
+    ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
     ("donor", "A recorded donor valve", ("donor",)),
     ("benchmark", "How fast", ("benchmark",)),
 )
@@ -74,6 +76,10 @@ CAPTIONS = {
     "imaging_training": "Errors of each stage against the number of training volumes. Simulated.",
     "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
     "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
+    "joint": "Estimates as frames come in, errors over seeds, and what two frames and a whole "
+    "cycle could tell. Simulated.",
+    "cycle": "The cycle and its frames, what they tell of each parameter, and a modulus that "
+    "drifts over beats, filtered and smoothed. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "benchmark": "Where the time goes.",
 }

@@ -1,0 +1,230 @@
+"""Chordal length and leaflet moduli, estimated together from a whole cycle."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.build import build_filter
+from experiments.gate import forward_record, model_of
+from experiments.mirror import build
+from mvest.cycle import CycleModel, CycleObservation, CycleProtocol, SeenFrames
+from mvest.errors import ConfigurationError
+from mvest.estimation import (
+    Estimate,
+    Gaussian,
+    Identifiability,
+    IteratedFilter,
+    SequentialEstimate,
+    SequentialFilter,
+    Transform,
+    identifiability,
+    nees,
+)
+from mvest.gate import GateCase
+from mvest.typing import FloatArray
+
+__all__ = ["bound_entry", "closed_frame", "cycle_model", "run_joint_study"]
+
+Values = Mapping[str, Any]
+
+
+def cycle_model(config: Values, **changes: Any) -> CycleModel:
+    """The configured model of a cycle, its protocol with ``changes``."""
+    protocol = build(CycleProtocol, {**config["cycle"]["protocol"], **changes})
+    return CycleModel(model_of(config, GateCase("reference")), protocol)
+
+
+def closed_frame(protocol: CycleProtocol) -> int:
+    """The last frame in which the valve is held closed."""
+    held = [k for k, t in enumerate(protocol.times) if protocol.phase(t) > 1 - 1e-9]
+    if not held:
+        raise ConfigurationError("cycle.protocol.times has no frame on the plateau of the pressure")
+    return held[-1]
+
+
+def bound_entry(label: str, frames: list[int], bound: Identifiability) -> dict[str, Any]:
+    """Plain data of a Cramér-Rao bound; standard deviations relative to the parameters."""
+    relative = bound.std / bound.scale
+    return {
+        "frames": label,
+        "count": len(frames),
+        "std": [float(v) if np.isfinite(v) else None for v in relative],
+        "correlation": [[_finite(v) for v in row] for row in bound.correlation],
+        "condition_number": _finite(bound.condition_number),
+        "flat": list(bound.flat(0.05)),
+    }
+
+
+def run_joint_study(
+    config: Values, config_hash: str, folder: Path, started: float
+) -> tuple[dict[str, Any], list[Path]]:
+    """Estimate from frames without noise, with noise, and of a finer model."""
+    settings = config["cycle"]
+    parameters = tuple(config["parameters"])
+    _, transform, prior = build_filter(config["filter"], parameters)
+    truth = np.array(config["truth"]["values"], dtype=float)
+    # The truth is made by an object of its own; the estimator gets the observation alone.
+    maker, model = cycle_model(config), cycle_model(config)
+    at_truth = maker(truth)
+    if not at_truth.converged:
+        raise ConfigurationError(f"the truth has no cycle: {at_truth.reason}")
+    frames = at_truth.y.reshape(len(maker.protocol.times), -1, 3)
+    noise, told = settings["noise_mm"], settings["exact_told_mm"]
+    seen = CycleObservation(frames, noise).of(model)
+    study = _Study(parameters, transform, prior, seen, truth)
+
+    def rows_of(wanted: list[int]) -> FloatArray:
+        return at_truth.jacobian.reshape(*frames.shape, -1)[wanted].reshape(-1, len(truth))
+
+    everything, two = list(range(len(frames))), [0, closed_frame(maker.protocol)]
+    bounds = [
+        bound_entry(label, wanted, identifiability(rows_of(wanted), noise**2, truth))
+        for label, wanted in (("open and closed", two), ("whole cycle", everything))
+    ]
+    bound = np.array(bounds[1]["std"], dtype=float)
+
+    exact = study.sequential(CycleObservation.simulated(frames, 0.0, _rng(config, 0), told))
+    _tell("no noise", exact.estimate, truth)
+    seeds: list[Estimate] = []
+    first: SequentialEstimate | None = None
+    for k in range(settings["seeds"]):
+        observation = CycleObservation.simulated(frames, noise, _rng(config, k))
+        if first is None:
+            first = study.sequential(observation)
+            seeds.append(first.estimate)
+        else:
+            # The mode does not depend on where its search starts.
+            seeds.append(study.batch(observation, seeds[0].mean))
+        _tell(f"seed {k}", seeds[-1], truth)
+    assert first is not None
+    finer = _finer(config).frames(truth)
+    other = study.batch(CycleObservation.simulated(finer, noise, _rng(config, 0)), seeds[0].mean)
+    _tell("finer truth", other, truth)
+
+    errors = np.array([e.mean / truth - 1 for e in seeds if e.converged])
+    runs = [exact.estimate, *seeds, other]
+    record = forward_record(
+        config, config_hash, model.closure, truth, started, sum(e.forward_solves for e in runs)
+    )
+    record |= {
+        "times": list(maker.protocol.times),
+        "start": prior.mean.tolist(),
+        "noise_mm": noise,
+        "told_mm": told,
+        "vertices": int(frames.shape[1]),
+        "bounds": bounds,
+        "exact": _entry(exact.estimate, truth) | {"frames": study.path(exact)},
+        "seeds": [_entry(e, truth) | {"seed": config["seed"] + k} for k, e in enumerate(seeds)],
+        "first": study.path(first),
+        "rms_over_bound": (np.sqrt(np.mean(errors**2, axis=0)) / bound).tolist(),
+        "finer": _entry(other, truth)
+        | {
+            "cells": [settings["finer_columns"], settings["finer_rows"]],
+            "distance_mm": float(np.linalg.norm(finer - frames, axis=2).mean()),
+        },
+    }
+    failed = [e for e in runs if not e.converged]
+    if failed:
+        record |= {"status": "failed", "reason": failed[0].reason.value}
+    record["seconds"] = record["seconds_total"] = time.time() - started
+    return record, []
+
+
+class _Study:
+    """What all estimates of the study share."""
+
+    def __init__(
+        self,
+        parameters: tuple[str, ...],
+        transform: Transform,
+        prior: Gaussian,
+        seen: SeenFrames,
+        truth: FloatArray,
+    ) -> None:
+        self.parameters, self.transform, self.prior = parameters, transform, prior
+        self.seen = seen
+        self._truth = truth
+
+    def sequential(self, observation: CycleObservation) -> SequentialEstimate:
+        return SequentialFilter(observation.sizes, relinearise=0.1).run(
+            self.seen,
+            self.prior,
+            observation.y,
+            observation.R,
+            names=self.parameters,
+            transform=self.transform,
+        )
+
+    def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
+        filter_ = IteratedFilter(tolerance=1e-3, start=tuple(map(float, start)))
+        return filter_(
+            self.seen,
+            self.prior,
+            observation.y,
+            observation.R,
+            names=self.parameters,
+            transform=self.transform,
+        )
+
+    def path(self, found: SequentialEstimate) -> list[dict[str, Any]]:
+        """Relative error and relative standard deviation after each frame of the first pass."""
+        rows = []
+        for extended, final in zip(found.extended, found.final, strict=True):
+            m = self.transform.inverse(extended.filtered.mean)
+            rows.append(
+                {
+                    "error": (m / self._truth - 1).tolist(),
+                    "std": extended.filtered.std.tolist(),
+                    "nis": final.nis,
+                    "nis_band": list(final.nis_band),
+                    "gain_nats": final.information_gain,
+                }
+            )
+        return rows
+
+
+def _finer(config: Values) -> CycleModel:
+    """The truth that the estimator's model cannot be."""
+    settings = config["cycle"]
+    mesh = {
+        **config["mesh"],
+        "columns": settings["finer_columns"],
+        "rows": settings["finer_rows"],
+    }
+    dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
+    return cycle_model({**config, "mesh": mesh}, dt=dt)
+
+
+def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:
+    error = found.mean - truth
+    summary = found.innovation
+    return {
+        "status": "converged" if found.converged else "failed",
+        "reason": found.reason.value,
+        "estimate": found.mean.tolist(),
+        "error": (error / truth).tolist(),
+        "std": (found.std / truth).tolist(),
+        "nees": nees(error, found.covariance),
+        "iterations": found.iterations,
+        "runs": found.forward_solves,
+        "residual_mm": None if summary is None else summary.rms,
+    }
+
+
+def _rng(config: Values, k: int) -> np.random.Generator:
+    return np.random.default_rng(config["seed"] + k)
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _tell(label: str, found: Estimate, truth: FloatArray) -> None:
+    errors = ", ".join(f"{100 * e:+.2f} %" for e in found.mean / truth - 1)
+    print(f"{label}: {errors} ({found.forward_solves} runs)", file=sys.stderr, flush=True)

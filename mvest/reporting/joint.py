@@ -1,0 +1,194 @@
+"""Chordal length and moduli from a whole cycle: the table, the words and the figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from mvest.errors import cannot_write
+from mvest.provenance import write_json
+from mvest.reporting.figures import COLOURS, MARKERS, save_figure
+from mvest.reporting.files import provenance_line, write_text, write_with
+
+__all__ = ["joint_figure", "joint_text", "parameter_label", "publish_joint", "write_joint"]
+
+Record = Mapping[str, Any]
+
+EXACT_LIMIT = 0.01
+"""Relative error to be reached without noise."""
+NOISE_LIMIT = 1.5
+"""Root mean square error over the Cramér-Rao bound to be reached with noise."""
+
+LABELS = {
+    "E_f.anterior": "anterior modulus",
+    "E_f.posterior": "posterior modulus",
+    "chord_rest_length": "chordal length",
+}
+
+
+def parameter_label(name: str) -> str:
+    """What a reader calls a parameter."""
+    return LABELS.get(name, name)
+
+
+def _percent(value: float | None, form: str = ".2f") -> str:
+    return "not determined" if value is None else f"{100 * value:{form}} %"
+
+
+def _table(record: Record) -> pd.DataFrame:
+    """One row per estimate and parameter."""
+    cases = [("no noise", record["exact"])]
+    cases += [(f"noise, seed {entry['seed']}", entry) for entry in record["seeds"]]
+    cases.append(("noise, truth on a finer mesh", record["finer"]))
+    bound = record["bounds"][-1]["std"]
+    rows = []
+    for case, entry in cases:
+        for k, name in enumerate(record["parameters"]):
+            rows.append(
+                {
+                    "case": case,
+                    "parameter": name,
+                    "truth": record["truth"][k],
+                    "start": record["start"][k],
+                    "estimate": entry["estimate"][k],
+                    "relative_error": entry["error"][k],
+                    "relative_std": entry["std"][k],
+                    "relative_bound": bound[k],
+                    "model_runs": entry["runs"],
+                    "residual_mm": entry["residual_mm"],
+                    "status": entry["status"],
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _words(record: Record) -> str:
+    names = [parameter_label(name) for name in record["parameters"]]
+    two, whole = record["bounds"]
+    exact, ratio, finer = record["exact"], record["rms_over_bound"], record["finer"]
+    worst = max(abs(e) for e in exact["error"])
+    start = [s / t - 1 for s, t in zip(record["start"], record["truth"], strict=True)]
+    lines = [
+        f"| | {' | '.join(names)} |",
+        "|---|" + "---|" * len(names),
+        f"| start | {' | '.join(_percent(v, '+.0f') for v in start)} |",
+        f"| error, whole cycle without noise | "
+        f"{' | '.join(_percent(v, '+.3f') for v in exact['error'])} |",
+        f"| smallest possible std, open and closed frame | "
+        f"{' | '.join(_percent(v) for v in two['std'])} |",
+        f"| smallest possible std, whole cycle | {' | '.join(_percent(v) for v in whole['std'])} |",
+        f"| RMS error over that bound, {len(record['seeds'])} seeds | "
+        f"{' | '.join(f'{v:.2f}' for v in ratio)} |",
+        f"| error, truth on {finer['cells'][0]} x {finer['cells'][1]} cells and half the time step "
+        f"| {' | '.join(_percent(v, '+.2f') for v in finer['error'])} |",
+        f"| std that the filter told of it | {' | '.join(_percent(v) for v in finer['std'])} |",
+        "",
+        f"{len(record['times'])} frames of {record['vertices']} vertices; noise of "
+        f"{record['noise_mm']:g} mm per coordinate. Everything is simulated.",
+        f"Without noise: largest error {100 * worst:.3f} %, target {100 * EXACT_LIMIT:g} %: "
+        f"{'met' if worst <= EXACT_LIMIT else 'missed'}. "
+        f"With noise: largest ratio to the bound {max(ratio):.2f}, target {NOISE_LIMIT:g}: "
+        f"{'met' if max(ratio) <= NOISE_LIMIT else 'missed'}.",
+        _two_frames(record),
+        f"Where the truth comes from another mesh, the frames of the two meshes are "
+        f"{finer['distance_mm']:.2f} mm apart (mean) at the same parameters; the standard "
+        f"deviations know nothing of it.",
+    ]
+    return "\n".join(lines)
+
+
+def _two_frames(record: Record) -> str:
+    two, whole = record["bounds"]
+    names = [parameter_label(name) for name in record["parameters"]]
+    pairs = [
+        (abs(two["correlation"][i][j]), i, j)
+        for i in range(len(names))
+        for j in range(i)
+        if two["correlation"][i][j] is not None
+    ]
+    if not pairs or None in two["std"] or None in whole["std"]:
+        return "Open and closed frame alone do not determine all parameters."
+    _, i, j = max(pairs)
+    factor = [a / b for a, b in zip(two["std"], whole["std"], strict=True)]
+    return (
+        f"Open and closed frame alone leave {names[j]} and {names[i]} correlated by "
+        f"{two['correlation'][i][j]:+.3f} (whole cycle: {whole['correlation'][i][j]:+.3f}); their "
+        f"bounds are {min(factor):.1f} to {max(factor):.1f} times those of the whole cycle, of "
+        f"which {np.sqrt(whole['count'] - 1):.1f} would be the number of frames alone."
+    )
+
+
+def joint_text(record: Record) -> str:
+    """The summary for the terminal."""
+    return _words(record)
+
+
+def joint_figure(record: Record) -> Figure:
+    """Estimates as frames come in, errors over the bound, and the bounds of both sets of frames."""
+    names = record["parameters"]
+    figure = Figure(figsize=(11.0, 3.9), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
+    times = record["times"]
+    for k, name in enumerate(names):
+        colour, label = COLOURS[k], parameter_label(name)
+        error = 100 * np.array([row["error"][k] for row in record["first"]])
+        std = 100 * np.array([row["std"][k] for row in record["first"]])
+        left.fill_between(times, error - 2 * std, error + 2 * std, color=colour, alpha=0.15, lw=0)
+        left.plot(times, error, color=colour, marker=MARKERS[k], ms=4, label=label)
+    left.axhline(0.0, color="black", lw=0.8)
+    left.set(xlabel="time of the last frame seen (s)", ylabel="error (% of the truth)")
+    left.set_yscale("symlog", linthresh=5.0)
+    left.set_title("first pass over the frames (± 2 std)", fontsize=10)
+    left.legend(fontsize=8, frameon=False)
+    bound = np.array(record["bounds"][-1]["std"], dtype=float)
+    errors = np.array([entry["error"] for entry in record["seeds"]]) / bound
+    for k in range(len(names)):
+        x = k + np.linspace(-0.2, 0.2, len(errors))
+        middle.plot(x, errors[:, k], ls="", marker=MARKERS[k], ms=4, color=COLOURS[k])
+        rms = record["rms_over_bound"][k]
+        middle.text(k, 3.4, f"RMS {rms:.2f}", ha="center", fontsize=8)
+    middle.axhspan(-2, 2, color="0.9", zorder=0)
+    middle.axhline(0.0, color="black", lw=0.8)
+    middle.set(ylim=(-4, 4), ylabel="error / Cramér-Rao bound")
+    middle.set_title(f"{len(errors)} seeds, {record['noise_mm']:g} mm noise", fontsize=10)
+    width = 0.38
+    for j, entry in enumerate(record["bounds"]):
+        values = [np.nan if v is None else 100 * v for v in entry["std"]]
+        places = np.arange(len(names)) + (j - 0.5) * width
+        right.bar(places, values, width, color=("0.65", "0.25")[j], label=entry["frames"])
+    right.set_yscale("log")
+    right.set(ylabel="smallest possible std (%)")
+    right.set_title("two frames and the whole cycle", fontsize=10)
+    right.legend(fontsize=8, frameon=False)
+    for axes in (middle, right):
+        axes.set_xticks(range(len(names)))
+        axes.set_xticklabels(
+            [parameter_label(name).replace(" ", "\n") for name in names], fontsize=8
+        )
+    return figure
+
+
+def write_joint(folder: Path, record: Record) -> list[Path]:
+    """``joint.csv``, ``joint.md`` and the figure ``joint``."""
+    table = _table(record)
+    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
+    return [
+        write_with(folder / "joint.csv", lambda path: table.to_csv(path, index=False)),
+        write_text(folder / "joint.md", text),
+        *save_figure(folder / "joint", joint_figure(record), record),
+    ]
+
+
+def publish_joint(results: Path, record: Record) -> list[Path]:
+    """Keep the record, its tables and its figure."""
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(results, error) from error
+    write_json(results / "joint.json", record)
+    return write_joint(results, record)
