@@ -16,11 +16,13 @@ vertices of the leaflet's surface and the areas w that belong to them. A priori 
 same modulus at the same point.
 
 All stiffness of a point, damping included, is scaled by :math:`\exp(\sum_k a_k \phi_k)`.
+
+A :class:`StiffPatch` is no unknown: it is how a valve is simulated whose tissue differs somewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,7 +36,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy import LeafletSurface, lumped_areas
 from mvest.valve.mesh import SolidMesh
 
-__all__ = ["FieldBasis", "FieldLaw", "ModulusField", "basis_at_quadrature"]
+__all__ = ["FieldBasis", "FieldLaw", "ModulusField", "StiffPatch", "at_quadrature"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,42 @@ class ModulusField:
                 raise InputError(f"field {name} = {value}, expected > 0")
         if self.modes < 1:
             raise InputError(f"field modes = {self.modes}, expected at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class StiffPatch:
+    """Tissue of another stiffness around one point of a leaflet.
+
+    ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` within ``radius`` of the centre,
+    d the distance in the reference frame: smooth, and of bounded extent.
+
+    Attributes
+    ----------
+    region : str
+    centre : tuple of float
+        ``(x, y, z)`` mm in the reference frame.
+    radius_mm : float
+    factor : float
+        On the stiffness at the centre.
+    """
+
+    region: str
+    centre: tuple[float, ...]
+    radius_mm: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
+            raise InputError(f"centre of a patch {self.centre}, expected (x, y, z) mm")
+        for name in ("radius_mm", "factor"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} of a patch = {value}, expected > 0")
+
+    def log_scale(self, points: FloatArray) -> FloatArray:
+        """What is added to log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
+        d2 = np.sum((points - np.asarray(self.centre)) ** 2, axis=-1) / self.radius_mm**2
+        return np.asarray(np.log(self.factor) * np.maximum(1 - d2, 0.0) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,13 +173,32 @@ def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     return np.asarray(np.exp(-cdist(a, b, "sqeuclidean") / (2 * length**2)))
 
 
-def basis_at_quadrature(mesh: SolidMesh, region: str, basis: FieldBasis) -> FloatArray:
-    """The modes ``(e, q, k)`` at the quadrature points of a leaflet's elements, 0 in the others."""
+def at_quadrature(
+    mesh: SolidMesh, region: str, of: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """What a function gives at the quadrature points of a leaflet's elements, 0 in the others.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    region : str
+    of : callable
+        Points ``(e, q, 3)`` mm of the reference frame -> ``(e, q, ...)``.
+
+    Raises
+    ------
+    InputError
+        If the mesh has no such leaflet.
+    """
+    if region not in mesh.region_names:
+        raise InputError(
+            f"field of {region!r}: no such leaflet; there are {', '.join(mesh.region_names)}"
+        )
     shape = mesh.reference.shape(mesh.reference.points)
     here = mesh.region == mesh.region_names.index(region)
-    points = np.einsum("qa,eai->eqi", shape, mesh.nodes[mesh.elements[here]])
-    out = np.zeros((len(mesh.elements), len(shape), basis.combination.shape[1]))
-    out[here] = basis(points)
+    values = of(np.einsum("qa,eai->eqi", shape, mesh.nodes[mesh.elements[here]]))
+    out = np.zeros((len(here), *values.shape[1:]))
+    out[here] = values
     return out
 
 
@@ -154,18 +211,22 @@ class FieldLaw:
     base : Law
         At coefficients of zero.
     modes : mapping
-        Region -> ``(e, q, k)``, see `basis_at_quadrature`.
+        Region -> ``(e, q, k)``, see `at_quadrature`.
     coefficients : mapping
         Region -> ``(k,)``.
+    given : ndarray or float
+        ``(e, q)`` part of log E_f that is no unknown.
     """
 
     base: Law
     modes: Mapping[str, FloatArray]
     coefficients: Mapping[str, FloatArray]
+    given: FloatArray | float = 0.0
     _scale: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        log = sum(modes @ self.coefficients[region] for region, modes in self.modes.items())
+        varied = (modes @ self.coefficients[region] for region, modes in self.modes.items())
+        log = sum(varied, np.asarray(self.given))
         object.__setattr__(self, "_scale", np.exp(log)[:, :, None])
 
     @property

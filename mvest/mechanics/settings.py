@@ -8,7 +8,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.contact import ContactSettings
-from mvest.mechanics.field import ModulusField
+from mvest.mechanics.field import ModulusField, StiffPatch
 from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
@@ -139,6 +139,8 @@ class MechanicsSettings:
     fields : dict
         Region name -> :class:`mvest.mechanics.field.ModulusField`, where the modulus varies within
         it; the coefficients ``field.REGION.K`` that are given no value are 0.
+    patches : dict
+        Any name -> :class:`mvest.mechanics.field.StiffPatch`, for simulations.
     """
 
     tissue: dict[str, TissueSettings]
@@ -152,6 +154,7 @@ class MechanicsSettings:
     patch_radius: float = 2.0
     solver: str = "auto"
     fields: dict[str, ModulusField] = field(default_factory=dict)
+    patches: dict[str, StiffPatch] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("density", "support_stiffness", "patch_radius"):

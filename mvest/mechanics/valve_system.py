@@ -15,7 +15,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.cables import Cables, Hinge
 from mvest.mechanics.contact import Contact
-from mvest.mechanics.field import FieldBasis, FieldLaw, basis_at_quadrature
+from mvest.mechanics.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law import BiotLaw
 from mvest.mechanics.parameters import check_names
 from mvest.mechanics.pressure import PressureLoad
@@ -31,14 +31,15 @@ from mvest.valve.mesh import SolidMesh
 __all__ = [
     "HeldState",
     "Pacing",
+    "Variation",
     "boundary_loading",
     "build_system",
     "check_parameters",
     "factors_of",
-    "field_modes",
     "held_loading",
     "material_law",
     "retune",
+    "variation_of",
 ]
 
 
@@ -72,6 +73,22 @@ class HeldState:
     papillary_tips: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Variation:
+    """How the modulus varies within the leaflets, at the quadrature points of a mesh.
+
+    Attributes
+    ----------
+    modes : mapping
+        Region -> ``(e, q, k)`` modes of its field.
+    given : ndarray or float
+        ``(e, q)`` part of log E_f that is no unknown.
+    """
+
+    modes: Mapping[str, FloatArray]
+    given: FloatArray | float
+
+
 def build_system(
     valve: Valve,
     contact_valve: Valve,
@@ -102,8 +119,7 @@ def build_system(
     """
     check_parameters(values, valve, settings)
     chordae = valve.chordae
-    modes = field_modes(valve, mesh, settings)
-    law = material_law(mesh, settings, values, modes)
+    law = material_law(mesh, settings, values, variation_of(valve, mesh, settings))
     solid = Solid(mesh, law, density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
@@ -144,7 +160,7 @@ def material_law(
     mesh: SolidMesh,
     settings: MechanicsSettings,
     values: Mapping[str, float],
-    modes: Mapping[str, FloatArray] | None = None,
+    variation: Variation | None = None,
 ) -> Law:
     """The law of the mesh.
 
@@ -155,8 +171,8 @@ def material_law(
     values : mapping
         Parameter -> value: ``E_f.REGION`` of each region, and any of the others; those that are no
         parameters of tissue are passed over.
-    modes : mapping, optional
-        Of the settings' fields, from `field_modes`.
+    variation : Variation, optional
+        From `variation_of`; by default every leaflet has the same moduli throughout.
 
     Raises
     ------
@@ -178,31 +194,36 @@ def material_law(
             )
         )
     law = BiotLaw.of_moduli(moduli)
-    if not modes:
+    if variation is None:
         return law
     coefficients = {
         region: np.array([values.get(f"field.{region}.{k}", 0.0) for k in range(own.shape[2])])
-        for region, own in modes.items()
+        for region, own in variation.modes.items()
     }
-    return FieldLaw(law, modes, coefficients)
+    return FieldLaw(law, variation.modes, coefficients, variation.given)
 
 
-def field_modes(
-    valve: Valve, mesh: SolidMesh, settings: MechanicsSettings
-) -> dict[str, FloatArray]:
-    """Region -> modes ``(e, q, k)`` of its field at the quadrature points of the mesh."""
-    return {
-        region: basis_at_quadrature(mesh, region, FieldBasis.of(valve.surface, region, own))
+def variation_of(valve: Valve, mesh: SolidMesh, settings: MechanicsSettings) -> Variation | None:
+    """How the settings let the modulus vary within the leaflets, at the mesh's points."""
+    if not settings.fields and not settings.patches:
+        return None
+    modes = {
+        region: at_quadrature(mesh, region, FieldBasis.of(valve.surface, region, own))
         for region, own in settings.fields.items()
     }
+    given = sum(
+        (at_quadrature(mesh, patch.region, patch.log_scale) for patch in settings.patches.values()),
+        np.zeros((len(mesh.elements), len(mesh.reference.points))),
+    )
+    return Variation(modes, given)
 
 
 def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
     """Give a system of a valve other values of its parameters; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
-    modes = old.modes if isinstance(old, FieldLaw) else None
-    law = material_law(system.solid.mesh, settings, values, modes)
+    variation = Variation(old.modes, old.given) if isinstance(old, FieldLaw) else None
+    law = material_law(system.solid.mesh, settings, values, variation)
     system.retune(law, factors_of(system.cables, values))
 
 

@@ -1,13 +1,17 @@
 """Modulus that varies over a leaflet: the modes of the field, and the law that they scale."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.field import FieldBasis, FieldLaw, ModulusField, basis_at_quadrature
+from mvest.mechanics.field import FieldBasis, FieldLaw, ModulusField, StiffPatch, at_quadrature
 from mvest.mechanics.law import BiotLaw
 from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.solid import Solid
+from mvest.mechanics.valve_system import material_law, variation_of
 from mvest.valve.structured import structured_mesh
 from mvest.valve.template import Template
 from tests.mechanics.bodies import MATERIALS, block
@@ -58,7 +62,7 @@ def test_the_modulus_is_the_same_in_every_mesh(basis):
     moments = []
     for kind in (("hex18", 24, 3), ("hex18", 48, 6), ("tet10", 24, 3)):
         mesh = structured_mesh(TEMPLATE, *kind)
-        modes = basis_at_quadrature(mesh, "anterior", basis)
+        modes = at_quadrature(mesh, "anterior", basis)
         assert np.all(modes[mesh.region != mesh.region_names.index("anterior")] == 0)
         shape = mesh.reference.shape(mesh.reference.points)
         points = np.einsum("qa,eai->eqi", shape, mesh.nodes[mesh.elements])
@@ -146,3 +150,30 @@ def test_a_field_of_no_leaflet_or_of_too_many_modes_is_refused():
         FieldBasis.of(SURFACE, "septal", SETTINGS)
     with pytest.raises(InputError, match="10000 modes, expected at most"):
         FieldBasis.of(SURFACE, "anterior", ModulusField(8.0, 0.4, 10000))
+
+
+def test_a_patch_is_smooth_of_bounded_extent_and_as_stiff_as_it_says():
+    patch = StiffPatch("anterior", (1.0, 2.0, 3.0), 4.0, 2.0)
+    points = np.array([[1.0, 2.0, 3.0], [1.0, 4.0, 3.0], [5.0, 2.0, 3.0], [1.0, 2.0, 9.0]])
+    # At half the radius (1 - 1/4)^2 = 9/16 of the logarithm.
+    np.testing.assert_allclose(np.exp(patch.log_scale(points)), [2, 2 ** (9 / 16), 1, 1])
+    with pytest.raises(InputError, match="factor of a patch = 0"):
+        StiffPatch("anterior", (1.0, 2.0, 3.0), 4.0, 0.0)
+    with pytest.raises(InputError, match="centre of a patch"):
+        StiffPatch("anterior", (1.0, 2.0), 4.0, 2.0)
+
+
+def test_a_patch_of_the_settings_scales_the_law_of_its_leaflet_alone():
+    mesh, valve = structured_mesh(TEMPLATE, "hex18", 24, 3), TEMPLATE.valve(32, 8)
+    tissue = {"anterior": TissueSettings(2.6), "posterior": TissueSettings(1.1)}
+    values = {"E_f.anterior": 6.0, "E_f.posterior": 2.0}
+    at = tuple(float(x) for x in TEMPLATE.position(np.array([90.0]), np.array([0.5]))[0])
+    patch = {"scar": StiffPatch("anterior", at, 7.0, 2.0)}
+    settings = MechanicsSettings(tissue, patches=patch)
+    law = material_law(mesh, settings, values, variation_of(valve, mesh, settings))
+    anterior = mesh.region == mesh.region_names.index("anterior")
+    assert 1.7 < law.scale[anterior].max() < 2.0
+    assert np.all(law.scale[~anterior] == 1)
+    lost = MechanicsSettings(tissue, patches={"scar": replace(patch["scar"], region="septal")})
+    with pytest.raises(InputError, match="no such leaflet"):
+        variation_of(valve, mesh, lost)
