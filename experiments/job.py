@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from experiments.case import check_case, run_case
+from experiments.chord import run_chord_study
 from experiments.config import register
 from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
@@ -28,6 +29,7 @@ from experiments.guard import run_apart
 from experiments.imaged_patient import run_imaged_patient
 from experiments.imaging import publish_model, run_imaging
 from experiments.joint import run_joint_study
+from experiments.patch import run_patch_study
 from experiments.patient import run_patient
 from experiments.request import Request
 from experiments.tracking import require_no_password, track_job
@@ -35,6 +37,7 @@ from experiments.twin import run_twin
 from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
+from mvest.reporting.chord import chord_text, publish_chord, write_chord
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
@@ -42,6 +45,7 @@ from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.joint import joint_text, publish_joint, write_joint
+from mvest.reporting.patch import patch_text, publish_patch, write_patch
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.publish import publish
 from mvest.reporting.tables import text_table, write_tables
@@ -221,6 +225,18 @@ STUDIES: dict[str, Study] = {
         cycle_text,
         write_cycle,
         lambda results, _name, record, _folder: publish_cycle(results, record),
+    ),
+    "chord": Study(
+        run_chord_study,
+        chord_text,
+        write_chord,
+        lambda results, _name, record, _folder: publish_chord(results, record),
+    ),
+    "patch": Study(
+        run_patch_study,
+        patch_text,
+        write_patch,
+        lambda results, _name, record, _folder: publish_patch(results, record),
     ),
     "donor": Study(
         run_donor,

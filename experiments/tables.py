@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvest.errors import MvestError
+from mvest.reporting.chord import write_chord
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.cycle import write_cycle
 from mvest.reporting.donor import write_donor_tables
@@ -15,6 +16,7 @@ from mvest.reporting.gate import write_gate_tables
 from mvest.reporting.imaging_study import write_imaging_study
 from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.joint import write_joint
+from mvest.reporting.patch import write_patch
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
 from mvest.reporting.publish import RECORDS, regenerate
@@ -28,6 +30,8 @@ OTHER_TABLES = {
     "closure": write_closure_tables,
     "joint": write_joint,
     "cycle": write_cycle,
+    "chord": write_chord,
+    "patch": write_patch,
     "donor": write_donor_tables,
     "imaging": write_imaging_study,
     "volume": write_volume_tables,

@@ -60,6 +60,8 @@ OTHERS = (
     ),
     ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
     ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
+    ("chord", "Chordae by family", ("chord",)),
+    ("patch", "A stiff patch of a leaflet", ("patch",)),
     ("donor", "A recorded donor valve", ("donor",)),
     ("benchmark", "How fast", ("benchmark",)),
 )
@@ -80,6 +82,8 @@ CAPTIONS = {
     "cycle could tell. Simulated.",
     "cycle": "The cycle and its frames, what they tell of each parameter, and a modulus that "
     "drifts over beats, filtered and smoothed. Simulated.",
+    "chord": "What is known of chordae and leaflets before and after the data. Simulated.",
+    "patch": "True and found modulus of the unrolled anterior leaflet, and how sure. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "benchmark": "Where the time goes.",
 }
