@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from mvest.errors import cannot_write
 from mvest.provenance import write_json
@@ -147,16 +148,22 @@ def chord_figure(record: Record) -> Figure:
         right.errorbar(error, shift, xerr=band, fmt=MARKERS[k], color=COLOURS[k], capsize=3,
                        label=entry["frames"])  # fmt: skip
     offset = 100 * (np.array(record["start"]) / np.array(record["truth"]) - 1)
-    right.plot(offset, y, "x", color="0.4", label="start (prior mean)")
+    right.plot(offset, y, "x", color="0.4", label="start (prior mean), right")
     left.set(xscale="log", xlabel="relative standard deviation (%)",
              yticks=y, yticklabels=[_label(n) for n in names])  # fmt: skip
+    left.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    left.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    left.xaxis.set_minor_formatter(NullFormatter())
     right.axvline(0, color="0.7", lw=1, zorder=0)
     right.set(xscale="symlog", xlabel="error of the estimate ± 2 standard deviations (%)")
     right.set_xticks([-100, -10, -1, 0, 1, 10, 100], ["-100", "-10", "-1", "0", "1", "10", "100"])
     for axes in (left, right):
         axes.grid(axis="x", color="0.9")
         axes.set_axisbelow(True)
-        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
+    handles, labels = left.get_legend_handles_labels()
+    start = right.get_legend_handles_labels()
+    figure.legend([*handles, start[0][0]], [*labels, start[1][0]], loc="outside lower center",
+                  ncols=3, fontsize=8, frameon=False)  # fmt: skip
     figure.suptitle("What is known of the chordae and leaflets before and after (simulated)")
     return figure
 

@@ -104,45 +104,46 @@ def patch_figure(record: Record) -> Figure:
     places, results = record["map"], record["results"]
     mesh = Triangulation(places["along_mm"], places["down_mm"], places["triangles"])
     moduli = np.concatenate([e[k] for e in results.values() for k in ("truth", "modulus")])
-    scale = LogNorm(float(moduli.min()), float(moduli.max()))
-    spread = Normalize(0.0, max(max(e["log_std"]) for e in results.values()))
-    figure = Figure(figsize=(11.5, 2.9 * len(results) + 0.6), layout="constrained")
+    log_levels = np.linspace(*np.log([0.999 * moduli.min(), 1.001 * moduli.max()]), 25)
+    modulus = (np.exp(log_levels), LogNorm(), "viridis")
+    largest = max(max(entry["log_std"]) for entry in results.values())
+    spread = (np.linspace(0.0, 1.001 * largest, 13), Normalize(), "Greys")
+    figure = Figure(figsize=(11.5, 1.9 * len(results) + 0.9), layout="constrained")
     grid = figure.subplots(len(results), 3, sharex=True, sharey=True, squeeze=False)
+    drawn = {}
     for row, (label, entry) in zip(grid, results.items(), strict=True):
-        for axes, key, norm in zip(
-            row, ("truth", "modulus", "log_std"), (scale, scale, spread), strict=True
-        ):
-            colours = "viridis" if norm is scale else "Greys"
-            drawn = axes.tripcolor(mesh, entry[key], norm=norm, cmap=colours, shading="gouraud")
+        for axes, key in zip(row, ("truth", "modulus", "log_std"), strict=True):
+            levels, norm, colours = spread if key == "log_std" else modulus
+            drawn[key] = axes.tricontourf(mesh, entry[key], levels, norm=norm, cmap=colours)
+            axes.set_aspect("equal")
             if label == "patch":
-                _outline(axes, mesh, results["patch"]["truth"], norm is spread)
-            if axes in grid[0] and key != "truth":
-                bar = figure.colorbar(drawn, ax=[r[list(row).index(axes)] for r in grid])
-                bar.set_label("E_f (MPa)" if norm is scale else "standard deviation of log E_f")
-                if norm is scale:
-                    low, high = float(moduli.min()), float(moduli.max())
-                    ticks = [t for t in (3, 4, 5, 6, 8, 10, 12, 15) if low <= t <= high]
-                    bar.set_ticks(ticks, labels=[str(t) for t in ticks])
-                    bar.minorticks_off()
+                _outline(axes, mesh, entry["truth"], "black" if key == "log_std" else "white")
         top = int(np.argmax(entry["modulus"]))
         row[1].plot(places["along_mm"][top], places["down_mm"][top], "x", color="red", ms=8)
         row[0].set_ylabel(f"{label}\nfrom the annulus (mm)")
-    for axes, title in zip(
-        grid[0], ("true modulus", "found (x: highest)", "how sure"), strict=True
-    ):
+    bar = figure.colorbar(drawn["modulus"], ax=list(grid[:, :2].ravel()), label="E_f (MPa)")
+    ticks = [t for t in (2, 3, 4, 5, 6, 8, 10, 12, 15) if moduli.min() <= t <= moduli.max()]
+    bar.set_ticks(ticks, labels=[str(t) for t in ticks])
+    bar.minorticks_off()
+    figure.colorbar(drawn["log_std"], ax=list(grid[:, 2]), format="%.2f",
+                    label="standard deviation of log E_f")  # fmt: skip
+    titles = ("true modulus", "modulus found (x: highest)", "its standard deviation")
+    for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title)
-        axes.invert_yaxis() if axes is grid[0][0] else None
+    grid[0, 0].invert_yaxis()
     for axes in grid[-1]:
         axes.set_xlabel("along the annulus (mm)")
-    figure.suptitle(f"Unrolled {record['patch']['region']} leaflet (simulated)")
+    figure.suptitle(
+        f"Unrolled {record['patch']['region']} leaflet; dashed: where the true stiffness is "
+        "half-way up the patch (simulated)"
+    )
     return figure
 
 
-def _outline(axes: Axes, mesh: Triangulation, truth: list[float], dark: bool) -> None:
+def _outline(axes: Axes, mesh: Triangulation, truth: list[float], colour: str) -> None:
     """Where the true modulus is half-way up the patch, on the logarithmic scale."""
     level = float(np.sqrt(min(truth) * max(truth)))
-    axes.tricontour(mesh, truth, levels=[level], colors="black" if dark else "white",
-                    linewidths=1.2, linestyles="--")  # fmt: skip
+    axes.tricontour(mesh, truth, levels=[level], colors=colour, linewidths=1.2, linestyles="--")
 
 
 def write_patch(folder: Path, record: Record) -> list[Path]:
