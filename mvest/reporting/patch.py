@@ -104,8 +104,8 @@ def patch_figure(record: Record) -> Figure:
     places, results = record["map"], record["results"]
     mesh = Triangulation(places["along_mm"], places["down_mm"], places["triangles"])
     moduli = np.concatenate([e[k] for e in results.values() for k in ("truth", "modulus")])
-    log_levels = np.linspace(*np.log([0.999 * moduli.min(), 1.001 * moduli.max()]), 25)
-    modulus = (np.exp(log_levels), LogNorm(), "viridis")
+    levels = np.geomspace(0.999 * moduli.min(), 1.001 * moduli.max(), 25)
+    modulus = (levels, LogNorm(), "viridis")
     largest = max(max(entry["log_std"]) for entry in results.values())
     spread = (np.linspace(0.0, 1.001 * largest, 13), Normalize(), "Greys")
     figure = Figure(figsize=(11.5, 1.9 * len(results) + 0.9), layout="constrained")
