@@ -415,6 +415,17 @@ class PredictionConfig:
 
 
 @dataclass
+class PatchConfig:
+    """A stiff patch of the simulated truth, in material coordinates of the template."""
+
+    region: str = "anterior"
+    angle_deg: float = 90.0
+    share: float = 0.5  # of the way from the annulus to the free edge
+    radius_mm: float = 7.0
+    factor: float = 2.0
+
+
+@dataclass
 class PaperConfig:
     """What the paper reports for the same experiment."""
 
@@ -482,6 +493,7 @@ class Config:
     personal: PersonalConfig = field(default_factory=PersonalConfig)
     patient: PatientConfig | None = None
     cycle: CycleConfig = field(default_factory=CycleConfig)
+    patch: PatchConfig = field(default_factory=PatchConfig)
     echo: EchoConfig = field(default_factory=EchoConfig)
     imaging: ImagingConfig | None = None
     external: ExternalConfig = field(default_factory=ExternalConfig)

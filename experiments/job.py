@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from experiments.case import check_case, run_case
+from experiments.chord import run_chord_study
 from experiments.config import register
 from experiments.cycle import run_cycle_study
 from experiments.donor import run_donor
@@ -34,6 +35,7 @@ from experiments.imaging import publish_model, run_imaging
 from experiments.joint import run_joint_study
 from experiments.law import run_law_study
 from experiments.models import run_models
+from experiments.patch import run_patch_study
 from experiments.patient import run_patient
 from experiments.prediction import run_prediction
 from experiments.request import Request
@@ -42,6 +44,7 @@ from experiments.twin import run_twin
 from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
+from mvest.reporting.chord import chord_text, publish_chord, write_chord
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
 from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
@@ -58,6 +61,7 @@ from mvest.reporting.imaging_volumes import publish_volume
 from mvest.reporting.joint import joint_text, publish_joint, write_joint
 from mvest.reporting.law import law_text, publish_law, write_law_tables
 from mvest.reporting.models import models_text, publish_models, write_models_tables
+from mvest.reporting.patch import patch_text, publish_patch, write_patch
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.prediction import (
     prediction_text,
@@ -281,6 +285,18 @@ STUDIES: dict[str, Study] = {
         filters_text,
         write_filter_tables,
         lambda results, _name, record, _folder: publish_filters(results, record),
+    ),
+    "chord": Study(
+        run_chord_study,
+        chord_text,
+        write_chord,
+        lambda results, _name, record, _folder: publish_chord(results, record),
+    ),
+    "patch": Study(
+        run_patch_study,
+        patch_text,
+        write_patch,
+        lambda results, _name, record, _folder: publish_patch(results, record),
     ),
     "donor": Study(
         run_donor,

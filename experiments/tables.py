@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvest.errors import MvestError
+from mvest.reporting.chord import write_chord
 from mvest.reporting.closure import write_closure_tables
 from mvest.reporting.cycle import write_cycle
 from mvest.reporting.donor import write_donor_tables
@@ -19,6 +20,7 @@ from mvest.reporting.imaging_tables import write_volume_tables
 from mvest.reporting.joint import write_joint
 from mvest.reporting.law import write_law_tables
 from mvest.reporting.models import write_models_tables
+from mvest.reporting.patch import write_patch
 from mvest.reporting.patient_tables import write_patient_tables
 from mvest.reporting.population import write_population_tables
 from mvest.reporting.prediction import write_prediction_tables
@@ -35,6 +37,8 @@ OTHER_TABLES = {
     "cycle": write_cycle,
     "identifiability": write_identifiability_study,
     "filters": write_filter_study,
+    "chord": write_chord,
+    "patch": write_patch,
     "donor": write_donor_tables,
     "law": write_law_tables,
     "imaging": write_imaging_study,

@@ -8,8 +8,10 @@ engineering shear). Lengths are mm, times s, masses tonne, forces N, stresses MP
 
 What is here, in the order data flows:
 
-* ``law``: transversely isotropic moduli and the law in Biot strain; ``solid``: strains, forces and
-  tangents of all elements of a mesh;
+* ``parameters``: what can be differentiated by; ``moduli``, ``law``: transversely isotropic moduli
+  and the law in Biot strain; ``exponential``: a second law, ``regional``: one for each leaflet;
+  ``solid``: strains, forces and tangents of all elements of a mesh; ``field``: moduli that vary
+  over a leaflet;
 * ``pressure``, ``cables`` (chordae, annular hinge), ``ties``, ``contact``: what acts on the solid;
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
@@ -37,6 +39,7 @@ A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at 
 
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.box import box, outer_faces
+from mvest.mechanics.field import ModulusField, StiffPatch
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Reason, Simulation, Step
@@ -47,12 +50,14 @@ __all__ = [
     "Damping",
     "Factors",
     "Loads",
+    "ModulusField",
     "NewtonSettings",
     "Parameter",
     "PoissonReading",
     "Reason",
     "Simulation",
     "Step",
+    "StiffPatch",
     "System",
     "TransverselyIsotropic",
     "box",

@@ -68,6 +68,8 @@ OTHERS = (
     ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
     ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
     ("prediction", "What an estimated valve would do (simulated)", ("prediction",)),
+    ("chord", "Chordae by family", ("chord",)),
+    ("patch", "A stiff patch of a leaflet", ("patch",)),
     ("donor", "A recorded donor valve", ("donor",)),
     ("models", "Other biomechanical models (simulated)", ("models",)),
     ("benchmark", "How fast", ("benchmark",)),
@@ -103,6 +105,8 @@ CAPTIONS = {
     "drifts over beats, filtered and smoothed. Simulated.",
     "prediction": "A leaking valve closed as observed and under changed conditions, seen from the "
     "atrium, and measures of it with their 95 % intervals. Simulated.",
+    "chord": "What is known of chordae and leaflets before and after the data. Simulated.",
+    "patch": "True and found modulus of the unrolled anterior leaflet, and how sure. Simulated.",
     "donor": "A recorded donor valve and closures of its model.",
     "models": "A pressed sheet in two finite-element codes: deformed, its moduli iterate by "
     "iterate under each model, and how the codes differ on finer meshes. Simulated.",

@@ -1,0 +1,167 @@
+"""A stiff patch of a leaflet: how well it was found, as a table, in words and as maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+
+from mvest.errors import cannot_write
+from mvest.provenance import write_json
+from mvest.reporting.figures import save_figure
+from mvest.reporting.files import provenance_line, write_text, write_with
+
+__all__ = ["patch_figure", "patch_text", "publish_patch", "write_patch"]
+
+Record = Mapping[str, Any]
+
+STIFFNESS_LIMIT = 0.2
+"""Relative error of the peak that is to be met."""
+PLACE_LIMIT = 0.5
+"""Distance of the peak from the patch's centre, over the patch's radius, that is to be met."""
+
+
+def _table(record: Record) -> pd.DataFrame:
+    """One row for each point of the leaflet and each truth."""
+    places = record["map"]
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "truth": label,
+                    "along_mm": places["along_mm"],
+                    "down_mm": places["down_mm"],
+                    "true_MPa": entry["truth"],
+                    "estimate_MPa": entry["modulus"],
+                    "log_std": entry["log_std"],
+                }
+            )
+            for label, entry in record["results"].items()
+        ]
+    ).round(5)
+
+
+def _verdict(record: Record) -> str:
+    entry, radius = record["results"]["patch"], record["patch"]["radius_mm"]
+    error = entry["peak"] / entry["true_at_centre"] - 1
+    stiff = abs(error) <= STIFFNESS_LIMIT
+    place = entry["peak_distance_mm"] <= PLACE_LIMIT * radius
+    return (
+        f"Stiffness of the peak {100 * error:+.0f} % off, target {100 * STIFFNESS_LIMIT:g} %: "
+        f"{'met' if stiff else 'missed'}. Place {entry['peak_distance_mm']:.1f} mm off, target "
+        f"{PLACE_LIMIT * radius:g} mm (half the patch's radius): {'met' if place else 'missed'}."
+    )
+
+
+def _words(record: Record) -> str:
+    found, none = record["results"]["patch"], record["results"]["no patch"]
+    field = record["field"]
+    rows = [
+        ("true modulus at the centre (MPa)", "true_at_centre", ".2f"),
+        ("modulus found there (MPa)", "at_centre", ".2f"),
+        ("its standard deviation (of the logarithm)", "log_std_at_centre", ".2f"),
+        ("highest modulus found (MPa)", "peak", ".2f"),
+        ("its distance from the centre (mm)", "peak_distance_mm", ".1f"),
+        ("modulus found outside the patch (MPa)", "outside", ".2f"),
+        ("RMS error of log E over the leaflet", "rms_log_error", ".2f"),
+        ("share of the leaflet within two standard deviations", "within_two_std", ".2f"),
+        ("residual (mm)", "residual_mm", ".3f"),
+    ]
+    lines = ["| | with the patch | without a patch |", "|---|---|---|"]
+    for words, key, form in rows:
+        lines.append(f"| {words} | {found[key]:{form}} | {none[key]:{form}} |")
+    cells, own = record["cells_of_truth"], record["model"]["cells"]
+    lines += [
+        "",
+        _verdict(record),
+        f"Truth: {record['truth'][0]:g} MPa, in the patch up to {record['patch']['factor']:g} "
+        f"times as much, radius {record['patch']['radius_mm']:g} mm; {cells[0]} x {cells[1]} "
+        f"cells. Estimator: {own[0]} x {own[1]} cells, a smooth field with a correlation length "
+        f"of {field['correlation_length_mm']:g} mm and a prior standard deviation of "
+        f"{field['std_log']:g} of log E, {field['modes']} modes "
+        f"({100 * field['share']:.0f} % of its variance), together with both moduli.",
+        f"{len(record['times'])} frames of a cycle, {record['vertices']} vertices, noise of "
+        f"{record['noise_mm']:g} mm per coordinate. Without a patch, what is found beside the "
+        "uniform modulus comes from the noise and from the other mesh. Everything is simulated.",
+    ]
+    return "\n".join(lines)
+
+
+def patch_text(record: Record) -> str:
+    """The summary for the terminal."""
+    return _words(record)
+
+
+def patch_figure(record: Record) -> Figure:
+    """Maps of the unrolled leaflet: true modulus, found modulus, standard deviation."""
+    places, results = record["map"], record["results"]
+    mesh = Triangulation(places["along_mm"], places["down_mm"], places["triangles"])
+    moduli = np.concatenate([e[k] for e in results.values() for k in ("truth", "modulus")])
+    levels = np.geomspace(0.999 * moduli.min(), 1.001 * moduli.max(), 25)
+    modulus = (levels, LogNorm(), "viridis")
+    largest = max(max(entry["log_std"]) for entry in results.values())
+    spread = (np.linspace(0.0, 1.001 * largest, 13), Normalize(), "Greys")
+    figure = Figure(figsize=(11.5, 1.9 * len(results) + 0.9), layout="constrained")
+    grid = figure.subplots(len(results), 3, sharex=True, sharey=True, squeeze=False)
+    drawn = {}
+    for row, (label, entry) in zip(grid, results.items(), strict=True):
+        for axes, key in zip(row, ("truth", "modulus", "log_std"), strict=True):
+            levels, norm, colours = spread if key == "log_std" else modulus
+            drawn[key] = axes.tricontourf(mesh, entry[key], levels, norm=norm, cmap=colours)
+            axes.set_aspect("equal")
+            if label == "patch":
+                _outline(axes, mesh, entry["truth"], "black" if key == "log_std" else "white")
+        top = int(np.argmax(entry["modulus"]))
+        row[1].plot(places["along_mm"][top], places["down_mm"][top], "x", color="red", ms=8)
+        row[0].set_ylabel(f"{label}\nfrom the annulus (mm)")
+    bar = figure.colorbar(drawn["modulus"], ax=list(grid[:, :2].ravel()), label="E_f (MPa)")
+    ticks = [t for t in (2, 3, 4, 5, 6, 8, 10, 12, 15) if moduli.min() <= t <= moduli.max()]
+    bar.set_ticks(ticks, labels=[str(t) for t in ticks])
+    bar.minorticks_off()
+    figure.colorbar(drawn["log_std"], ax=list(grid[:, 2]), format="%.2f",
+                    label="standard deviation of log E_f")  # fmt: skip
+    titles = ("true modulus", "modulus found (x: highest)", "its standard deviation")
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title)
+    grid[0, 0].invert_yaxis()
+    for axes in grid[-1]:
+        axes.set_xlabel("along the annulus (mm)")
+    figure.suptitle(
+        f"Unrolled {record['patch']['region']} leaflet; dashed: where the true stiffness is "
+        "half-way up the patch (simulated)"
+    )
+    return figure
+
+
+def _outline(axes: Axes, mesh: Triangulation, truth: list[float], colour: str) -> None:
+    """Where the true modulus is half-way up the patch, on the logarithmic scale."""
+    level = float(np.sqrt(min(truth) * max(truth)))
+    axes.tricontour(mesh, truth, levels=[level], colors=colour, linewidths=1.2, linestyles="--")
+
+
+def write_patch(folder: Path, record: Record) -> list[Path]:
+    """``patch.csv``, ``patch.md`` and the figure in ``folder``."""
+    table = _table(record)
+    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
+    return [
+        write_with(folder / "patch.csv", lambda path: table.to_csv(path, index=False)),
+        write_text(folder / "patch.md", text),
+        *save_figure(folder / "patch", patch_figure(record), record),
+    ]
+
+
+def publish_patch(results: Path, record: Record) -> list[Path]:
+    """Keep the record and write its tables and figure into the results."""
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(results, error) from error
+    write_json(results / "patch.json", record)
+    return write_patch(results, record)
