@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.build import build_filter
 from experiments.gate import forward_record
-from experiments.joint import bound_entry, closed_frame, cycle_model
+from experiments.whole_cycle import bound_entry, closed_frame, cycle_model
 from mvest.cycle import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation import Estimate, IteratedFilter, identifiability, nees

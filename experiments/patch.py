@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.build import build_filter, mechanics_of, template_of
 from experiments.gate import forward_record
-from experiments.joint import cycle_model
+from experiments.whole_cycle import cycle_model
 from mvest.cycle import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
 from mvest.estimation import Estimate, IteratedFilter
