@@ -102,7 +102,7 @@ def _profile_rows(record: Record) -> Rows:
                 "observed": found["label"],
                 "parameter": found["parameter"],
                 "95 % interval": f"{_end(found['low'])} to {_end(found['high'])}",
-                "followed from": f"{number(values[0])} to {number(values[-1])}",
+                "followed from": f"{number(values[0], 4)} to {number(values[-1], 4)}",
                 "identifiable": "yes"
                 if found["low"] is not None and found["high"] is not None
                 else "NO: " + _why_open(found),
@@ -112,7 +112,7 @@ def _profile_rows(record: Record) -> Rows:
 
 
 def _end(value: float | None) -> str:
-    return OPEN if value is None else number(value)
+    return OPEN if value is None else number(value, 4)
 
 
 def _why_open(found: Mapping[str, Any]) -> str:
