@@ -61,7 +61,9 @@ def _store(config: Values, name: str, part: str, decisive: Any) -> Path:
     """Where a part of what is computed of a problem is kept: under a key of all that decides it."""
     described = {k: config[k] for k in ("valve", "mesh", "mechanics", "fixed", "seed")}
     problem = config["filters"]["problems"][name]
-    described["problem"] = {k: v for k, v in problem.items() if k not in ("title", "about")}
+    words = ("title", "about")
+    without = (*words, "truth", "noise_mm") if part == "runs" else words
+    described["problem"] = {k: v for k, v in problem.items() if k not in without}
     described["decisive"] = decisive
     key = truth_key(described, () if part == "runs" else ("estimation",))
     return Path(config["paths"]["outputs"]) / "filter_store" / f"{name}_{part}_{key[:16]}"
