@@ -315,15 +315,18 @@ def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> S
 
 
 def build_filter(
-    settings: Values, parameters: tuple[str, ...]
+    settings: Values, parameters: tuple[str, ...], *, positive: bool = False
 ) -> tuple[Filter, Transform, Gaussian]:
-    """The filter, its coordinates, and the prior of the parameters."""
+    """The filter, its coordinates, and the prior of the parameters.
+
+    Those of our mechanics are known to be positive or not; those of another model are ``positive``.
+    """
     mean = np.array(settings["initial"], dtype=float)
     _one_each("filter.initial", mean, parameters)
     prior = _gaussian("filter.P0", mean, settings["P0"])
     transforms: dict[str, Transform] = {
         "identity": Identity(),
-        "log": Log(tuple(map(is_positive, parameters))),
+        "log": Log(None if positive else tuple(map(is_positive, parameters))),
     }
     if settings["transform"] not in transforms:
         raise ConfigurationError(

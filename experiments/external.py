@@ -102,7 +102,7 @@ def estimator_of(config: Values) -> tuple[Filter, Transform, Gaussian, float]:
     if noise is None or not (np.isfinite(noise) and noise > 0):
         raise ConfigurationError(f"external.noise_mm = {noise}, expected a number > 0 (mm)")
     settings = {**config["filter"], "P0": (std**2).tolist()}
-    return *build_filter(settings, names), float(noise) ** 2
+    return *build_filter(settings, names, positive=True), float(noise) ** 2
 
 
 def check_external(config: Values, folder: Path) -> str:

@@ -59,7 +59,7 @@ def run_models(config: Values, config_hash: str, folder: Path, started: float) -
         )
     about = config["models"]
     sheet = build(Sheet, about["sheet"])
-    filter_, transform, prior = build_filter(config["filter"], PARAMETERS)
+    filter_, transform, prior = build_filter(config["filter"], PARAMETERS, positive=True)
     variance = float(config["filter"]["R"])
     truth = np.array(config["truth"]["values"], dtype=float)
     problem = Problem(filter_, transform, prior, variance, truth)
