@@ -56,7 +56,8 @@ def test_every_model_estimates_from_the_data(done):
         assert np.all(error != 0)
     # A program is the library behind files, and its differences are derivatives.
     second = found[OWN, SECOND]["estimate"]
-    assert found[OWN, PROGRAM]["estimate"] == second
+    # Another process may add up in another order.
+    np.testing.assert_allclose(found[OWN, PROGRAM]["estimate"], second, rtol=1e-12)
     np.testing.assert_allclose(found[OWN, PROGRAM_ALONE]["estimate"], second, rtol=1e-3)
     assert found[OWN, PROGRAM]["program_runs"] == found[OWN, PROGRAM]["forward_solves"]
     alone = found[OWN, PROGRAM_ALONE]

@@ -98,7 +98,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 
 ERRORS = [
-    ("experiment=nope", "Could not find 'experiment/nope'; known: closure, debug"),
+    ("experiment=nope", "Could not find 'experiment/nope'; known: chord, closure, cycle, debug"),
     ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "Key 'inital' not in 'FilterConfig'; did you mean initial?"),
@@ -123,7 +123,7 @@ ERRORS = [
     ("filter.Q=-1", "filter.Q = -1"),
     ("filter.R=0", "filter.R = 0: R must be positive"),
     ("filter.R=[1,2,3]", "R has shape (3,)"),
-    ("filter.mode=magic", "filter.mode = 'magic', expected paper or iterated"),
+    ("filter.mode=magic", "filter.mode = 'magic', expected one of paper, extended, iterated"),
     ("filter.transform=exp", "filter.transform = 'exp'"),
     ("filter.tolerance=0", "tolerance must be positive"),
     ("filter.max_iterations=0", "at least one iteration"),
