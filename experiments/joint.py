@@ -170,7 +170,9 @@ def _finer_frames(config: Values, truth: FloatArray) -> FloatArray:
     """Frames of a truth that the estimator's model cannot be."""
     settings = config["cycle"]
     cells = {"columns": settings["finer_columns"], "rows": settings["finer_rows"]}
-    changed = {**config, "mesh": {**config["mesh"], **cells}}
+    points = dict(zip(("columns", "rows"), settings["finer_contact"], strict=True))
+    mechanics = {**config["mechanics"], "contact_points": points}
+    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
     dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
     return stored_frames(changed, cycle_model(changed, dt=dt), truth)
 
