@@ -139,7 +139,9 @@ class _Study:
         )
 
     def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
-        filter_ = IteratedFilter(tolerance=1e-3, start=tuple(map(float, start)))
+        # A decrease of 0.02 moves no parameter by more than a fifth of its standard deviation.
+        first = tuple(map(float, start))
+        filter_ = IteratedFilter(tolerance=1e-3, objective_tolerance=0.02, start=first)
         return filter_(
             self.seen,
             self.prior,
