@@ -118,8 +118,9 @@ def _two_frames(record: Record) -> str:
     return (
         f"Open and closed frame alone leave {names[j]} and {names[i]} correlated by "
         f"{two['correlation'][i][j]:+.3f} (whole cycle: {whole['correlation'][i][j]:+.3f}); their "
-        f"bounds are {min(factor):.1f} to {max(factor):.1f} times those of the whole cycle, of "
-        f"which {np.sqrt(whole['count'] - 1):.1f} would be the number of frames alone."
+        f"bounds are {min(factor):.1f} to {max(factor):.1f} times those of the whole cycle. As many "
+        f"independent frames like the closed one as the cycle has after the open one would give "
+        f"{np.sqrt(whole['count'] - 1):.1f}."
     )
 
 
