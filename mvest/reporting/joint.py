@@ -108,7 +108,7 @@ def _first_pass(record: Record) -> str:
     last, names = record["first"][-1], record["parameters"]
     parts = [
         f"{parameter_label(name)} {_percent(last['error'][k], '+.1f')} "
-        f"(told std {_percent(last['std'][k], '.1f')})"
+        f"(told std {_percent(last['std'][k])})"
         for k, name in enumerate(names)
     ]
     worst = max(abs(e) / s for e, s in zip(last["error"], last["std"], strict=True))
