@@ -361,8 +361,9 @@ class CycleConfig:
     noise_mm: float = 0.5  # SD of each coordinate
     exact_told_mm: float = 0.1  # SD that the filter is told of coordinates without noise
     seeds: int = 8
-    finer_columns: int = 40  # cells of the mesh of a truth that is not the estimator's
-    finer_rows: int = 5
+    finer_columns: int = 32  # cells of the mesh of a truth that is not the estimator's
+    finer_rows: int = 4
+    finer_contact: list[int] = field(default_factory=lambda: [96, 21])  # points, around and along
     finer_dt_factor: float = 0.5
     halvings: int = 2  # of the time step, to see what depends on it
     beats: int = 10  # over which a modulus drifts

@@ -99,6 +99,7 @@ def run_joint_study(
         "exact": _entry(exact.estimate, truth) | {"frames": study.path(exact)},
         "seeds": [_entry(e, truth) | {"seed": config["seed"] + k} for k, e in enumerate(seeds)],
         "first": study.path(first),
+        "passes": _passes(first.estimate, truth),
         "rms_over_bound": (np.sqrt(np.mean(errors**2, axis=0)) / bound).tolist(),
         "finer": _entry(other, truth)
         | {
@@ -139,7 +140,9 @@ class _Study:
         )
 
     def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
-        filter_ = IteratedFilter(tolerance=1e-3, start=tuple(map(float, start)))
+        # A decrease of 0.02 moves no parameter by more than a fifth of its standard deviation.
+        first = tuple(map(float, start))
+        filter_ = IteratedFilter(tolerance=1e-3, objective_tolerance=0.02, start=first)
         return filter_(
             self.seen,
             self.prior,
@@ -170,9 +173,17 @@ def _finer_frames(config: Values, truth: FloatArray) -> FloatArray:
     """Frames of a truth that the estimator's model cannot be."""
     settings = config["cycle"]
     cells = {"columns": settings["finer_columns"], "rows": settings["finer_rows"]}
-    changed = {**config, "mesh": {**config["mesh"], **cells}}
+    points = dict(zip(("columns", "rows"), settings["finer_contact"], strict=True))
+    mechanics = {**config["mechanics"], "contact_points": points}
+    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
     dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
     return stored_frames(changed, cycle_model(changed, dt=dt), truth)
+
+
+def _passes(found: Estimate, truth: FloatArray) -> list[dict[str, Any]]:
+    """Relative error and standard deviation at the end of each pass over all frames."""
+    pairs = zip(found.iterates[1:], found.iterate_std[1:], strict=True)
+    return [{"error": (m / truth - 1).tolist(), "std": (s / truth).tolist()} for m, s in pairs]
 
 
 def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mvest.errors import cannot_write
@@ -95,11 +96,28 @@ def _words(record: Record) -> str:
         f"With noise: largest ratio to the bound {max(ratio):.2f}, target {NOISE_LIMIT:g}: "
         f"{'met' if max(ratio) <= NOISE_LIMIT else 'missed'}.",
         _two_frames(record),
+        _first_pass(record),
         f"Where the truth comes from another mesh, the frames of the two meshes are "
         f"{finer['distance_mm']:.2f} mm apart (mean) at the same parameters; the standard "
         f"deviations know nothing of it.",
     ]
     return "\n".join(lines)
+
+
+def _first_pass(record: Record) -> str:
+    last, names = record["first"][-1], record["parameters"]
+    parts = [
+        f"{parameter_label(name)} {_percent(last['error'][k], '+.1f')} "
+        f"(told std {_percent(last['std'][k])})"
+        for k, name in enumerate(names)
+    ]
+    worst = max(abs(e) / s for e, s in zip(last["error"], last["std"], strict=True))
+    return (
+        f"The first pass over the frames, an extended Kalman filter, ends at errors of "
+        f"{', '.join(parts)}: up to {worst:.1f} of its standard deviations. "
+        f"{len(record['passes'])} further passes, each linearised anew and counting every frame "
+        f"once, end at the mode of the batch."
+    )
 
 
 def _two_frames(record: Record) -> str:
@@ -118,8 +136,9 @@ def _two_frames(record: Record) -> str:
     return (
         f"Open and closed frame alone leave {names[j]} and {names[i]} correlated by "
         f"{two['correlation'][i][j]:+.3f} (whole cycle: {whole['correlation'][i][j]:+.3f}); their "
-        f"bounds are {min(factor):.1f} to {max(factor):.1f} times those of the whole cycle, of "
-        f"which {np.sqrt(whole['count'] - 1):.1f} would be the number of frames alone."
+        f"bounds are {min(factor):.1f} to {max(factor):.1f} times those of the whole cycle. The "
+        f"closed frame {whole['count'] - 1} times over would make it "
+        f"{np.sqrt(whole['count'] - 1):.1f}."
     )
 
 
@@ -131,20 +150,16 @@ def joint_text(record: Record) -> str:
 def joint_figure(record: Record) -> Figure:
     """Estimates as frames come in, errors over the bound, and the bounds of both sets of frames."""
     names = record["parameters"]
-    figure = Figure(figsize=(11.0, 3.9), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1.0, 1.0])
-    times = record["times"]
-    for k, name in enumerate(names):
-        colour, label = COLOURS[k], parameter_label(name)
-        error = 100 * np.array([row["error"][k] for row in record["first"]])
-        std = 100 * np.array([row["std"][k] for row in record["first"]])
-        left.fill_between(times, error - 2 * std, error + 2 * std, color=colour, alpha=0.15, lw=0)
-        left.plot(times, error, color=colour, marker=MARKERS[k], ms=4, label=label)
-    left.axhline(0.0, color="black", lw=0.8)
+    figure = Figure(figsize=(12.5, 4.0), layout="constrained")
+    left, passes, middle, right = figure.subplots(1, 4, width_ratios=[1.3, 1.0, 1.0, 1.0])
+    _draw_path(left, record["times"], record["first"], names)
     left.set(xlabel="time of the last frame seen (s)", ylabel="error (% of the truth)")
-    left.set_yscale("symlog", linthresh=5.0)
-    left.set_title("first pass over the frames (± 2 std)", fontsize=10)
-    left.legend(fontsize=8, frameon=False)
+    left.set_title("first pass, frame by frame", fontsize=10)
+    numbers = list(range(1, len(record["passes"]) + 1))
+    _draw_path(passes, numbers, record["passes"], names)
+    passes.set(xlabel="pass over the whole cycle", ylim=left.get_ylim())
+    passes.set_title("passes that follow", fontsize=10)
+    passes.legend(fontsize=8, frameon=False, loc="upper right")
     bound = np.array(record["bounds"][-1]["std"], dtype=float)
     errors = np.array([entry["error"] for entry in record["seeds"]]) / bound
     for k in range(len(names)):
@@ -171,6 +186,22 @@ def joint_figure(record: Record) -> Figure:
             [parameter_label(name).replace(" ", "\n") for name in names], fontsize=8
         )
     return figure
+
+
+def _draw_path(
+    axes: Axes, at: Sequence[float], rows: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> None:
+    """Errors with bands of two standard deviations, in percent."""
+    for k, name in enumerate(names):
+        error, std = (100 * np.array([row[key][k] for row in rows]) for key in ("error", "std"))
+        axes.fill_between(at, error - 2 * std, error + 2 * std, color=COLOURS[k], alpha=0.15, lw=0)
+        label = parameter_label(name)
+        axes.plot(at, error, color=COLOURS[k], marker=MARKERS[k], ms=4, label=label)
+    axes.axhline(0.0, color="black", lw=0.8)
+    axes.set_yscale("symlog", linthresh=5.0)
+    ticks = (-100, -50, -20, -5, 0, 5, 20, 50, 100)
+    axes.set_yticks(ticks, labels=[str(tick) for tick in ticks])
+    axes.set_ylim(-150, 250)
 
 
 def write_joint(folder: Path, record: Record) -> list[Path]:

@@ -24,6 +24,7 @@ TINY = (
     "cycle.protocol.times=[0.0,0.05,0.1,0.15,0.25]",
     "cycle.finer_columns=10",
     "cycle.finer_rows=1",
+    "cycle.finer_contact=[20,5]",
     "cycle.seeds=2",
     "cycle.beats=3",
     "cycle.beat_times=[0.05,0.1]",

@@ -40,6 +40,7 @@ RECORD = {
     "exact": entry(0.009),
     "seeds": [entry(0.01, seed=1), entry(-0.01, seed=2)],
     "first": [{"error": [0.4, 0.1, 0.03], "std": [0.5, 0.4, 0.05]}] * 3,
+    "passes": [{"error": [0.1, 0.1, 0.01], "std": [0.1, 0.1, 0.01]}] * 2,
     "rms_over_bound": [0.8, 1.4, 0.9],
     "finer": entry(0.05, cells=[40, 5], distance_mm=0.2),
     "provenance": {
