@@ -424,6 +424,7 @@ class PatchConfig:
     share: float = 0.5  # of the way from the annulus to the free edge
     radius_mm: float = 7.0
     factor: float = 2.0
+    compared: bool = False  # with a valve that has no patch: takes twice as long
 
 
 @dataclass

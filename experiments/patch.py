@@ -34,7 +34,7 @@ Values = Mapping[str, Any]
 def run_patch_study(
     config: Values, config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Estimate moduli and field from a valve with the patch and from one without."""
+    """Estimate moduli and field from a valve with the patch, and from one without if asked."""
     settings, parameters = config["cycle"], tuple(config["parameters"])
     _, transform, prior = build_filter(config["filter"], parameters)
     patch = _patch(config)
@@ -42,7 +42,10 @@ def run_patch_study(
     leaflet = _Leaflet(config, parameters, patch)
     noise, start, results = settings["noise_mm"], prior.mean, {}
     seen: SeenFrames | None = None
-    for label, patches in (("patch", {"patch": patch}), ("no patch", {})):
+    valves: dict[str, dict[str, StiffPatch]] = {"patch": {"patch": patch}}
+    if config["patch"]["compared"]:
+        valves["no patch"] = {}
+    for label, patches in valves.items():
         frames = _truth(config, patches)
         rng = np.random.default_rng(config["seed"])
         observation = CycleObservation.simulated(frames, noise, rng)

@@ -61,7 +61,7 @@ def _verdict(record: Record) -> str:
 
 
 def _words(record: Record) -> str:
-    found, none = record["results"]["patch"], record["results"]["no patch"]
+    results = record["results"]
     field = record["field"]
     rows = [
         ("true modulus at the centre (MPa)", "true_at_centre", ".2f"),
@@ -74,9 +74,12 @@ def _words(record: Record) -> str:
         ("share of the leaflet within two standard deviations", "within_two_std", ".2f"),
         ("residual (mm)", "residual_mm", ".3f"),
     ]
-    lines = ["| | with the patch | without a patch |", "|---|---|---|"]
+    titles = {"patch": "with the patch", "no patch": "without a patch"}
+    lines = ["| | " + " | ".join(titles[label] for label in results) + " |"]
+    lines.append("|---" * (1 + len(results)) + "|")
     for words, key, form in rows:
-        lines.append(f"| {words} | {found[key]:{form}} | {none[key]:{form}} |")
+        values = " | ".join(f"{entry[key]:{form}}" for entry in results.values())
+        lines.append(f"| {words} | {values} |")
     cells, own = record["cells_of_truth"], record["model"]["cells"]
     lines += [
         "",
@@ -88,8 +91,8 @@ def _words(record: Record) -> str:
         f"{field['std_log']:g} of log E, {field['modes']} modes "
         f"({100 * field['share']:.0f} % of its variance), together with both moduli.",
         f"{len(record['times'])} frames of a cycle, {record['vertices']} vertices, noise of "
-        f"{record['noise_mm']:g} mm per coordinate. Without a patch, what is found beside the "
-        "uniform modulus comes from the noise and from the other mesh. Everything is simulated.",
+        f"{record['noise_mm']:g} mm per coordinate. What is found beside the true modulus comes "
+        "from the noise, the other mesh and the field's smoothness. Everything is simulated.",
     ]
     return "\n".join(lines)
 
