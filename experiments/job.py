@@ -265,6 +265,7 @@ STUDIES: dict[str, Study] = {
         cycle_text,
         write_cycle,
         lambda results, _name, record, _folder: publish_cycle(results, record),
+        keeps_failures=True,
     ),
     "identifiability": Study(
         run_identifiability,
