@@ -292,6 +292,7 @@ STUDIES: dict[str, Study] = {
         chord_text,
         write_chord,
         lambda results, _name, record, _folder: publish_chord(results, record),
+        keeps_failures=True,
     ),
     "patch": Study(
         run_patch_study,

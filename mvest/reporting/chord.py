@@ -107,6 +107,12 @@ def _words(record: Record) -> str:
         + f" from the whole cycle with {len(cycles)} seeds.",
         _pairs(record, whole),
     ]
+    lines += [
+        f"The estimate from the {entry['frames']} (errors {entry['seed'] + 1}) ended: "
+        f"{entry['reason']}."
+        for entry in record["results"]
+        if entry["status"] != "converged"
+    ]
     return "\n".join(lines)
 
 
