@@ -65,7 +65,7 @@ FEW = (
 
 
 def test_a_patch_is_compared_with_the_truth_where_it_is(run):
-    status, record, folder, said = run("experiment=patch", *FEW)
+    status, record, folder, said = run("experiment=patch", "patch.compared=true", *FEW)
     assert status == 0, said.err
     assert set(record["results"]) == {"patch", "no patch"}
     with_patch, without = record["results"]["patch"], record["results"]["no patch"]
