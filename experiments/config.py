@@ -365,7 +365,7 @@ class CycleConfig:
     finer_rows: int = 4
     finer_contact: list[int] = field(default_factory=lambda: [96, 21])  # points, around and along
     finer_dt_factor: float = 0.5
-    halvings: int = 2  # of the time step, to see what depends on it
+    time_steps: list[float] = field(default_factory=list)  # s, each half of the one before
     beats: int = 10  # over which a modulus drifts
     beat_times: list[float] = field(default_factory=lambda: [0.1, 0.2, 0.3, 0.4])  # s
     drift: float = -0.3  # of the first parameter, from the first beat to the last

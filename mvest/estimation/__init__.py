@@ -18,6 +18,7 @@ from mvest.estimation.diagnostics import (
     nees,
     zero_mean,
 )
+from mvest.estimation.drift import DriftEstimate, DriftSmoother, FrameModel
 from mvest.estimation.ensemble import EnsembleFilter
 from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
 from mvest.estimation.extended import ExtendedFilter
@@ -42,13 +43,7 @@ from mvest.estimation.paper import PaperFilter
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.profile import Profile, profile
 from mvest.estimation.sampler import SamplerSettings
-from mvest.estimation.sequential import (
-    DriftEstimate,
-    DriftSmoother,
-    FrameModel,
-    SequentialEstimate,
-    SequentialFilter,
-)
+from mvest.estimation.sequential import SequentialEstimate, SequentialFilter
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.estimation.unscented import UnscentedFilter
 from mvest.estimation.update import Update, kalman_update

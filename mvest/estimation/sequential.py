@@ -1,8 +1,7 @@
-"""Filters that take frames as they come: constant parameters, and parameters that drift."""
+"""The filter that takes the frames of a run as they come; its parameters are constant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -11,10 +10,8 @@ from mvest.estimation.estimate import Estimate, OnIterate, Reason
 from mvest.estimation.frames import (
     FrameState,
     LinearFrame,
-    Trajectory,
     filter_frames,
     frame_noises,
-    smooth_frames,
     split_frames,
 )
 from mvest.estimation.gaussian import Gaussian
@@ -22,11 +19,11 @@ from mvest.estimation.iterated import ROUND_OFF
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.run import FilterRun, require_settings
-from mvest.estimation.transform import Identity, Transform, to_filter
+from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
-__all__ = ["DriftEstimate", "DriftSmoother", "FrameModel", "SequentialEstimate", "SequentialFilter"]
+__all__ = ["SequentialEstimate", "SequentialFilter"]
 
 OBJECTIVE_TOLERANCE = 1e-9
 """Decrease of the objective, the negative logarithm of a probability, that matters to nobody."""
@@ -217,135 +214,6 @@ class SequentialFilter:
             detail += f"; {failure}"
         estimate = run.finish(reason, detail, point.prediction, innovation, update)
         return SequentialEstimate(estimate, extended, states)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DriftEstimate:
-    """Parameters that drift over f frames, filtered and smoothed.
-
-    Attributes
-    ----------
-    transform : Transform
-    states : tuple of FrameState, (f,)
-        The filter's, in filter coordinates, linearised at the smoothed trajectory.
-    extended : tuple of FrameState, (f,)
-        The first pass, linearised at what was predicted of each frame when it came.
-    smoothed : Trajectory
-        In filter coordinates.
-    reason : Reason
-    detail : str
-    forward_solves : int
-    """
-
-    transform: Transform
-    states: tuple[FrameState, ...]
-    extended: tuple[FrameState, ...]
-    smoothed: Trajectory | None
-    reason: Reason
-    detail: str
-    forward_solves: int
-
-    @property
-    def converged(self) -> bool:
-        """Whether the smoother stopped because its passes agree."""
-        return self.reason.converged
-
-
-class FrameModel(Protocol):
-    """A model whose frames depend on the parameters of that frame only."""
-
-    def frame(self, k: int, m: FloatArray, /) -> Prediction:
-        """Predict frame k of parameters m (p,); fails as `ObservationModel` does."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class DriftSmoother:
-    """Fixed-interval smoother of parameters that walk at random from frame to frame.
-
-    A pass filters the linearised frames and smooths backwards (see `smooth_frames`). The first one
-    linearises each frame at its prediction (the extended Kalman smoother), further ones at the
-    smoothed trajectory: Gauss-Newton on the posterior of the whole trajectory (Bell 1994, SIAM J.
-    Optim. 4:626). Steps are not shortened.
-
-    Attributes
-    ----------
-    sizes : tuple of int, (f,)
-        Number of observations in each frame.
-    Q : one variance or p variances
-        Of one step of the walk, in filter coordinates.
-    tolerance : float
-        Stop when a pass moves no parameter of any frame by more than this part of its smoothed
-        standard deviation.
-    max_iterations : int
-    """
-
-    sizes: tuple[int, ...]
-    Q: float | tuple[float, ...] = 0.0
-    tolerance: float = 0.02
-    max_iterations: int = 10
-
-    def __post_init__(self) -> None:
-        require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
-
-    def __call__(
-        self,
-        model: FrameModel,
-        initial: Gaussian,
-        y: FloatArray,
-        R: NoiseCovariance,
-        *,
-        transform: Transform | None = None,
-    ) -> DriftEstimate:
-        """Smooth; ``initial`` is N(m, P) of the parameters themselves at the first frame."""
-        transform = Identity() if transform is None else transform
-        prior = to_filter(transform, initial)
-        seen = list(
-            zip(split_frames(np.asarray(y), self.sizes), frame_noises(R, self.sizes), strict=True)
-        )
-        Q, solves = np.asarray(self.Q, dtype=np.float64), 0
-
-        def linear(k: int, z: FloatArray) -> LinearFrame | str:
-            nonlocal solves
-            solves += 1
-            found = model.frame(k, transform.inverse(z))
-            if not found.converged:
-                return f"frame {k} at {transform.inverse(z)}: {found.reason}"
-            H = found.jacobian * transform.derivative(z)
-            return LinearFrame(seen[k][0] - found.y + H @ z, H, seen[k][1])
-
-        extended: list[FrameState] = []
-        smoothed: Trajectory | None = None
-        reason, detail = Reason.MODEL_FAILED, ""
-        frames: list[LinearFrame] = []
-        for k in range(len(seen)):
-            # The prediction of frame k depends on no observation of it.
-            at = extended[-1].filtered.mean if k else prior.mean
-            frame = linear(k, at)
-            if isinstance(frame, str):
-                return DriftEstimate(transform, (), tuple(extended), None, reason, frame, solves)
-            frames.append(frame)
-            extended = list(filter_frames(prior, frames, Q))
-        states = tuple(extended)
-        for _ in range(self.max_iterations):
-            before, smoothed = smoothed, smooth_frames(states)
-            if before is not None:
-                change = np.abs(smoothed.mean - before.mean)
-                if np.all(change <= self.tolerance * smoothed.std):
-                    reason = Reason.CONVERGED
-                    break
-            frames = []
-            for k, z in enumerate(smoothed.mean):
-                frame = linear(k, z)
-                if isinstance(frame, str):
-                    return DriftEstimate(
-                        transform, states, tuple(extended), smoothed, reason, frame, solves
-                    )
-                frames.append(frame)
-            states = filter_frames(prior, frames, Q)
-        else:
-            reason = Reason.MAX_ITERATIONS
-        return DriftEstimate(transform, states, tuple(extended), smoothed, reason, detail, solves)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

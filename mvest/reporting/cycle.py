@@ -53,17 +53,24 @@ def _words(record: Record) -> str:
         values = ("not determined" if v is None else f"{100 * v:.2f} %" for v in entry["std"])
         lines.append(f"| {label} | {' | '.join(values)} |")
     steps, drift = record["steps"], record["drift"]
-    halves = ", ".join(
-        f"{1e3 * a:g} to {1e3 * b:g} ms: {v:.3f} mm"
-        for a, b, v in zip(steps["dt"], steps["dt"][1:], steps["rms_mm"], strict=False)
-    )
     lines += [
         "",
         f"Smallest possible standard deviation (Cramér-Rao) of each parameter, relative to it, "
         f"with {record['noise_mm']:g} mm noise per coordinate on {record['vertices']} vertices per "
         f"frame, no prior. Everything is simulated.",
-        f"Change of all frames (RMS of coordinates) when the time step is halved from {halves}; "
-        f"order {', '.join(f'{v:.2f}' for v in steps['order'])}.",
+        "",
+        f"| time step | RMS change when it is halved | {' | '.join(names)} |",
+        "|---|---|" + "---|" * len(names),
+    ]
+    for k, dt in enumerate(steps["dt"]):
+        change = f"{steps['rms_mm'][k]:.3f} mm" if k < len(steps["rms_mm"]) else ""
+        departures = " | ".join(f"{100 * v:.1f} %" for v in steps["departures"][k])
+        lines.append(f"| {1e3 * dt:g} ms | {change} | {departures} |")
+    lines += [
+        "",
+        "Under each parameter: by how much the frames depart from their derivative within two "
+        "of its standard deviations (of all frames, above) to both sides; 0 for a linear model, "
+        "and large where a fast motion of a leaflet falls into a step or not.",
     ]
     if drift["status"] == "converged":
         filter_, smoother = drift["filter"], drift["smoother"]

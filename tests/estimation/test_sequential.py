@@ -270,3 +270,33 @@ def test_a_drifting_model_that_fails_is_a_value():
     assert found.reason is Reason.MODEL_FAILED
     assert "frame 0" in found.detail
     assert "too far" in found.detail
+
+
+class Saturating:
+    """Frame k sees the arc tangent of m: from afar a full Gauss-Newton step leads farther away."""
+
+    def frame(self, k: int, m: FloatArray, /) -> Prediction:
+        if not abs(m[0]) < 30:
+            return Prediction.failed("too far")
+        return Prediction(np.arctan(m), np.array([1 / (1 + m**2)]))
+
+
+def test_the_drift_smoother_shortens_passes_that_lead_away():
+    prior = Gaussian.from_variance(np.array([2.5]), 100.0)
+    found = DriftSmoother((1,) * 3, 0.01, max_iterations=50)(Saturating(), prior, np.zeros(3), 1e-2)
+    assert found.converged
+    assert found.smoothed is not None
+    assert np.all(np.diff(found.objectives) < 0)
+    # The mode is where the prior's pull, 2.5 / 100, is that of three frames of variance 0.01.
+    np.testing.assert_allclose(found.smoothed.mean, 0.0, atol=1e-3)
+
+
+def test_parameters_without_a_walk_stay_the_same_in_all_frames():
+    prior = Gaussian.from_variance(np.array([0.0]), 1.0)
+    model = Growing()
+    y = np.concatenate([model.frame(k, np.array([0.8])).y for k in range(4)])
+    found = DriftSmoother((2,) * 4, 0.0, tolerance=1e-6)(model, prior, y, 1e-4)
+    assert found.converged
+    assert found.smoothed is not None
+    np.testing.assert_allclose(found.smoothed.mean - found.smoothed.mean[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.smoothed.mean[0], 0.8, atol=1e-3)

@@ -84,14 +84,18 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
 
 
 def test_the_cycle_study_records_frames_steps_and_the_drift(run):
-    status, record, folder, said = run("experiment=cycle")
+    status, record, folder, said = run("experiment=cycle", "cycle.time_steps=[0.05,0.025,0.0125]")
     assert status == 0, said.err
     frames = record["frames"]
     # The open frame says nothing of any parameter.
     assert frames[0]["std_alone"] == [None, None, None]
     assert [entry["count"] for entry in record["sets"]] == [2, 3, 5]
     assert {entry["frames"] for entry in record["phases"]} == {"closing", "held closed", "opening"}
-    assert record["steps"]["rms_mm"][0] > record["steps"]["rms_mm"][1] > 0
+    steps = record["steps"]
+    assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
+    # So small a motion is smooth: the derivative tells what two standard deviations do.
+    assert np.array(steps["departures"]).shape == (3, 3)
+    assert np.max(steps["departures"]) < 0.02
     drift = record["drift"]
     assert np.array(drift["truth"]).shape == (3, 2)
     # From the first to the last beat by -30 % in the first modulus alone.
