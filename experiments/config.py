@@ -366,6 +366,7 @@ class CycleConfig:
     finer_contact: list[int] = field(default_factory=lambda: [96, 21])  # points, around and along
     finer_dt_factor: float = 0.5
     time_steps: list[float] = field(default_factory=list)  # s, each half of the one before
+    path_steps: int = 16  # along which frames are looked at for jumps
     beats: int = 10  # over which a modulus drifts
     beat_times: list[float] = field(default_factory=lambda: [0.1, 0.2, 0.3, 0.4])  # s
     drift: float = -0.3  # of the first parameter, from the first beat to the last

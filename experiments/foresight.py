@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from experiments.build import Twin, build_twin
+from experiments.build import Twin, build_filter, build_twin
 from experiments.case import read_configured, settings_of
+from experiments.patient import make_patient
 from experiments.progress import SolveBar
+from experiments.whole_cycle import cycle_model, stored_cycle
 from mvest.estimation import Prediction
-from mvest.foresight import Foresight, foresee
+from mvest.foresight import Foresight, foresee, foresee_model
 from mvest.personalise import foresee_case
 from mvest.provenance import config_hash
 from mvest.reporting.foresight import foresight_text
 from mvest.study import SharedStart, simulate_observation
 from mvest.typing import FloatArray
 
-__all__ = ["TwinForesight", "foresee_own", "told"]
+__all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "foresee_patient", "told"]
 
 Values = Mapping[str, Any]
 
@@ -103,6 +105,44 @@ def foresee_own(config: Values, _folder: Path | None = None) -> str:
     length = doubt.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"
     return told(case.name, found, f"{doubt.typical_mm:.3g} mm of noise stated, {errors}")
+
+
+def foresee_patient(config: Values, folder: Path | None = None) -> str:
+    """The answer for the case of a virtual patient, which is simulated first unless it is there.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or the patient's valve does not close.
+    """
+    return foresee_own({**config, "case": str(make_patient(config).case)}, folder)
+
+
+def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
+    """The answer for all frames of a cycle.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible.
+    """
+    parameters = tuple(config["parameters"])
+    _, transform, prior = build_filter(config["filter"], parameters)
+    noise = config["cycle"]["noise_mm"]
+    model = cycle_model(config)
+    with SolveBar(config["name"], len(model.protocol.steps()), 1) as bar:
+        model.closure.on_step = bar.step
+        found = foresee_model(
+            stored_cycle(config, model),
+            prior,
+            noise**2,
+            parameters=parameters,
+            transform=transform,
+            frames=tuple(f"{t:g} s" for t in model.protocol.times),
+        )
+    return told(
+        f"{config['name']}, {config['row']}", found, f"{noise:g} mm of noise assumed, independent"
+    )
 
 
 def told(title: str, found: Foresight | str, noise: str) -> str:

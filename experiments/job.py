@@ -26,7 +26,12 @@ from experiments.folder import (
     mark_done,
     require_writable,
 )
-from experiments.foresight import TwinForesight, foresee_own
+from experiments.foresight import (
+    TwinForesight,
+    foresee_cycle,
+    foresee_own,
+    foresee_patient,
+)
 from experiments.gate import run_closure_study, run_gate_study
 from experiments.guard import run_apart
 from experiments.identifiability import run_identifiability
@@ -259,6 +264,7 @@ STUDIES: dict[str, Study] = {
         joint_text,
         write_joint,
         lambda results, _name, record, _folder: publish_joint(results, record),
+        checks=lambda: (foresee_cycle,),
     ),
     "cycle": Study(
         run_cycle_study,
@@ -266,6 +272,7 @@ STUDIES: dict[str, Study] = {
         write_cycle,
         lambda results, _name, record, _folder: publish_cycle(results, record),
         keeps_failures=True,
+        checks=lambda: (foresee_cycle,),
     ),
     "identifiability": Study(
         run_identifiability,
@@ -293,12 +300,14 @@ STUDIES: dict[str, Study] = {
         write_chord,
         lambda results, _name, record, _folder: publish_chord(results, record),
         keeps_failures=True,
+        checks=lambda: (foresee_cycle,),
     ),
     "patch": Study(
         run_patch_study,
         patch_text,
         write_patch,
         lambda results, _name, record, _folder: publish_patch(results, record),
+        checks=lambda: (foresee_cycle,),
     ),
     "donor": Study(
         run_donor,
@@ -335,6 +344,7 @@ STUDIES: dict[str, Study] = {
             results, name, record, folder / "fields.npz"
         ),
         keeps_failures=True,
+        checks=lambda: (foresee_patient,),
     ),
     "imaging": Study(
         run_imaging,

@@ -12,11 +12,13 @@ import numpy as np
 from scipy.stats import norm
 
 from mvest.estimation import Gaussian, Identifiability, Transform, identifiability
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import to_filter
 from mvest.study import Case, Observed
 from mvest.typing import FloatArray
 
-__all__ = ["Foresight", "foresee"]
+__all__ = ["Foresight", "foresee", "foresee_model"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,26 +82,57 @@ def foresee(case: Case, observation: Observed) -> Foresight:
         Which points are seen, and how well; the values that were seen play no part where points
         correspond.
     """
+    return foresee_model(
+        observation.of(case.model),
+        case.prior,
+        observation.R,
+        parameters=case.parameters,
+        transform=case.transform,
+        frames=observation.frames,
+    )
+
+
+def foresee_model(
+    model: ObservationModel,
+    prior: Gaussian,
+    R: NoiseCovariance,
+    *,
+    parameters: tuple[str, ...],
+    transform: Transform,
+    frames: tuple[str, ...],
+) -> Foresight:
+    """Expected intervals of an estimation of any model that is not run.
+
+    Parameters
+    ----------
+    model : ObservationModel
+        Predicts what is to be observed. It is run once, at the mean of the prior.
+    prior : Gaussian
+        Of the parameters themselves.
+    R : noise covariance
+        Of the observation.
+    parameters, transform, frames
+        See `Foresight`.
+    """
     # As filters start, whose first prediction may be shared.
-    assumed = case.transform.inverse(case.transform.forward(case.prior.mean))
-    predicted = observation.of(case.model)(assumed)
+    assumed = transform.inverse(transform.forward(prior.mean))
+    predicted = model(assumed)
     data = informed = None
     if predicted.converged:
-        scale = np.where(assumed != 0.0, np.abs(assumed), case.prior.std)
-        H, R = predicted.jacobian, observation.R
-        data = identifiability(H, R, scale, names=case.parameters)
-        if np.all(case.prior.std > 0.0):
-            D = case.transform.derivative(case.transform.forward(assumed))
-            inner = to_filter(case.transform, case.prior).covariance
-            prior = Gaussian(assumed, inner * np.outer(D, D))
-            informed = identifiability(H, R, scale, prior=prior, names=case.parameters)
+        scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)
+        data = identifiability(predicted.jacobian, R, scale, names=parameters)
+        if np.all(prior.std > 0.0):
+            D = transform.derivative(transform.forward(assumed))
+            inner = to_filter(transform, prior).covariance
+            known = Gaussian(assumed, inner * np.outer(D, D))
+            informed = identifiability(predicted.jacobian, R, scale, prior=known, names=parameters)
     return Foresight(
-        case.parameters,
+        parameters,
         assumed,
-        case.prior,
-        case.transform,
-        observation.frames,
-        len(observation.y),
+        prior,
+        transform,
+        frames,
+        len(predicted.y),
         data,
         informed,
         "" if predicted.converged else predicted.reason,

@@ -84,7 +84,9 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
 
 
 def test_the_cycle_study_records_frames_steps_and_the_drift(run):
-    status, record, folder, said = run("experiment=cycle", "cycle.time_steps=[0.05,0.025,0.0125]")
+    status, record, folder, said = run(
+        "experiment=cycle", "cycle.time_steps=[0.05,0.025,0.0125]", "cycle.path_steps=4"
+    )
     assert status == 0, said.err
     frames = record["frames"]
     # The open frame says nothing of any parameter.
@@ -93,10 +95,11 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     assert {entry["frames"] for entry in record["phases"]} == {"closing", "held closed", "opening"}
     steps = record["steps"]
     assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
-    # So small a motion is smooth: the derivative tells what two standard deviations do, where
-    # steps are not so large that some are halved on one side of the truth and not on the other.
-    assert np.array(steps["departures"]).shape == (3, 3)
-    assert np.max(steps["departures"][1:]) < 0.02
+    # So small a motion is smooth.
+    assert np.array(steps["path_rms_mm"]).shape == (3, 4)
+    uneven = [max(along) / np.median(along) for along in steps["path_rms_mm"]]
+    assert max(uneven) < 1.5
+    assert steps["path"][-1][0] / steps["path"][0][0] == pytest.approx(0.7)
     drift = record["drift"]
     assert np.array(drift["truth"]).shape == (3, 2)
     # From the first to the last beat by -30 % in the first modulus alone.
@@ -105,3 +108,19 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     for k in range(2):
         assert drift["smoother"]["mean_std"][k] < drift["filter"]["mean_std"][k]
     assert {"cycle.csv", "cycle.md", "cycle.png"} <= {path.name for path in folder.iterdir()}
+
+
+def test_a_check_says_what_a_cycle_will_tell_and_estimates_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "experiments.joint.CycleObservation", lambda *a, **k: pytest.fail("something was observed")
+    )
+    monkeypatch.setattr(sys, "argv", ["experiments.run", "experiment=joint", "check=true", *TINY])
+    assert main() == 0
+    said = capsys.readouterr().out
+    # 16 x 5 vertices in 5 frames, three coordinates each.
+    assert "1200 numbers of 0 s, 0.05 s, 0.1 s, 0.15 s, 0.25 s; 0.01 mm of noise assumed" in said
+    rows = [line.split() for line in said.splitlines() if line.strip().startswith("E_f.")]
+    assert [row[2] for row in rows] == ["3.74", "2.93"]  # where the filter starts
+    assert "No estimation was run." in said
+    assert not list(tmp_path.rglob("result.json"))

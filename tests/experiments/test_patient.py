@@ -10,6 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from experiments import patient
 from experiments.blind import SECRET
 from experiments.case import run_case
+from experiments.foresight import foresee_patient
 from experiments.patient import make_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
@@ -296,3 +297,15 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
     for key in ("estimate", "std", "iterates", "objective", "distances", "measurements"):
         assert records[0][key] == records[1][key]
     assert revealed["truth"] == [6.28, 2.61]
+
+
+def test_a_check_tells_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
+    use(monkeypatch)
+    said = foresee_patient(config_of(tmp_path))
+    assert len(simulated) == 1
+    assert "numbers of closed" in said
+    assert "No estimation was run." in said
+    rows = {line.split()[0]: line.split()[2] for line in said.splitlines() if "E_f." in line}
+    # The assumed values are the prior's, not the patient's.
+    assert rows
+    assert all(float(rows[name]) != pytest.approx(TRUE[name], rel=1e-3) for name in rows)
