@@ -34,6 +34,7 @@ OTHER_TABLES = {
     "gate": write_gate_tables,
     "closure": write_closure_tables,
     "joint": write_joint,
+    "joint_open": write_joint,
     "cycle": write_cycle,
     "identifiability": write_identifiability_study,
     "filters": write_filter_study,

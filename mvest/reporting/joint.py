@@ -205,13 +205,14 @@ def _draw_path(
 
 
 def write_joint(folder: Path, record: Record) -> list[Path]:
-    """``joint.csv``, ``joint.md`` and the figure ``joint``."""
+    """A table, words and a figure, all named after the record's row."""
+    name = record["row"]
     table = _table(record)
     text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
     return [
-        write_with(folder / "joint.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "joint.md", text),
-        *save_figure(folder / "joint", joint_figure(record), record),
+        write_with(folder / f"{name}.csv", lambda path: table.to_csv(path, index=False)),
+        write_text(folder / f"{name}.md", text),
+        *save_figure(folder / name, joint_figure(record), record),
     ]
 
 
@@ -221,5 +222,5 @@ def publish_joint(results: Path, record: Record) -> list[Path]:
         results.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(results, error) from error
-    write_json(results / "joint.json", record)
+    write_json(results / f"{record['row']}.json", record)
     return write_joint(results, record)

@@ -66,6 +66,11 @@ OTHERS = (
         ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
     ),
     ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
+    (
+        "joint_open",
+        "The same of a valve that opens fully (simulated)",
+        ("joint_open",),
+    ),
     ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
     ("prediction", "What an estimated valve would do (simulated)", ("prediction",)),
     ("chord", "Chordae by family", ("chord",)),
@@ -101,6 +106,7 @@ CAPTIONS = {
     "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
     "joint": "Estimates as frames come in, errors over seeds, and what two frames and a whole "
     "cycle could tell. Simulated.",
+    "joint_open": "As the figure before, of a valve that opens fully. Simulated.",
     "cycle": "The cycle and its frames, what they tell of each parameter, and a modulus that "
     "drifts over beats, filtered and smoothed. Simulated.",
     "prediction": "A leaking valve closed as observed and under changed conditions, seen from the "
