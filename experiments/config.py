@@ -414,6 +414,9 @@ class PredictionConfig:
     spread: list[float] = field(default_factory=list)  # SD of the logarithms of true parameters
     # Cells [around, annulus to edge] of further meshes on which peak stress is computed.
     stress_meshes: list[Any] = field(default_factory=list)
+    # Cells of the finer mesh on which each estimate is predicted once, to tell the mesh's error;
+    # empty: intervals know nothing of it.
+    check_mesh: list[int] = field(default_factory=list)
 
 
 @dataclass

@@ -8,7 +8,7 @@ its posterior. Only then are the same scenarios computed with the true parameter
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from mvest.prediction.predict import Sample, closed_valve
 from mvest.study import StudyResult, estimate, simulate_observation
 from mvest.typing import FloatArray
 from mvest.valve.anatomy import Valve
+from mvest.valve.mesh import SolidMesh
 
 __all__ = ["run_prediction"]
 
@@ -36,6 +37,16 @@ Outcome = tuple[dict[str, Any], list[Path]]
 
 MEASURED_ON = (96, 22)
 """Vertices around and along the leaflets of the surface on which shapes are measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """What is asked of every patient."""
+
+    scenarios: dict[str, Scenario]
+    spread: FloatArray  # of the logarithms of true parameters
+    valve: Valve  # the surface that is measured
+    finer: SolidMesh | None  # on which the mesh's error is told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,13 +70,19 @@ def run_prediction(config: Values, config_hash: str, folder: Path, started: floa
     twin = build_twin(config)
     # Measured on more points than are observed, which cost time where their errors are correlated.
     valve = template_of(config).valve(*MEASURED_ON)
+    asked = _Asked(
+        scenarios,
+        np.array(settings["spread"], dtype=float),
+        valve,
+        _mesh_of(config, settings["check_mesh"]) if settings["check_mesh"] else None,
+    )
     seeds = [config["seed"] + k for k in range(settings["patients"])]
     patients = []
     total = sum(len(scenarios) * (2 + _count(settings, k == 0)) + 1 for k in range(len(seeds)))
     with PartBar("prediction", total, "closure") as bar:
         for number, seed in enumerate(seeds):
             count = _count(settings, number == 0)
-            patients.append(_predicted(twin, seed, settings, scenarios, valve, count, bar.step))
+            patients.append(_predicted(twin, seed, asked, count, bar.step))
         truths = {p.seed: _true_scenarios(twin, p, scenarios, bar.step) for p in patients}
     usual = replace(twin.model, valve=valve)
     record = forward_record(config, config_hash, twin.model, patients[0].truth, started, 0)
@@ -74,6 +91,7 @@ def run_prediction(config: Values, config_hash: str, folder: Path, started: floa
         "scenarios": {name: scenario.title for name, scenario in scenarios.items()},
         "stress_meshes": _stress_on_meshes(config, usual, patients[0].truth),
         "reach_mm": contact_reach(usual),
+        "check_mesh": list(settings["check_mesh"]),
         "observed": {
             "vertices": len(twin.valve.surface.vertices),
             "truth_cells": [config["truth"][k] for k in ("columns", "rows")],
@@ -121,16 +139,10 @@ def _count(settings: Values, first: bool) -> int:
 
 # -- estimate and predict -------------------------------------------------------------------------
 def _predicted(
-    twin: Twin,
-    seed: int,
-    settings: Values,
-    scenarios: Mapping[str, Scenario],
-    valve: Valve,
-    count: int,
-    step: Callable[[], None],
+    twin: Twin, seed: int, asked: _Asked, count: int, step: Callable[[], None]
 ) -> _Patient:
     rng = np.random.default_rng(seed)
-    spread = np.array(settings["spread"], dtype=float)
+    spread = asked.spread
     if spread.shape != twin.truth_values.shape:
         raise ConfigurationError(
             f"prediction.spread has {spread.size} values; expected one for each of "
@@ -156,11 +168,12 @@ def _predicted(
     if result.filtered is None or not result.converged:
         return _Patient(seed, truth, result, {}, {})
     samples = posterior_samples(result.filtered, count, seed)
-    measured = replace(twin.model, valve=valve)
-    models = {name: model_under(measured, scenario) for name, scenario in scenarios.items()}
+    measured = replace(twin.model, valve=asked.valve)
+    models = {name: model_under(measured, scenario) for name, scenario in asked.scenarios.items()}
     found = {}
     for name, model in models.items():
-        found[name] = predict(model, result.filtered, samples, lambda _: step())
+        finer = None if asked.finer is None else _on_mesh(model, asked.finer)
+        found[name] = predict(model, result.filtered, samples, lambda _: step(), finer=finer)
         step()
     return _Patient(seed, truth, result, found, models)
 
@@ -186,18 +199,28 @@ def _stress_on_meshes(
     """Peak stress of the first patient as observed, on finer and finer meshes."""
     rows = []
     for columns, count in config["prediction"]["stress_meshes"]:
-        mesh = build_mesh(
-            template_of(config),
-            {**config["mesh"], "columns": columns, "rows": count},
-            config["mechanics"]["element"],
-            Path(config["paths"]["outputs"]) / "meshes",
-        )
-        model = replace(usual.fresh(), mesh=mesh, guide=None)
+        model = _on_mesh(usual, _mesh_of(config, [columns, count]))
         sample = closed_valve(model, truth)[0]
         stress = {k: v for k, v in sample.measures.items() if k.startswith("stress")}
         gap = sample.measures.get("gap_mm2")
         rows.append({"cells": [columns, count], "gap_mm2": gap, **stress, "reason": sample.reason})
     return rows
+
+
+def _mesh_of(config: Values, cells: Sequence[int]) -> SolidMesh:
+    """The configured mesh with ``cells`` around and along the leaflets."""
+    columns, rows = cells
+    return build_mesh(
+        template_of(config),
+        {**config["mesh"], "columns": columns, "rows": rows},
+        config["mechanics"]["element"],
+        Path(config["paths"]["outputs"]) / "meshes",
+    )
+
+
+def _on_mesh(model: ClosureModel, mesh: SolidMesh) -> ClosureModel:
+    """A fresh model of the same valve on another mesh, closed from the open valve."""
+    return replace(model.fresh(), mesh=mesh, guide=None)
 
 
 # -- record ---------------------------------------------------------------------------------------
@@ -228,6 +251,7 @@ def _told(patient: _Patient, truth: Mapping[str, Mapping[str, Sample]]) -> dict[
                 "failures": list(found.failures),
                 "sampled": [s.measures for s in found.samples],
                 "truth_failure": truth[name]["own"].reason,
+                "finer_failure": "" if found.finer is None else found.finer.reason,
                 "measures": {
                     measure: _row(found, truth[name], measure) for measure in _names(found)
                 },
@@ -250,6 +274,7 @@ def _row(
     found: PredictedScenario, truth: Mapping[str, Sample], measure: str
 ) -> dict[str, float | bool | None]:
     spread = found.spread(measure)
+    low, high = found.interval(measure)
     row: dict[str, float | bool | None] = {
         "estimate": found.at_estimate.measures[measure],
         "first_order_std": found.first_order.get(measure),
@@ -258,16 +283,23 @@ def _row(
         "low": _known(spread.low),
         "high": _known(spread.high),
         "samples": spread.count,
+        "mesh_error": _known(found.mesh_error(measure)),
+        "wide_low": _known(low),
+        "wide_high": _known(high),
     }
     for key, sample in truth.items():
         true = sample.measures.get(measure)
         row[f"truth_{key}_mesh"] = true
-        row[f"inside_{key}_mesh"] = (
-            None
-            if true is None or not np.isfinite(spread.std)
-            else bool(spread.low <= true <= spread.high)
-        )
+        row[f"inside_{key}_mesh"] = _inside(spread.low, true, spread.high)
+    row["inside_wide"] = _inside(low, row["truth_own_mesh"], high)
     return row
+
+
+def _inside(low: float, true: float | None, high: float) -> bool | None:
+    """Whether an interval holds the truth; None where one of them is not known."""
+    if true is None or not np.isfinite(high - low):
+        return None
+    return bool(low <= true <= high)
 
 
 def _known(value: float) -> float | None:

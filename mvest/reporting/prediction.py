@@ -54,18 +54,25 @@ def _predicted(record: Record) -> Iterator[tuple[int, str, str, Mapping[str, Any
                 yield patient["seed"], scenario, measure, row
 
 
-def coverage(record: Record, measure: str, mesh: str) -> tuple[int, int]:
-    """How many intervals hold the truth computed on a mesh (own, same), and of how many.
+INTERVALS = {
+    "wide": ("wide_low", "wide_high", "truth_own_mesh", "inside_wide"),
+    "own": ("low", "high", "truth_own_mesh", "inside_own_mesh"),
+    "same": ("low", "high", "truth_same_mesh", "inside_same_mesh"),
+}
+"""Intervals with and without the mesh's error, the truth they are to hold, and whether they do."""
+
+
+def coverage(record: Record, measure: str, kind: str) -> tuple[int, int]:
+    """How many intervals of a kind (see `INTERVALS`) hold the truth, and of how many.
 
     Where all samples and the truth are one number (no gap at all) there is no uncertainty that
     could be right or wrong: such an interval is not counted.
     """
+    low, high, truth, held = INTERVALS[kind]
     inside = [
-        row[f"inside_{mesh}_mesh"]
+        row[held]
         for _, _, name, row in _predicted(record)
-        if name == measure
-        and row[f"inside_{mesh}_mesh"] is not None
-        and not row["low"] == row["high"] == row[f"truth_{mesh}_mesh"]
+        if name == measure and row[held] is not None and not row[low] == row[high] == row[truth]
     ]
     return sum(inside), len(inside)
 
@@ -82,7 +89,8 @@ def _frame(record: Record) -> pd.DataFrame:
 def _cell(row: Mapping[str, Any] | None) -> str:
     if row is None:
         return MISSING
-    interval = f" [{number(row['low'])}, {number(row['high'])}]"
+    low, high, *_ = INTERVALS["wide" if row["wide_low"] is not None else "own"]
+    interval = f" [{number(row[low])}, {number(row[high])}]"
     truth = f", true {number(row['truth_own_mesh'])}"
     return f"{number(row['estimate'])}{interval}{truth}"
 
@@ -117,6 +125,13 @@ def _moduli_table(record: Record) -> str:
     return markdown_rows(rows)
 
 
+HEADS = {
+    "wide": "truth inside",
+    "own": "without the mesh's error",
+    "same": "inside, same mesh",
+}
+
+
 def _uncertainty_table(record: Record) -> str:
     """Standard deviations by sampling and to first order, and how often the truth is inside."""
     scenarios = record["patients"][0]["scenarios"]
@@ -130,10 +145,11 @@ def _uncertainty_table(record: Record) -> str:
             row[title] = (
                 MISSING
                 if entry is None
-                else f"{number(entry['std'], 2)} / {number(entry['first_order_std'], 2)}"
+                else f"{number(entry['std'], 2)} / {number(entry['first_order_std'], 2)} / "
+                f"{number(entry['mesh_error'], 2)}"
             )
-        for mesh, head in (("own", "truth inside"), ("same", "inside, same mesh")):
-            inside, of = coverage(record, measure, mesh)
+        for kind, head in HEADS.items():
+            inside, of = coverage(record, measure, kind)
             row[head] = f"{inside} of {of}"
         rows.append(row)
     return markdown_rows(rows)
@@ -173,6 +189,10 @@ def _failures(record: Record) -> str:
                     f"patient {patient['seed']}, {title}: {len(found['failures'])} of "
                     f"{found['samples']} samples ({reasons})"
                 )
+            if found["finer_failure"]:
+                said.append(
+                    f"patient {patient['seed']}, {title}, finer mesh: {found['finer_failure']}"
+                )
             if found["truth_failure"]:
                 said.append(
                     f"patient {patient['seed']}, {title}, true valve: {found['truth_failure']}"
@@ -182,10 +202,16 @@ def _failures(record: Record) -> str:
     return f"Of {attempted} samples, not closed: " + "; ".join(said) + "."
 
 
-def _totals(record: Record, mesh: str) -> str:
-    counts = [coverage(record, name, mesh) for name in SHOWN if name not in PRESCRIBED]
+def _totals(record: Record, kind: str) -> str:
+    counts = [coverage(record, name, kind) for name in SHOWN if name not in PRESCRIBED]
     inside, of = (sum(column) for column in zip(*counts, strict=True))
     return f"{inside} of {of} ({100 * inside / of:.0f} %)" if of else "none"
+
+
+def _finer(record: Record) -> str:
+    if not record["check_mesh"]:
+        return "a finer mesh (none was computed)"
+    return f"a finer mesh ({' × '.join(map(str, record['check_mesh']))} cells)"
 
 
 def _readable(record: Record) -> str:
@@ -202,23 +228,25 @@ def _readable(record: Record) -> str:
             "",
             _moduli_table(record),
             "",
-            f"Patient {first['seed']} under each condition: at the estimate [95 % interval of the "
-            "samples], and the true valve, which was computed afterwards on its own mesh.",
+            f"Patient {first['seed']} under each condition: at the estimate [95 % interval: of the "
+            "samples, and of the mesh], and the true valve, which was computed afterwards on its "
+            "own mesh.",
             "",
             _scenario_table(record),
             "",
-            "Standard deviation of the samples / to first order (derivative of the closed shape), "
-            f"of the same patient; and how many intervals of all {len(record['patients'])} "
-            "patients and conditions hold the truth: computed on its own mesh, and on the mesh of "
-            "the estimate, where only the uncertainty of the parameters is left. Intervals in "
-            "which all samples and the truth are the same number are not counted.",
+            "Standard deviation of the samples / to first order (derivative of the closed shape) / "
+            f"error of the mesh, of the same patient; and how many intervals of all "
+            f"{len(record['patients'])} patients and conditions hold the truth: computed on its "
+            "own mesh, by intervals with and without the mesh's error, and on the mesh of the "
+            "estimate, where only the uncertainty of the parameters is left. Intervals in which "
+            "all samples and the truth are the same number are not counted.",
             "",
             _uncertainty_table(record),
             "",
-            f"Over all these measures {_totals(record, 'own')} of the intervals hold the truth of "
-            f"its own mesh and {_totals(record, 'same')} that of the same mesh; 95 % would be "
-            "right. The intervals carry the uncertainty of the estimated parameters and not the "
-            "error of the mesh.",
+            f"Over all these measures {_totals(record, 'wide')} of the intervals hold the truth of "
+            f"its own mesh, {_totals(record, 'own')} without the mesh's error; on the same mesh "
+            f"{_totals(record, 'same')} do. 95 % would be right. The error of the mesh is the "
+            f"difference to {_finer(record)}, at the estimate, taken as a standard deviation.",
             "",
             "Peak stress of the first patient as observed, with its true parameters, by mesh: the "
             "largest value belongs to insertions of chordae and to the hinge.",

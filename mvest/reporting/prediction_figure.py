@@ -197,8 +197,10 @@ def _dots(
         if row is None:
             continue
         x = place + shift - 0.12
+        if row["wide_low"] is not None:
+            panel.plot([x, x], [row["wide_low"], row["wide_high"]], color=colour, linewidth=0.8)
         if row["low"] is not None:
-            panel.plot([x, x], [row["low"], row["high"]], color=colour, linewidth=2)
+            panel.plot([x, x], [row["low"], row["high"]], color=colour, linewidth=2.5)
         panel.plot([x], [row["estimate"]], "o", color=colour, markersize=5)
         if row["truth_own_mesh"] is not None:
             panel.plot([x], [row["truth_own_mesh"]], "x", color=COLOURS[1], markersize=6, zorder=4)

@@ -33,6 +33,7 @@ SMALL = (
     "prediction.further_samples=2",
     "prediction.patients=2",
     "prediction.stress_meshes=[[12,2]]",
+    "prediction.check_mesh=[20,3]",
     "guided=false",
     "figures=false",
     "tracking.enabled=false",
@@ -96,6 +97,10 @@ def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
             assert row["low"] <= row["mean"] <= row["high"]
             inside = row["low"] <= row["truth_own_mesh"] <= row["high"]
             assert row["inside_own_mesh"] == inside
+            # Nothing is narrower for knowing of the mesh.
+            assert row["wide_low"] <= row["low"] <= row["high"] <= row["wide_high"]
+            if row["mesh_error"] > 1e-3 * abs(row["estimate"]):
+                assert row["wide_high"] > row["high"]
     # The same stretch on either mesh: the truth is one, but its stress has other sample points.
     row = patient["scenarios"]["observed"]["measures"]["ap_diameter_mm"]
     assert row["truth_own_mesh"] == pytest.approx(row["truth_same_mesh"], rel=1e-3)
@@ -113,6 +118,7 @@ def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
         assert np.all(off > 0)
     assert set(SHOWN) <= set(record["measures"])
     assert coverage(record, "tenting_height_mm", "own")[1] == 10
+    assert coverage(record, "tenting_height_mm", "wide")[1] == 10
 
     write_prediction_tables(folder, record)
     text = (folder / "prediction.md").read_text()

@@ -117,6 +117,52 @@ def test_failed_samples_are_told_and_not_dropped(linear):
     assert [s.failed for s in found.samples].count(True) == 3
 
 
+class Finer(Linear):
+    """The same, moved by 0.5 mm along x."""
+
+    def observed(self, x):
+        return x
+
+    def close(self, m, *, sensitivities):
+        result = super().close(m, sensitivities=sensitivities)
+        result.simulation.frames[0][0, 0] += 0.5
+        return result
+
+
+def test_intervals_carry_the_error_of_the_mesh(linear):
+    estimate = estimated()
+    samples = posterior_samples(estimate, 64, 3)
+    plain = predict_scenario(linear, estimate, samples)
+    assert np.isnan(plain.mesh_error("sum_mm"))
+    assert np.all(np.isnan(plain.interval("sum_mm")))
+    found = predict_scenario(linear, estimate, samples, finer=Finer())
+    assert found.mesh_error("first_mm") == pytest.approx(0.5)
+    centre, spread = found.at_estimate.measures["first_mm"], found.spread("first_mm")
+    low, high = found.interval("first_mm")
+    assert centre - low == pytest.approx(np.hypot(centre - spread.low, 1.96 * 0.5), rel=1e-4)
+    assert high - centre == pytest.approx(np.hypot(spread.high - centre, 1.96 * 0.5), rel=1e-4)
+    # Where the meshes agree, nothing is added: a load is 7 on both.
+    assert found.interval("load") == (7.0, 7.0)
+
+
+def test_a_measure_that_is_never_negative_has_no_negative_interval(linear, monkeypatch):
+    monkeypatch.setattr(
+        predict, "measure_closed", lambda model, system, x, changes=None: {"gap": abs(x[0, 0] - 16)}
+    )
+    estimate = estimated()
+    found = predict_scenario(linear, estimate, posterior_samples(estimate, 16, 3), finer=Finer())
+    assert found.mesh_error("gap") > 0
+    assert found.interval("gap")[0] >= 0
+
+
+def test_a_finer_mesh_that_does_not_close_leaves_the_error_unknown(linear):
+    estimate = estimated()
+    finer = Finer(lambda m: Reason.SINGULAR)
+    found = predict_scenario(linear, estimate, posterior_samples(estimate, 4, 3), finer=finer)
+    assert found.finer.reason == Reason.SINGULAR.value
+    assert np.all(np.isnan(found.interval("sum_mm")))
+
+
 def test_a_valve_that_does_not_close_at_the_estimate_is_a_result(linear):
     linear.refuse = lambda m: Reason.SINGULAR
     found = predict_scenario(linear, estimated(), posterior_samples(estimated(), 2, 1))

@@ -5,7 +5,11 @@ from mvest.reporting.prediction import coverage
 
 def row(low, high, truth):
     inside = low <= truth <= high
-    return {"low": low, "high": high, "truth_own_mesh": truth, "inside_own_mesh": inside}
+    return {
+        "low": low, "high": high, "truth_own_mesh": truth, "inside_own_mesh": inside,
+        "wide_low": low - 0.5, "wide_high": high + 0.5,
+        "inside_wide": low - 0.5 <= truth <= high + 0.5,
+    }  # fmt: skip
 
 
 def test_an_interval_without_width_counts_only_where_it_misses():
@@ -19,3 +23,5 @@ def test_an_interval_without_width_counts_only_where_it_misses():
     # Inside: observed. Missed: clip. Neither: the ring, where there is nothing to be wrong about,
     # and both, whose truth is not known.
     assert coverage(record, "gap_mm2", "own") == (1, 2)
+    # With the mesh's error the ring's interval has a width, and both, 3.0 in 0.5 to 2.5, misses.
+    assert coverage(record, "gap_mm2", "wide") == (2, 4)
