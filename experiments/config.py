@@ -365,6 +365,11 @@ class CycleConfig:
     finer_rows: int = 4
     finer_contact: list[int] = field(default_factory=lambda: [96, 21])  # points, around and along
     finer_dt_factor: float = 0.5
+    # Cells and contact points of the mesh on which the estimator looks for its own mesh's error,
+    # with the time step of the finer truth's.
+    check_columns: int = 40
+    check_rows: int = 5
+    check_contact: list[int] = field(default_factory=lambda: [120, 26])
     time_steps: list[float] = field(default_factory=list)  # s, each half of the one before
     path_steps: int = 16  # along which frames are looked at for jumps
     beats: int = 10  # over which a modulus drifts

@@ -31,6 +31,12 @@ from mvest.estimation import (
     identifiability,
     nees,
 )
+from mvest.estimation.noise import (
+    NoiseCovariance,
+    ObservationNoise,
+    low_rank_noise,
+    observation_noise,
+)
 from mvest.typing import FloatArray
 
 __all__ = ["run_joint_study"]
@@ -80,12 +86,18 @@ def run_joint_study(
             seeds.append(study.batch(observation, seeds[0].mean))
         _tell(f"seed {k}", seeds[-1], truth)
     assert first is not None
-    finer = _finer_frames(config, truth)
-    other = study.batch(CycleObservation.simulated(finer, noise, _rng(config, 0)), seeds[0].mean)
+    finer = _frames_on_mesh(config, truth, "finer")
+    seen_finer = CycleObservation.simulated(finer, noise, _rng(config, 0))
+    other = study.batch(seen_finer, seeds[0].mean)
     _tell("finer truth", other, truth)
+    # What the estimator can know of its mesh's error: its own frames on another mesh.
+    check = _frames_on_mesh(config, other.mean, "check")
+    off = check - study.seen(other.mean).y.reshape(frames.shape)
+    told_of = study.batch(seen_finer, other.mean, _with_mesh_error(seen_finer, off))
+    _tell("finer truth, told of the mesh's error", told_of, truth)
 
     errors = np.array([e.mean / truth - 1 for e in seeds if e.converged])
-    runs = [exact.estimate, *seeds, other]
+    runs = [exact.estimate, *seeds, other, told_of]
     record = forward_record(
         config, config_hash, model.closure, truth, started, sum(e.forward_solves for e in runs)
     )
@@ -105,6 +117,11 @@ def run_joint_study(
         | {
             "cells": [settings["finer_columns"], settings["finer_rows"]],
             "distance_mm": float(np.linalg.norm(finer - frames, axis=2).mean()),
+        },
+        "told": _entry(told_of, truth)
+        | {
+            "cells": [settings["check_columns"], settings["check_rows"]],
+            "distance_mm": float(np.linalg.norm(off, axis=2).mean()),
         },
     }
     failed = [e for e in runs if not e.converged]
@@ -139,7 +156,9 @@ class _Study:
             transform=self.transform,
         )
 
-    def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
+    def batch(
+        self, observation: CycleObservation, start: FloatArray, R: NoiseCovariance | None = None
+    ) -> Estimate:
         # A decrease of 0.02 moves no parameter by more than a fifth of its standard deviation.
         first = tuple(map(float, start))
         filter_ = IteratedFilter(tolerance=1e-3, objective_tolerance=0.02, start=first)
@@ -147,7 +166,7 @@ class _Study:
             self.seen,
             self.prior,
             observation.y,
-            observation.R,
+            observation.R if R is None else R,
             names=self.parameters,
             transform=self.transform,
         )
@@ -169,15 +188,28 @@ class _Study:
         return rows
 
 
-def _finer_frames(config: Values, truth: FloatArray) -> FloatArray:
-    """Frames of a truth that the estimator's model cannot be."""
+def _with_mesh_error(observation: CycleObservation, off: FloatArray) -> ObservationNoise:
+    """The noise of an observation and, frame by frame, an unknown share of ``off (f, n, 3)`` mm.
+
+    Each share is normal with standard deviation 1: what the estimator's frames are off from those
+    of another mesh is taken as the size of its error.
+    """
+    frames, vertices = observation.seen.shape
+    columns = np.zeros((frames, vertices, 3, frames))
+    columns[np.arange(frames), :, :, np.arange(frames)] = off
+    base = observation_noise(observation.R, len(observation.y))
+    return low_rank_noise(base, columns[observation.seen].reshape(-1, frames))
+
+
+def _frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
+    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh."""
     settings = config["cycle"]
-    cells = {"columns": settings["finer_columns"], "rows": settings["finer_rows"]}
-    points = dict(zip(("columns", "rows"), settings["finer_contact"], strict=True))
+    cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
+    points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
     mechanics = {**config["mechanics"], "contact_points": points}
     changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
     dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
-    return stored_frames(changed, cycle_model(changed, dt=dt), truth)
+    return stored_frames(changed, cycle_model(changed, dt=dt), m)
 
 
 def _passes(found: Estimate, truth: FloatArray) -> list[dict[str, Any]]:

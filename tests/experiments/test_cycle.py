@@ -25,6 +25,9 @@ TINY = (
     "cycle.finer_columns=10",
     "cycle.finer_rows=1",
     "cycle.finer_contact=[20,5]",
+    "cycle.check_columns=12",
+    "cycle.check_rows=1",
+    "cycle.check_contact=[24,5]",
     "cycle.seeds=2",
     "cycle.beats=3",
     "cycle.beat_times=[0.05,0.1]",
@@ -79,6 +82,12 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
     np.testing.assert_allclose(record["rms_over_bound"], expected)
     # Another mesh is another truth.
     assert record["finer"]["distance_mm"] > 1e-3
+    # Told of what its mesh may be off, the filter is less sure, and closer to right.
+    finer, told = record["finer"], record["told"]
+    assert told["distance_mm"] > record["finer"]["distance_mm"] > 0
+    assert np.all(np.array(told["std"]) > finer["std"])
+    off = [np.abs(np.divide(entry["error"], entry["std"])).max() for entry in (finer, told)]
+    assert off[1] < off[0]
     assert {"joint.csv", "joint.md", "joint.png"} <= {path.name for path in folder.iterdir()}
     assert "target" in said.out
 

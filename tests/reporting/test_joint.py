@@ -44,6 +44,7 @@ RECORD = {
     "passes": [{"error": [0.1, 0.1, 0.01], "std": [0.1, 0.1, 0.01]}] * 2,
     "rms_over_bound": [0.8, 1.4, 0.9],
     "finer": entry(0.05, cells=[40, 5], distance_mm=0.2),
+    "told": entry(0.012, cells=[48, 6], distance_mm=0.3),
     "provenance": {
         "versions": {"mvest": "0.1.0"},
         "git": {"sha": "0" * 40, "dirty": False},
@@ -74,8 +75,13 @@ def test_the_most_correlated_parameters_of_two_frames_are_named():
     assert "do not determine all parameters" in joint_text(undetermined)
 
 
+def test_errors_on_another_mesh_are_told_in_standard_deviations():
+    text = joint_text(RECORD)
+    assert "over these standard deviations: +0.0, +1.2, +0.0 (not told: +0.0, +5.0, +0.0)" in text
+
+
 def test_files_are_written(tmp_path):
     names = {path.name for path in write_joint(tmp_path, RECORD)}
     assert names == {"joint.csv", "joint.md", "joint.png", "joint.pdf"}
-    # Of three parameters: no noise, two seeds, the finer truth.
-    assert len((tmp_path / "joint.csv").read_text().splitlines()) == 1 + 4 * len(NAMES)
+    # Of three parameters: no noise, two seeds, the finer truth without and with its mesh's error.
+    assert len((tmp_path / "joint.csv").read_text().splitlines()) == 1 + 5 * len(NAMES)
