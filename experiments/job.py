@@ -49,24 +49,25 @@ from experiments.twin import run_twin
 from experiments.volume import check_volume, run_volume
 from mvest.errors import ConfigurationError
 from mvest.provenance import write_json
-from mvest.reporting.chord import chord_text, publish_chord, write_chord
+from mvest.reporting.chord import chord_text, write_chord
 from mvest.reporting.closure import closure_text, publish_closure, write_closure_tables
-from mvest.reporting.cycle import cycle_text, publish_cycle, write_cycle
+from mvest.reporting.cycle import cycle_text, write_cycle
 from mvest.reporting.donor import donor_text, publish_donor, write_donor_tables
 from mvest.reporting.external import external_text, write_external_tables
-from mvest.reporting.filters import filters_text, publish_filters, write_filter_tables
-from mvest.reporting.gate import gate_text, publish_gate, write_gate_tables
+from mvest.reporting.files import keep_record
+from mvest.reporting.filters import filters_text, write_filter_study, write_filter_tables
+from mvest.reporting.gate import gate_text, write_gate_tables
 from mvest.reporting.identifiability import (
     identifiability_text,
-    publish_identifiability,
+    write_identifiability_study,
     write_identifiability_tables,
 )
 from mvest.reporting.imaging_study import imaging_text, publish_imaging, write_imaging_study
 from mvest.reporting.imaging_volumes import publish_volume
-from mvest.reporting.joint import joint_text, publish_joint, write_joint
-from mvest.reporting.law import law_text, publish_law, write_law_tables
-from mvest.reporting.models import models_text, publish_models, write_models_tables
-from mvest.reporting.patch import patch_text, publish_patch, write_patch
+from mvest.reporting.joint import joint_text, write_joint
+from mvest.reporting.law import law_text, write_law_tables
+from mvest.reporting.models import models_text, write_models_tables
+from mvest.reporting.patch import patch_text, write_patch
 from mvest.reporting.patients import case_text, publish_patient, write_case_tables
 from mvest.reporting.prediction import (
     prediction_text,
@@ -191,6 +192,20 @@ def _leave(values: Mapping[str, Any], record: Mapping[str, Any], folder: Path) -
     """Nothing more is done with a finished run."""
 
 
+def _kept(
+    write: Callable[[Path, Mapping[str, Any]], list[Path]],
+) -> Callable[[Path, str, Mapping[str, Any], Path], list[Path]]:
+    """Publish the record, with tables and figures from it alone."""
+
+    def publish_record(
+        results: Path, _name: str, record: Mapping[str, Any], _folder: Path
+    ) -> list[Path]:
+        keep_record(results, record)
+        return write(results, record)
+
+    return publish_record
+
+
 def _nothing_to_check(values: Mapping[str, Any], folder: Path) -> str:
     kinds = ", ".join(kind for kind, study in STUDIES.items() if study.checks())
     raise ConfigurationError(
@@ -251,26 +266,26 @@ STUDIES: dict[str, Study] = {
         run_gate_study,
         gate_text,
         write_gate_tables,
-        lambda results, _name, record, _folder: publish_gate(results, record),
+        _kept(write_gate_tables),
     ),
     "law": Study(
         run_law_study,
         law_text,
         write_law_tables,
-        lambda results, _name, record, _folder: publish_law(results, record),
+        _kept(write_law_tables),
     ),
     "joint": Study(
         run_joint_study,
         joint_text,
         write_joint,
-        lambda results, _name, record, _folder: publish_joint(results, record),
+        _kept(write_joint),
         checks=lambda: (foresee_cycle,),
     ),
     "cycle": Study(
         run_cycle_study,
         cycle_text,
         write_cycle,
-        lambda results, _name, record, _folder: publish_cycle(results, record),
+        _kept(write_cycle),
         keeps_failures=True,
         checks=lambda: (foresee_cycle,),
     ),
@@ -278,7 +293,7 @@ STUDIES: dict[str, Study] = {
         run_identifiability,
         identifiability_text,
         write_identifiability_tables,
-        lambda results, _name, record, _folder: publish_identifiability(results, record),
+        _kept(write_identifiability_study),
     ),
     "prediction": Study(
         run_prediction,
@@ -292,13 +307,13 @@ STUDIES: dict[str, Study] = {
         run_filter_study,
         filters_text,
         write_filter_tables,
-        lambda results, _name, record, _folder: publish_filters(results, record),
+        _kept(write_filter_study),
     ),
     "chord": Study(
         run_chord_study,
         chord_text,
         write_chord,
-        lambda results, _name, record, _folder: publish_chord(results, record),
+        _kept(write_chord),
         keeps_failures=True,
         checks=lambda: (foresee_cycle,),
     ),
@@ -306,7 +321,7 @@ STUDIES: dict[str, Study] = {
         run_patch_study,
         patch_text,
         write_patch,
-        lambda results, _name, record, _folder: publish_patch(results, record),
+        _kept(write_patch),
         checks=lambda: (foresee_cycle,),
     ),
     "donor": Study(
@@ -357,7 +372,7 @@ STUDIES: dict[str, Study] = {
         run_models,
         models_text,
         write_models_tables,
-        lambda results, _name, record, _folder: publish_models(results, record),
+        _kept(write_models_tables),
     ),
     "external": Study(
         run_external,

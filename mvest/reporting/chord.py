@@ -11,12 +11,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 
-__all__ = ["chord_figure", "chord_text", "publish_chord", "write_chord"]
+__all__ = ["chord_figure", "chord_text", "write_chord"]
 
 Record = Mapping[str, Any]
 
@@ -183,13 +181,3 @@ def write_chord(folder: Path, record: Record) -> list[Path]:
         write_text(folder / "chord.md", text),
         *save_figure(folder / "chord", chord_figure(record), record),
     ]
-
-
-def publish_chord(results: Path, record: Record) -> list[Path]:
-    """Keep the record and write its tables and figure into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
-    write_json(results / "chord.json", record)
-    return write_chord(results, record)

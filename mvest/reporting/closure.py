@@ -11,10 +11,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import keep_record, provenance_line, write_text, write_with
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["closure_figure", "closure_text", "publish_closure", "write_closure_tables"]
@@ -131,10 +129,6 @@ def write_closure_tables(folder: Path, record: Record) -> list[Path]:
 
 def publish_closure(results: Path, record: Record, folder: Path) -> list[Path]:
     """Keep the record, its tables and its figure."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "closure.json", record)
+    keep_record(results, record)
     figure = closure_figure(record, folder / "fields.npz")
     return write_closure_tables(results, record) + save_figure(results / "closure", figure, record)

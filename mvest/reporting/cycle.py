@@ -11,13 +11,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 from mvest.reporting.joint import parameter_label
 
-__all__ = ["cycle_figure", "cycle_text", "publish_cycle", "write_cycle"]
+__all__ = ["cycle_figure", "cycle_text", "write_cycle"]
 
 Record = Mapping[str, Any]
 
@@ -177,13 +175,3 @@ def write_cycle(folder: Path, record: Record) -> list[Path]:
         write_text(folder / "cycle.md", text),
         *save_figure(folder / "cycle", cycle_figure(record), record),
     ]
-
-
-def publish_cycle(results: Path, record: Record) -> list[Path]:
-    """Keep the record, its tables and its figure."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
-    write_json(results / "cycle.json", record)
-    return write_cycle(results, record)

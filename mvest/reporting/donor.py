@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
-from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.files import keep_record, provenance_line, write_text
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["donor_figure", "donor_text", "publish_donor", "write_donor_tables"]
@@ -216,11 +215,7 @@ def write_donor_tables(folder: Path, record: Record) -> list[Path]:
 
 def publish_donor(results: Path, record: Record, fields: Path) -> list[Path]:
     """Keep the record, and write its table and its picture into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "donor.json", record)
+    keep_record(results, record)
     return [
         *write_donor_tables(results, record),
         *save_figure(results / "donor", donor_figure(fields), record),

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mvest.errors import cannot_write
+from mvest.provenance import write_json
 
-__all__ = ["provenance_line", "write_text", "write_with"]
+__all__ = ["keep_record", "provenance_line", "write_text", "write_with"]
 
 HASH_DIGITS = 12
 
@@ -53,3 +54,18 @@ def write_text(path: Path, text: str) -> Path:
 
 def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
+
+
+def keep_record(results: Path, record: Mapping[str, Any]) -> None:
+    """Write ``RESULTS/EXPERIMENT.json``, from which tables and figures come again.
+
+    Raises
+    ------
+    InputError
+        If the folder or the file cannot be written.
+    """
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(results, error) from error
+    write_json(results / f"{record['experiment']}.json", record)

@@ -12,8 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 from mvest.typing import FloatArray
@@ -22,7 +20,6 @@ __all__ = [
     "REFERENCE",
     "filters_figure",
     "filters_text",
-    "publish_filters",
     "write_filter_study",
     "write_filter_tables",
 ]
@@ -301,13 +298,3 @@ def write_filter_study(folder: Path, record: Record) -> list[Path]:
     """The tables and the figure."""
     figure = save_figure(folder / "filters", filters_figure(record), record)
     return write_filter_tables(folder, record) + figure
-
-
-def publish_filters(results: Path, record: Record) -> list[Path]:
-    """Keep the record, its tables and its figure."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "filters.json", record)
-    return write_filter_study(results, record)

@@ -8,11 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.files import provenance_line, write_text, write_with
 
-__all__ = ["gate_text", "publish_gate", "write_gate_tables"]
+__all__ = ["gate_text", "write_gate_tables"]
 
 Record = Mapping[str, Any]
 
@@ -62,13 +60,3 @@ def write_gate_tables(folder: Path, record: Record) -> list[Path]:
         write_with(folder / "gate.csv", lambda path: table.to_csv(path, index=False)),
         write_text(folder / "gate.md", text),
     ]
-
-
-def publish_gate(results: Path, record: Record) -> list[Path]:
-    """Keep the record and write its tables into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "gate.json", record)
-    return write_gate_tables(results, record)

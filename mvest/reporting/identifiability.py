@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 from mvest.reporting.files import provenance_line, write_text
 from mvest.reporting.foresight import alike_words
 from mvest.reporting.identifiability_figures import write_identifiability_figures
@@ -20,7 +18,6 @@ from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
 __all__ = [
     "identifiability_frame",
     "identifiability_text",
-    "publish_identifiability",
     "write_identifiability_study",
     "write_identifiability_tables",
 ]
@@ -254,13 +251,3 @@ def write_identifiability_study(folder: Path, record: Record) -> list[Path]:
         *write_identifiability_tables(folder, record),
         *write_identifiability_figures(folder, record),
     ]
-
-
-def publish_identifiability(results: Path, record: Record) -> list[Path]:
-    """Keep the record, its tables and its figures."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
-    write_json(results / "identifiability.json", record)
-    return write_identifiability_study(results, record)

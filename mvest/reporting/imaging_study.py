@@ -10,11 +10,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mvest.errors import cannot_write
 from mvest.imaging.layout import ValveLayout
-from mvest.provenance import write_json
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line
+from mvest.reporting.files import keep_record, provenance_line
 from mvest.reporting.imaging_figures import SETTINGS, std_figure
 from mvest.reporting.imaging_tables import imaging_table, imaging_words, write_imaging_tables
 from mvest.reporting.markup import MISSING, number
@@ -179,12 +177,8 @@ def write_imaging_study(folder: Path, record: Record) -> list[Path]:
 
 def publish_imaging(results: Path, record: Record) -> list[Path]:
     """Keep the record, and write its tables and figures into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
     kept = {key: value for key, value in record.items() if key not in NOT_KEPT}
-    write_json(results / "imaging.json", kept)
+    keep_record(results, kept)
     return write_imaging_study(results, kept)
 
 

@@ -11,12 +11,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 
-__all__ = ["joint_figure", "joint_text", "parameter_label", "publish_joint", "write_joint"]
+__all__ = ["joint_figure", "joint_text", "parameter_label", "write_joint"]
 
 Record = Mapping[str, Any]
 
@@ -226,8 +224,8 @@ def _draw_path(
 
 
 def write_joint(folder: Path, record: Record) -> list[Path]:
-    """A table, words and a figure, all named after the record's row."""
-    name = record["row"]
+    """A table, words and a figure, all named after the experiment."""
+    name = record["experiment"]
     table = _table(record)
     text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
     return [
@@ -235,13 +233,3 @@ def write_joint(folder: Path, record: Record) -> list[Path]:
         write_text(folder / f"{name}.md", text),
         *save_figure(folder / name, joint_figure(record), record),
     ]
-
-
-def publish_joint(results: Path, record: Record) -> list[Path]:
-    """Keep the record, its tables and its figure."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
-    write_json(results / f"{record['row']}.json", record)
-    return write_joint(results, record)

@@ -10,12 +10,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import COLOURS, save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 
-__all__ = ["biaxial_figure", "curves_figure", "law_text", "publish_law", "write_law_tables"]
+__all__ = ["biaxial_figure", "curves_figure", "law_text", "write_law_tables"]
 
 Record = Mapping[str, Any]
 
@@ -218,13 +216,3 @@ def write_law_tables(folder: Path, record: Record) -> list[Path]:
         *(save_figure(folder / "law", curves_figure(record), record) if record["curves"] else []),
         *save_figure(folder / "law_biaxial", biaxial_figure(record), record),
     ]
-
-
-def publish_law(results: Path, record: Record) -> list[Path]:
-    """Keep the record and write its tables and figures into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "law.json", record)
-    return write_law_tables(results, record)

@@ -11,14 +11,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 from mvest.reporting.markup import MISSING, markdown_rows, number
 from mvest.typing import FloatArray
 
-__all__ = ["models_figure", "models_text", "publish_models", "write_models_tables"]
+__all__ = ["models_figure", "models_text", "write_models_tables"]
 
 Record = Mapping[str, Any]
 
@@ -233,13 +231,3 @@ def write_models_tables(folder: Path, record: Record) -> list[Path]:
     if record["rows"]:
         written += save_figure(folder / "models", models_figure(record), record)
     return written
-
-
-def publish_models(results: Path, record: Record) -> list[Path]:
-    """Keep the record and write its tables and its figure into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "models.json", record)
-    return write_models_tables(results, record)

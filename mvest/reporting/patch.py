@@ -13,12 +13,10 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 from mvest.reporting.figures import save_figure
 from mvest.reporting.files import provenance_line, write_text, write_with
 
-__all__ = ["patch_figure", "patch_text", "publish_patch", "write_patch"]
+__all__ = ["patch_figure", "patch_text", "write_patch"]
 
 Record = Mapping[str, Any]
 
@@ -158,13 +156,3 @@ def write_patch(folder: Path, record: Record) -> list[Path]:
         write_text(folder / "patch.md", text),
         *save_figure(folder / "patch", patch_figure(record), record),
     ]
-
-
-def publish_patch(results: Path, record: Record) -> list[Path]:
-    """Keep the record and write its tables and figure into the results."""
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(results, error) from error
-    write_json(results / "patch.json", record)
-    return write_patch(results, record)

@@ -8,10 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.files import keep_record, provenance_line, write_text
 from mvest.reporting.markup import MISSING, markdown_rows, number
 
 __all__ = [
@@ -290,11 +288,7 @@ def publish_prediction(results: Path, record: Record, fields: Path) -> list[Path
     """Keep the record, and write its tables and its figure into the results."""
     from mvest.reporting.prediction_figure import prediction_figure
 
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write to {results}: {error.strerror}") from error
-    write_json(results / "prediction.json", record)
+    keep_record(results, record)
     return [
         *write_prediction_tables(results, record),
         *save_figure(results / "prediction", prediction_figure(record, fields), record),

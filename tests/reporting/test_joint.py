@@ -26,7 +26,6 @@ def bound(frames: str, count: int, std: list, correlation: float) -> dict:
 
 RECORD = {
     "experiment": "joint",
-    "row": "joint",
     "title": "Joint",
     "parameters": NAMES,
     "truth": [6.23, 2.09, 1.0],

@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from mvest.errors import InputError
-from mvest.reporting.law import curves_figure, law_text, publish_law, write_law_tables
+from mvest.reporting.files import keep_record
+from mvest.reporting.law import curves_figure, law_text, write_law_tables
 
 STRETCH = np.linspace(1.0, 1.2, 5)
 
@@ -99,7 +100,8 @@ def test_repeats_are_counted_without_those_that_gave_no_estimate():
 
 
 def test_published_files_come_out_of_the_record_again(tmp_path):
-    written = publish_law(tmp_path / "results", RECORD)
+    keep_record(tmp_path / "results", RECORD)
+    written = write_law_tables(tmp_path / "results", RECORD)
     names = {path.name for path in written}
     assert {"law.csv", "law.md", "law.png", "law.pdf", "law_biaxial.png"} <= names
     table = pd.read_csv(tmp_path / "results" / "law.csv")
@@ -139,4 +141,4 @@ def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        publish_law(tmp_path / "file", RECORD)
+        keep_record(tmp_path / "file", RECORD)
