@@ -37,6 +37,7 @@ from mvest.estimation.identifiability import (
     identifiability,
 )
 from mvest.estimation.iterated import IteratedFilter
+from mvest.estimation.model_error import shift_by_model_error
 from mvest.estimation.monte_carlo import MonteCarloFilter
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
 from mvest.estimation.paper import PaperFilter
@@ -95,6 +96,7 @@ __all__ = [
     "observation_noise",
     "profile",
     "random_walk",
+    "shift_by_model_error",
     "smooth_frames",
     "together",
     "zero_mean",

@@ -43,7 +43,8 @@ RECORD = {
     "passes": [{"error": [0.1, 0.1, 0.01], "std": [0.1, 0.1, 0.01]}] * 2,
     "rms_over_bound": [0.8, 1.4, 0.9],
     "finer": entry(0.05, cells=[40, 5], distance_mm=0.2),
-    "told": entry(0.012, cells=[48, 6], distance_mm=0.3),
+    "told": entry(0.05, shift=[0.0, 0.04, 0.0], cells=[48, 6], distance_mm=0.3)
+    | {"std": [0.01, 0.04, 0.001]},
     "provenance": {
         "versions": {"mvest": "0.1.0"},
         "git": {"sha": "0" * 40, "dirty": False},
@@ -76,7 +77,7 @@ def test_the_most_correlated_parameters_of_two_frames_are_named():
 
 def test_errors_on_another_mesh_are_told_in_standard_deviations():
     text = joint_text(RECORD)
-    assert "over these standard deviations: +0.0, +1.2, +0.0 (not told: +0.0, +5.0, +0.0)" in text
+    assert "over these standard deviations: +0.0, +1.2, +0.0 (without: +0.0, +5.0, +0.0)" in text
 
 
 def test_files_are_written(tmp_path):
