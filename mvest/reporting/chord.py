@@ -137,7 +137,7 @@ def chord_figure(record: Record) -> Figure:
     """Standard deviations before and after the data, and the estimates against the truth."""
     names = record["parameters"]
     y = np.arange(len(names))[::-1]
-    figure = Figure(figsize=(10.5, 0.62 * len(names) + 1.9), layout="constrained")
+    figure = Figure(figsize=(13.0, 0.62 * len(names) + 1.9), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     left.plot(100 * np.array(record["prior_std"]), y, "|", color="0.4", ms=16, mew=2.5,
               label="before the data (prior)")  # fmt: skip
@@ -155,7 +155,7 @@ def chord_figure(record: Record) -> Figure:
     right.plot(offset, y, "x", color="0.4", label="start (prior mean), right")
     left.set(xscale="log", xlabel="relative standard deviation (%)",
              yticks=y, yticklabels=[_label(n) for n in names])  # fmt: skip
-    left.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    left.xaxis.set_major_locator(LogLocator())
     left.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     left.xaxis.set_minor_formatter(NullFormatter())
     right.axvline(0, color="0.7", lw=1, zorder=0)
@@ -166,8 +166,8 @@ def chord_figure(record: Record) -> Figure:
         axes.set_axisbelow(True)
     handles, labels = left.get_legend_handles_labels()
     start = right.get_legend_handles_labels()
-    figure.legend([*handles, start[0][0]], [*labels, start[1][0]], loc="outside lower center",
-                  ncols=3, fontsize=8, frameon=False)  # fmt: skip
+    figure.legend([*handles, start[0][0]], [*labels, start[1][0]], loc="outside right upper",
+                  fontsize=8, frameon=False)  # fmt: skip
     figure.suptitle("What is known of the chordae and leaflets before and after (simulated)")
     return figure
 
