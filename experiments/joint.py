@@ -16,8 +16,9 @@ from experiments.whole_cycle import (
     bound_entry,
     closed_frame,
     cycle_model,
+    frames_on_mesh,
+    shift_by_mesh,
     stored_cycle,
-    stored_frames,
 )
 from mvest.cycle import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
@@ -30,9 +31,7 @@ from mvest.estimation import (
     Transform,
     identifiability,
     nees,
-    shift_by_model_error,
 )
-from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 
 __all__ = ["run_joint_study"]
@@ -68,12 +67,15 @@ def run_joint_study(
     ]
     bound = np.array(bounds[1]["std"], dtype=float)
 
-    exact = study.sequential(CycleObservation.simulated(frames, 0.0, _rng(config, 0), told))
+    exact_seen = CycleObservation.simulated(frames, 0.0, _rng(config, 0), told)
+    exact = study.sequential(exact_seen)
     _tell("no noise", exact.estimate, truth)
     seeds: list[Estimate] = []
     first: SequentialEstimate | None = None
-    for k in range(settings["seeds"]):
-        observation = CycleObservation.simulated(frames, noise, _rng(config, k))
+    observations = [
+        CycleObservation.simulated(frames, noise, _rng(config, k)) for k in range(settings["seeds"])
+    ]
+    for k, observation in enumerate(observations):
         if first is None:
             first = study.sequential(observation)
             seeds.append(first.estimate)
@@ -82,12 +84,12 @@ def run_joint_study(
             seeds.append(study.batch(observation, seeds[0].mean))
         _tell(f"seed {k}", seeds[-1], truth)
     assert first is not None
-    finer = _frames_on_mesh(config, truth, "finer")
+    finer = frames_on_mesh(config, truth, "finer")
     seen_finer = CycleObservation.simulated(finer, noise, _rng(config, 0))
     other = study.batch(seen_finer, seeds[0].mean)
     _tell("finer truth", other, truth)
     # What the estimator can know of its mesh's error: its own frames on another mesh.
-    check = _frames_on_mesh(config, other.mean, "check")
+    check = frames_on_mesh(config, other.mean, "check")
     off = check - study.seen(other.mean).y.reshape(frames.shape)
 
     errors = np.array([e.mean / truth - 1 for e in seeds if e.converged])
@@ -102,17 +104,20 @@ def run_joint_study(
         "told_mm": told,
         "vertices": int(frames.shape[1]),
         "bounds": bounds,
-        "exact": _entry(exact.estimate, truth) | {"frames": study.path(exact)},
-        "seeds": [_entry(e, truth) | {"seed": config["seed"] + k} for k, e in enumerate(seeds)],
+        "exact": _entry(exact.estimate, truth, exact_seen) | {"frames": study.path(exact)},
+        "seeds": [
+            _entry(e, truth, observation) | {"seed": config["seed"] + k}
+            for k, (e, observation) in enumerate(zip(seeds, observations, strict=True))
+        ],
         "first": study.path(first),
         "passes": _passes(first.estimate, truth),
         "rms_over_bound": (np.sqrt(np.mean(errors**2, axis=0)) / bound).tolist(),
-        "finer": _entry(other, truth)
+        "finer": _entry(other, truth, seen_finer)
         | {
             "cells": [settings["finer_columns"], settings["finer_rows"]],
             "distance_mm": float(np.linalg.norm(finer - frames, axis=2).mean()),
         },
-        "told": _entry(other, truth)
+        "told": _entry(other, truth, seen_finer)
         | _with_mesh_error(study, other, seen_finer, off)
         | {"cells": [settings["check_columns"], settings["check_rows"]]},
     }
@@ -182,28 +187,14 @@ def _with_mesh_error(
     study: _Study, found: Estimate, observation: CycleObservation, off: FloatArray
 ) -> dict[str, Any]:
     """An estimate whose model is ``off (f, n, 3)`` mm, and how far that may have moved it."""
-    z = study.transform.forward(found.mean)
-    H = study.seen(found.mean).jacobian * study.transform.derivative(z)
-    prior = to_filter(study.transform, study.prior)
-    shift = shift_by_model_error(H, observation.R, off[observation.seen].ravel(), prior)
+    shift = shift_by_mesh(found, study.seen(found.mean), study.prior, observation, off)
+    scale = study.transform.derivative(study.transform.forward(found.mean)) / study.truth
     covariance = found.transformed.covariance + np.outer(shift, shift)
-    scale = study.transform.derivative(z) / study.truth
     return {
         "shift": (shift * scale).tolist(),
         "std": (np.sqrt(np.diag(covariance)) * scale).tolist(),
         "distance_mm": float(np.linalg.norm(off, axis=2).mean()),
     }
-
-
-def _frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
-    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh."""
-    settings = config["cycle"]
-    cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
-    points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
-    mechanics = {**config["mechanics"], "contact_points": points}
-    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
-    dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
-    return stored_frames(changed, cycle_model(changed, dt=dt), m)
 
 
 def _passes(found: Estimate, truth: FloatArray) -> list[dict[str, Any]]:
@@ -212,9 +203,8 @@ def _passes(found: Estimate, truth: FloatArray) -> list[dict[str, Any]]:
     return [{"error": (m / truth - 1).tolist(), "std": (s / truth).tolist()} for m, s in pairs]
 
 
-def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:
+def _entry(found: Estimate, truth: FloatArray, seen: CycleObservation) -> dict[str, Any]:
     error = found.mean - truth
-    summary = found.innovation
     return {
         "status": "converged" if found.converged else "failed",
         "reason": found.reason.value,
@@ -224,7 +214,7 @@ def _entry(found: Estimate, truth: FloatArray) -> dict[str, Any]:
         "nees": nees(error, found.covariance),
         "iterations": found.iterations,
         "runs": found.forward_solves,
-        "residual_mm": None if summary is None else summary.rms,
+        "residual_mm": found.residual_rms(seen.y),
     }
 
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from experiments.build import build_filter, mechanics_of, template_of
 from experiments.gate import forward_record
-from experiments.whole_cycle import cycle_model
+from experiments.whole_cycle import cycle_model, frames_on_mesh, shift_by_mesh, stored_cycle
 from mvest.cycle import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
-from mvest.estimation import Estimate, IteratedFilter
+from mvest.estimation import Estimate, Gaussian, IteratedFilter
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.field import FieldBasis, StiffPatch
 from mvest.typing import FloatArray
@@ -49,7 +49,7 @@ def run_patch_study(
         frames = _truth(config, patches)
         rng = np.random.default_rng(config["seed"])
         observation = CycleObservation.simulated(frames, noise, rng)
-        seen = seen or observation.of(model)
+        seen = seen or observation.of(stored_cycle(config, model))
         filter_ = IteratedFilter(
             config["filter"]["tolerance"],
             max_iterations=config["filter"]["max_iterations"],
@@ -65,8 +65,10 @@ def run_patch_study(
             "estimate": found.mean.tolist(),
             "std": found.transformed.std.tolist(),
             "runs": found.forward_solves,
-            "residual_mm": None if found.innovation is None else found.innovation.rms,
-            **leaflet.compared(found, bool(patches)),
+            "residual_mm": found.residual_rms(observation.y),
+            **leaflet.compared(
+                found, _mesh_shift(config, found, seen, prior, observation), bool(patches)
+            ),
         }
         start = found.mean
     truth = np.array(config["truth"]["values"], dtype=float)
@@ -88,6 +90,20 @@ def run_patch_study(
         record |= {"status": "failed", "reason": failed[0]["reason"]}
     record["seconds"] = record["seconds_total"] = time.time() - started
     return record, []
+
+
+def _mesh_shift(
+    config: Values,
+    found: Estimate,
+    seen: SeenFrames,
+    prior: Gaussian,
+    observation: CycleObservation,
+) -> FloatArray:
+    """How far the estimator's mesh moves its estimate, from one run on another mesh."""
+    predicted = seen(found.mean)
+    check = frames_on_mesh(config, found.mean, "check")
+    off = check - predicted.y.reshape(check.shape)
+    return shift_by_mesh(found, predicted, prior, observation, off)
 
 
 def _patch(config: Values) -> StiffPatch:
@@ -171,11 +187,15 @@ class _Leaflet:
             "triangles": self.triangles.tolist(),
         }
 
-    def compared(self, found: Estimate, has_patch: bool) -> dict[str, Any]:
-        """The modulus that was found beside the true one."""
+    def compared(self, found: Estimate, shift: FloatArray, has_patch: bool) -> dict[str, Any]:
+        """The modulus that was found beside the true one.
+
+        Standard deviations are of the noise and of the ``shift (p,)`` by the mesh.
+        """
         z = found.transformed
         log = self.rows @ z.mean
-        std = np.sqrt(np.einsum("ij,jk,ik->i", self.rows, z.covariance, self.rows))
+        noise = np.sqrt(np.einsum("ij,jk,ik->i", self.rows, z.covariance, self.rows))
+        std = np.hypot(noise, self.rows @ shift)
         raised = self.patch.log_scale(self.points)
         truth = self.log_base + (raised if has_patch else np.zeros_like(raised))
         distance = np.linalg.norm(self.points - np.array(self.patch.centre), axis=1)
@@ -196,4 +216,6 @@ class _Leaflet:
             "outside": float(np.exp(np.average(log[outside], weights=weight[outside]))),
             "rms_log_error": float(np.sqrt(np.sum(weight * error**2))),
             "within_two_std": float(np.sum(weight[np.abs(error) <= 2 * std])),
+            "noise_log_std_at_centre": float(noise[middle]),
+            "within_two_noise_std": float(np.sum(weight[np.abs(error) <= 2 * noise])),
         }

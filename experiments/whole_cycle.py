@@ -11,13 +11,28 @@ import numpy as np
 from experiments.gate import model_of
 from experiments.mirror import build
 from experiments.truth import StoredModel, truth_key
-from mvest.cycle import CycleModel, CycleProtocol
+from mvest.cycle import CycleModel, CycleObservation, CycleProtocol
 from mvest.errors import ConfigurationError
-from mvest.estimation import Identifiability, Prediction
+from mvest.estimation import (
+    Estimate,
+    Gaussian,
+    Identifiability,
+    Prediction,
+    shift_by_model_error,
+)
+from mvest.estimation.transform import to_filter
 from mvest.gate import GateCase
 from mvest.typing import FloatArray
 
-__all__ = ["bound_entry", "closed_frame", "cycle_model", "stored_cycle", "stored_frames"]
+__all__ = [
+    "bound_entry",
+    "closed_frame",
+    "cycle_model",
+    "frames_on_mesh",
+    "shift_by_mesh",
+    "stored_cycle",
+    "stored_frames",
+]
 
 Values = Mapping[str, Any]
 
@@ -67,6 +82,34 @@ def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArra
 
     found = StoredModel(positions, _store(config), _key(config, model))(m)
     return found.y.reshape(len(model.protocol.times), -1, 3)
+
+
+def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
+    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh."""
+    settings = config["cycle"]
+    cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
+    points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
+    mechanics = {**config["mechanics"], "contact_points": points}
+    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
+    dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
+    return stored_frames(changed, cycle_model(changed, dt=dt), m)
+
+
+def shift_by_mesh(
+    found: Estimate,
+    predicted: Prediction,
+    prior: Gaussian,
+    observation: CycleObservation,
+    off: FloatArray,
+) -> FloatArray:
+    """How far a model whose frames are ``off (f, n, 3)`` mm moves an estimate, ``(p,)``.
+
+    In the filter's coordinates; ``predicted`` is what the model says of the observation at the
+    estimate, with its derivative.
+    """
+    H = predicted.jacobian * found.transform.derivative(found.transform.forward(found.mean))
+    wanted = off[observation.seen].ravel()
+    return shift_by_model_error(H, observation.R, wanted, to_filter(found.transform, prior))
 
 
 def _store(config: Values) -> Path:

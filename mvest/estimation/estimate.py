@@ -150,6 +150,12 @@ class Estimate:
         """Number of updates, one less than the number of iterates."""
         return len(self.transformed_iterates) - 1
 
+    def residual_rms(self, y: FloatArray) -> float | None:
+        """Root mean square of y (n,) less what is predicted at the estimate, in its units."""
+        if self.prediction is None:
+            return None
+        return float(np.sqrt(np.mean((y - self.prediction.y) ** 2)))
+
     @property
     def iterates(self) -> FloatArray:
         """Parameters at each iterate (k, p)."""

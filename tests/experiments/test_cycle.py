@@ -82,6 +82,9 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
     np.testing.assert_allclose(record["rms_over_bound"], expected)
     # Another mesh is another truth.
     assert record["finer"]["distance_mm"] > 1e-3
+    # What is left of the observation is its noise.
+    assert all(0.009 < entry["residual_mm"] < 0.011 for entry in record["seeds"])
+    assert record["exact"]["residual_mm"] < 1e-3
     # Meshes this coarse tell by far more than the noise, and the estimate says so.
     finer, told = record["finer"], record["told"]
     assert told["distance_mm"] > finer["distance_mm"] > 0
