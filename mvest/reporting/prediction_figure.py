@@ -175,7 +175,12 @@ def _draw_measures(part: Any, record: Record) -> None:
         panel.spines[["top", "right"]].set_visible(False)
     first = panels[0]
     first.errorbar(
-        [], [], yerr=[], fmt="o", color=COLOURS[0], label="estimate, 95 % interval (drawn above)"
+        [],
+        [],
+        yerr=[],
+        fmt="o",
+        color=COLOURS[0],
+        label="estimate (drawn above), 95 %: thick samples, thin with the mesh",
     )
     first.errorbar([], [], yerr=[], fmt="o", color=OTHER, label="further simulated patients")
     first.plot([], [], "x", color=COLOURS[1], ls="none", label="true valve (its own mesh)")
