@@ -393,7 +393,7 @@ class DesignsConfig:
 
     pressures_mmHg: list[float] = field(default_factory=lambda: [60.0])  # of one closed frame more
     cycle_times: list[float] = field(default_factory=list)  # s, observed in a whole cycle
-    cycle_dt: float = 0.05  # s
+    cycle_dt: float = 0.003125  # s
     noise_mm: list[float] = field(default_factory=lambda: [0.1, 0.25, 0.5, 1.0])
     typical_mm: float = 0.5  # noise of profiles and of what tables say at one noise
     correlation_length_mm: float = 5.0

@@ -21,6 +21,7 @@ COLUMNS, ROWS = 16, 5
 TINY = (
     "designs.pressures_mmHg=[4.0]",
     "designs.cycle_times=[0.05,0.1]",
+    "designs.cycle_dt=0.05",
     "designs.points=2",
     "designs.followed=[{vertices: all, pressures_mmHg: [4.0, 5.0], label: two}]",
     "designs.known=[chord_stiffness,pressure_scale]",
