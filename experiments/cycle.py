@@ -21,7 +21,7 @@ from experiments.whole_cycle import (
     stored_frames,
 )
 from mvest.cycle import Beats, CycleModel, CycleObservation
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import DriftSmoother, Log, Trajectory, identifiability
 from mvest.typing import FloatArray
 
@@ -117,27 +117,41 @@ def _curve(model: CycleModel) -> dict[str, list[float]]:
 def _time_steps(config: Values, truth: FloatArray) -> dict[str, Any]:
     """What depends on the time step: the frames, and how smoothly they follow the parameters."""
     dts: list[float] = config["cycle"]["time_steps"]
+    if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
+        raise ConfigurationError(
+            f"cycle.time_steps = {dts}, expected each to be half of the one before"
+        )
     path = np.tile(truth, (config["cycle"]["path_steps"] + 1, 1))
     path[:, 0] *= np.linspace(1.0, 1.0 + config["cycle"]["drift"], len(path))
-    found, changes = [], []
+    found, along = [], []
     for dt in dts:
-        model = cycle_model(config, dt=dt)
-        along = [stored_frames(config, model, m) for m in path]
-        found.append(along[0])
-        changes.append([_rms(b - a) for a, b in pairwise(along)])
-        uneven = max(changes[-1]) / np.median(changes[-1])
-        print(f"time step {dt:g} s: unevenness {uneven:.1f}", file=sys.stderr, flush=True)
-    halved = [b - a for a, b in pairwise(found)]
-    whole = [_rms(change) for change in halved]
+        frames, reason = _followed(config, cycle_model(config, dt=dt), path)
+        found.append(frames[0] if frames else None)
+        changes = [_rms(b - a) for a, b in pairwise(frames)]
+        along.append({"rms_mm": changes, "reason": reason})
+        told = reason or f"unevenness {max(changes) / np.median(changes):.1f}"
+        print(f"time step {dt:g} s: {told}", file=sys.stderr, flush=True)
+    halved = [None if a is None or b is None else b - a for a, b in pairwise(found)]
+    whole = [None if change is None else _rms(change) for change in halved]
     return {
         "dt": dts,
-        "mean_mm": [np.linalg.norm(change, axis=2).mean(axis=1).tolist() for change in halved],
         "rms_mm": whole,
-        "order": [float(np.log2(a / b)) for a, b in pairwise(whole)],
+        "order": [None if not (a and b) else float(np.log2(a / b)) for a, b in pairwise(whole)],
         "path": path.tolist(),
-        "path_rms_mm": changes,
+        "along": along,
         "runs": len(dts) * len(path),
     }
+
+
+def _followed(config: Values, model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], str]:
+    """Frames of the parameters along a path, up to the first that has none, and why it has none."""
+    frames: list[FloatArray] = []
+    try:
+        for m in path:
+            frames.append(stored_frames(config, model, m))
+    except InputError as error:
+        return frames, str(error)
+    return frames, ""
 
 
 def _rms(values: FloatArray) -> float:

@@ -17,7 +17,7 @@ from experiments.whole_cycle import (
     closed_frame,
     cycle_model,
     frames_on_mesh,
-    shift_by_mesh,
+    shift_by_check_mesh,
     stored_cycle,
 )
 from mvest.cycle import CycleObservation, SeenFrames
@@ -88,10 +88,6 @@ def run_joint_study(
     seen_finer = CycleObservation.simulated(finer, noise, _rng(config, 0))
     other = study.batch(seen_finer, seeds[0].mean)
     _tell("finer truth", other, truth)
-    # What the estimator can know of its mesh's error: its own frames on another mesh.
-    check = frames_on_mesh(config, other.mean, "check")
-    off = check - study.seen(other.mean).y.reshape(frames.shape)
-
     errors = np.array([e.mean / truth - 1 for e in seeds if e.converged])
     runs = [exact.estimate, *seeds, other]
     record = forward_record(
@@ -117,9 +113,7 @@ def run_joint_study(
             "cells": [settings["finer_columns"], settings["finer_rows"]],
             "distance_mm": float(np.linalg.norm(finer - frames, axis=2).mean()),
         },
-        "told": _entry(other, truth, seen_finer)
-        | _with_mesh_error(study, other, seen_finer, off)
-        | {"cells": [settings["check_columns"], settings["check_rows"]]},
+        "told": _with_mesh_error(config, study, other, seen_finer),
     }
     failed = [e for e in runs if not e.converged]
     if failed:
@@ -184,16 +178,22 @@ class _Study:
 
 
 def _with_mesh_error(
-    study: _Study, found: Estimate, observation: CycleObservation, off: FloatArray
+    config: Values, study: _Study, found: Estimate, observation: CycleObservation
 ) -> dict[str, Any]:
-    """An estimate whose model is ``off (f, n, 3)`` mm, and how far that may have moved it."""
-    shift = shift_by_mesh(found, study.seen(found.mean), study.prior, observation, off)
+    """The estimate with how far its mesh may have moved it, each parameter for itself."""
+    cells = [config["cycle"]["check_columns"], config["cycle"]["check_rows"]]
+    told = shift_by_check_mesh(config, found, study.seen, study.prior, observation)
+    if isinstance(told, str):
+        return {"status": "failed", "reason": told, "cells": cells}
     scale = study.transform.derivative(study.transform.forward(found.mean)) / study.truth
-    covariance = found.transformed.covariance + np.outer(shift, shift)
-    return {
-        "shift": (shift * scale).tolist(),
+    covariance = found.transformed.covariance + np.diag(told.shift**2)
+    offset = found.transformed.mean - study.transform.forward(study.truth)
+    return _entry(found, study.truth, observation) | {
+        "shift": (told.shift * scale).tolist(),
         "std": (np.sqrt(np.diag(covariance)) * scale).tolist(),
-        "distance_mm": float(np.linalg.norm(off, axis=2).mean()),
+        "nees": nees(offset, covariance),
+        "distance_mm": told.distance_mm,
+        "cells": cells,
     }
 
 

@@ -105,7 +105,7 @@ def run_prediction(config: Values, config_hash: str, folder: Path, started: floa
     record |= _summary(first)
     record["forward_solves"] = sum(
         (p.result.filtered.forward_solves if p.result.filtered else 0)
-        + sum(1 + len(s.samples) for s in p.scenarios.values())
+        + sum(1 + len(s.samples) + (s.finer is not None) for s in p.scenarios.values())
         for p in patients
     )
     names = sorted({name for p in patients for s in p.scenarios.values() for name in _names(s)})

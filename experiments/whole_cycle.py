@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,12 @@ from experiments.gate import model_of
 from experiments.mirror import build
 from experiments.truth import StoredModel, truth_key
 from mvest.cycle import CycleModel, CycleObservation, CycleProtocol
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import (
     Estimate,
     Gaussian,
     Identifiability,
+    ObservationModel,
     Prediction,
     shift_by_model_error,
 )
@@ -25,11 +27,12 @@ from mvest.gate import GateCase
 from mvest.typing import FloatArray
 
 __all__ = [
+    "MeshShift",
     "bound_entry",
     "closed_frame",
     "cycle_model",
     "frames_on_mesh",
-    "shift_by_mesh",
+    "shift_by_check_mesh",
     "stored_cycle",
     "stored_frames",
 ]
@@ -85,7 +88,16 @@ def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArra
 
 
 def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
-    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh."""
+    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh.
+
+    Cells and contact points are those of ``cycle.finer_...`` or ``cycle.check_...``, the time step
+    is shorter by ``cycle.finer_dt_factor``.
+
+    Raises
+    ------
+    InputError
+        If the cycle cannot be followed to its end.
+    """
     settings = config["cycle"]
     cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
     points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
@@ -95,21 +107,45 @@ def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
     return stored_frames(changed, cycle_model(changed, dt=dt), m)
 
 
-def shift_by_mesh(
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshShift:
+    """What a model's own mesh does to an estimate.
+
+    Attributes
+    ----------
+    shift : (p,)
+        Of the estimate, in the filter's coordinates.
+    distance_mm : float
+        Mean distance of what is seen on the two meshes.
+    """
+
+    shift: FloatArray
+    distance_mm: float
+
+
+def shift_by_check_mesh(
+    config: Values,
     found: Estimate,
-    predicted: Prediction,
+    model: ObservationModel,
     prior: Gaussian,
     observation: CycleObservation,
-    off: FloatArray,
-) -> FloatArray:
-    """How far a model whose frames are ``off (f, n, 3)`` mm moves an estimate, ``(p,)``.
+) -> MeshShift | str:
+    """How far its mesh may have moved an estimate, from one run of it on the "check" mesh.
 
-    In the filter's coordinates; ``predicted`` is what the model says of the observation at the
-    estimate, with its derivative.
+    ``model`` predicts what is seen in the observation, ``prior`` is of the parameters themselves. A
+    reason where there is no estimate or the cycle cannot be followed on that mesh.
     """
+    if not found.converged:
+        return f"no estimate: {found.reason.value}"
+    predicted = model(found.mean)
+    try:
+        check = frames_on_mesh(config, found.mean, "check")
+    except InputError as error:
+        return f"on the mesh of the check: {error}"
+    off = check[observation.seen].ravel() - predicted.y
     H = predicted.jacobian * found.transform.derivative(found.transform.forward(found.mean))
-    wanted = off[observation.seen].ravel()
-    return shift_by_model_error(H, observation.R, wanted, to_filter(found.transform, prior))
+    shift = shift_by_model_error(H, observation.R, off, to_filter(found.transform, prior))
+    return MeshShift(shift, float(np.linalg.norm(off.reshape(-1, 3), axis=1).mean()))
 
 
 def _store(config: Values) -> Path:

@@ -22,13 +22,11 @@ from mvest.estimation.iterated import ROUND_OFF
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.run import require_settings
+from mvest.estimation.sequential import HALVINGS
 from mvest.estimation.transform import Identity, Transform, to_filter
 from mvest.typing import FloatArray
 
 __all__ = ["DriftEstimate", "DriftSmoother", "FrameModel"]
-
-HALVINGS = 6
-"""How often a pass that does not lower the objective is shortened by half."""
 
 
 class FrameModel(Protocol):
@@ -47,11 +45,14 @@ class DriftEstimate:
     ----------
     transform : Transform
     states : tuple of FrameState, (f,)
-        The filter's, in filter coordinates, linearised at the smoothed trajectory.
+        The filter's, in filter coordinates, linearised at the last trajectory at which the model
+        was run; empty if it failed before there was one.
     extended : tuple of FrameState, (f,)
-        The first pass, linearised at what was predicted of each frame when it came.
-    smoothed : Trajectory
-        In filter coordinates.
+        The first pass, linearised at what was predicted of each frame when it came; fewer if the
+        model failed in it.
+    smoothed : Trajectory or None
+        In filter coordinates. Where the smoother has not converged, its mean is the last
+        trajectory that lowered the objective; None if the model failed before there was one.
     reason : Reason
     detail : str
     forward_solves : int
@@ -86,7 +87,8 @@ class DriftSmoother:
     A pass filters the linearised frames and smooths backwards (see `smooth_frames`). The first one
     linearises each frame at its prediction (the extended Kalman smoother), further ones at the
     last trajectory: Gauss-Newton on J (Bell 1994, SIAM J. Optim. 4:626). A pass that does not lower
-    J, or ends where the model cannot follow, is halved.
+    J, or ends where the model cannot follow, is halved. Where the model cannot follow to the end of
+    the first one, the search begins at the prior's mean in all frames.
 
     Attributes
     ----------
@@ -123,12 +125,13 @@ class DriftSmoother:
         """Smooth; ``initial`` is N(m, P) of the parameters themselves at the first frame."""
         run = _DriftRun(self, model, initial, y, R, Identity() if transform is None else transform)
         failure = run.extend()
-        if failure is None:
-            point = run.linearise(smooth_frames(run.extended).mean)
-            failure = point if isinstance(point, str) else None
         if failure is not None:
             return run.finish(Reason.MODEL_FAILED, failure)
-        assert isinstance(point, _Path)
+        point = run.linearise(smooth_frames(run.extended).mean)
+        if isinstance(point, str):
+            point = run.linearise(np.tile(run.prior.mean, (len(self.sizes), 1)))
+        if isinstance(point, str):
+            return run.finish(Reason.MODEL_FAILED, point)
         objectives = [point.objective]
         for passes in range(1, self.max_iterations + 2):
             states = filter_frames(run.prior, point.frames, run.Q)
@@ -152,6 +155,9 @@ class DriftSmoother:
                 break
             point = found
             objectives.append(point.objective)
+        if not reason.converged:
+            # Its step has not been tried, or was refused.
+            smoothed = Trajectory(point.mean, smoothed.covariance)
         return run.finish(reason, detail, states, smoothed, tuple(objectives))
 
 

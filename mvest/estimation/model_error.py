@@ -22,8 +22,9 @@ def shift_by_model_error(
         b = (Hᵀ R⁻¹ H + P⁻¹)⁻¹ Hᵀ R⁻¹ offset
 
     the update of Gauss-Newton with the offset for an innovation. The offset of a mesh is the
-    prediction of a finer one less its own, at the estimate; b with an unknown sign and size, as
-    b bᵀ added to the posterior's covariance, tells how far the estimate depends on the mesh.
+    prediction of a finer one less its own, at the estimate. Its size is some measure of what
+    another mesh does, its direction is not: b bᵀ added to the posterior's covariance would leave
+    the estimate as sure as before across b, diag(b²) takes each part of b for an error of its own.
 
     Parameters
     ----------

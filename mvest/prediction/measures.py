@@ -17,7 +17,14 @@ from mvest.valve.closure import coaptation_area, coaptation_length
 from mvest.valve.gap import find_gap
 from mvest.valve.measurements import measure_tenting
 
-__all__ = ["MEASURES", "Measured", "contact_reach", "meaning_of", "measure_closed"]
+__all__ = [
+    "MEASURES",
+    "NEVER_NEGATIVE",
+    "Measured",
+    "contact_reach",
+    "meaning_of",
+    "measure_closed",
+]
 
 Measured = dict[str, float]
 """Name with its unit -> number."""
@@ -42,6 +49,10 @@ MEASURES = {
     "on the mesh",
 }
 """Meaning by name; {} stands for a leaflet."""
+
+NEVER_NEGATIVE = ("gap_", "coaptation_", "ap_diameter_", "annulus_", "stress_")
+"""Beginnings of names of measures that have no negative values: areas, lengths, and the highest
+tension of a leaflet that is under pressure."""
 
 
 def meaning_of(name: str) -> str:

@@ -11,8 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mvest.reporting.figures import COLOURS, MARKERS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.figures import COLOURS, MARKERS, write_study
 
 __all__ = ["chord_figure", "chord_text", "write_chord"]
 
@@ -173,11 +172,5 @@ def chord_figure(record: Record) -> Figure:
 
 
 def write_chord(folder: Path, record: Record) -> list[Path]:
-    """``chord.csv``, ``chord.md`` and the figure in ``folder``."""
-    table = _table(record)
-    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_with(folder / "chord.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "chord.md", text),
-        *save_figure(folder / "chord", chord_figure(record), record),
-    ]
+    """Table, words and figure, named after the experiment."""
+    return write_study(folder, record, _table(record), _words(record), chord_figure(record))

@@ -11,9 +11,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mvest.reporting.figures import COLOURS, MARKERS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.figures import COLOURS, MARKERS, write_study
 from mvest.reporting.joint import parameter_label
+from mvest.reporting.markup import number
 
 __all__ = ["cycle_figure", "cycle_text", "write_cycle"]
 
@@ -37,6 +37,12 @@ def _table(record: Record) -> pd.DataFrame:
     )  # fmt: skip
 
 
+def _unevenness(along: Mapping[str, Any]) -> str:
+    if along["reason"]:
+        return f"not followed: {along['reason']}"
+    return f"{max(along['rms_mm']) / np.median(along['rms_mm']):.1f}"
+
+
 def _words(record: Record) -> str:
     names = [parameter_label(name) for name in record["parameters"]]
     lines = [
@@ -57,20 +63,20 @@ def _words(record: Record) -> str:
         f"with {record['noise_mm']:g} mm noise per coordinate on {record['vertices']} vertices per "
         f"frame, no prior. Everything is simulated.",
         "",
-        f"| time step | RMS change of all frames when it is halved | largest change over the "
-        f"median one, along {len(steps['path']) - 1} equal steps of the {names[0]} from "
+        f"| time step | RMS change of all frames when it is halved | order | largest change over "
+        f"the median one, along {len(steps['path']) - 1} equal steps of the {names[0]} from "
         f"{steps['path'][0][0]:.2f} to {steps['path'][-1][0]:.2f} MPa |",
-        "|---|---|---|",
+        "|---|---|---|---|",
     ]
     for k, dt in enumerate(steps["dt"]):
-        change = f"{steps['rms_mm'][k]:.3f} mm" if k < len(steps["rms_mm"]) else ""
-        along = steps["path_rms_mm"][k]
-        lines.append(f"| {1e3 * dt:g} ms | {change} | {max(along) / np.median(along):.1f} |")
+        change = number(steps["rms_mm"][k]) + " mm" if k < len(steps["rms_mm"]) else ""
+        order = number(steps["order"][k]) if k < len(steps["order"]) else ""
+        lines.append(f"| {1e3 * dt:g} ms | {change} | {order} | {_unevenness(steps['along'][k])} |")
     lines += [
         "",
         "Where the last column is large, frames jump: a fast motion of a leaflet falls into a time "
-        "step that leaps over it to one side or the other, and no filter that linearises can use "
-        "such frames.",
+        "step that leaps over it to one side or the other. A filter that linearises can then end "
+        "anywhere between the jumps, or nowhere.",
     ]
     if drift["status"] == "converged":
         filter_, smoother = drift["filter"], drift["smoother"]
@@ -167,11 +173,5 @@ def _draw_drift(axes: Axes, record: Record) -> None:
 
 
 def write_cycle(folder: Path, record: Record) -> list[Path]:
-    """``cycle.csv``, ``cycle.md`` and the figure ``cycle``."""
-    table = _table(record)
-    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_with(folder / "cycle.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "cycle.md", text),
-        *save_figure(folder / "cycle", cycle_figure(record), record),
-    ]
+    """Table, words and figure, named after the experiment."""
+    return write_study(folder, record, _table(record), _words(record), cycle_figure(record))

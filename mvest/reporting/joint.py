@@ -11,8 +11,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mvest.reporting.figures import COLOURS, MARKERS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.estimation.diagnostics import chi_square_band
+from mvest.reporting.figures import COLOURS, MARKERS, write_study
 
 __all__ = ["joint_figure", "joint_text", "parameter_label", "write_joint"]
 
@@ -44,7 +44,8 @@ def _table(record: Record) -> pd.DataFrame:
     cases = [("no noise", record["exact"])]
     cases += [(f"noise, seed {entry['seed']}", entry) for entry in record["seeds"]]
     cases.append(("noise, truth on a finer mesh", record["finer"]))
-    cases.append(("the same, with the mesh's error", record["told"]))
+    if record["told"]["status"] == "converged":
+        cases.append(("the same, with the mesh's error", record["told"]))
     bound = record["bounds"][-1]["std"]
     rows = []
     for case, entry in cases:
@@ -88,16 +89,14 @@ def _words(record: Record) -> str:
         f"| error, truth on {finer['cells'][0]} x {finer['cells'][1]} cells and half the time step "
         f"| {' | '.join(_percent(v, '+.2f') for v in finer['error'])} |",
         f"| std that the filter told of it | {' | '.join(_percent(v) for v in finer['std'])} |",
-        f"| shift by its own mesh, from one run on a third mesh | "
-        f"{' | '.join(_percent(v, '+.2f') for v in told['shift'])} |",
-        f"| std with that shift | {' | '.join(_percent(v) for v in told['std'])} |",
+        *_mesh_rows(told),
         "",
         f"{len(record['times'])} frames of {record['vertices']} vertices; noise of "
         f"{record['noise_mm']:g} mm per coordinate. Everything is simulated.",
         f"Without noise: largest error {100 * worst:.3f} %, target {100 * EXACT_LIMIT:g} %: "
         f"{'met' if worst <= EXACT_LIMIT else 'missed'}. "
         f"With noise: largest ratio to the bound {max(ratio):.2f}, target {NOISE_LIMIT:g}: "
-        f"{'met' if max(ratio) <= NOISE_LIMIT else 'missed'}.",
+        f"{'met' if max(ratio) <= NOISE_LIMIT else 'missed'}. {_band_words(record)}",
         _two_frames(record),
         _first_pass(record),
         _other_mesh(record),
@@ -105,22 +104,45 @@ def _words(record: Record) -> str:
     return "\n".join(lines)
 
 
+def _mesh_rows(told: Record) -> list[str]:
+    if told["status"] != "converged":
+        return []
+    return [
+        f"| shift by its own mesh, from one run on a third mesh | "
+        f"{' | '.join(_percent(v, '+.2f') for v in told['shift'])} |",
+        f"| std with that shift | {' | '.join(_percent(v) for v in told['std'])} |",
+    ]
+
+
 def _other_mesh(record: Record) -> str:
     finer, told = record["finer"], record["told"]
-    with_it, without = (", ".join(f"{v:+.1f}" for v in _in_std(entry)) for entry in (told, finer))
-    return (
+    apart = (
         f"Where the truth comes from another mesh, the frames of the two meshes are "
         f"{finer['distance_mm']:.2f} mm apart (mean) at the same parameters, and the first "
-        f"standard deviations know nothing of it. The second do: the estimator runs its own "
-        f"estimate once on a third mesh ({told['cells'][0]} x {told['cells'][1]} cells, half the "
-        f"time step, {told['distance_mm']:.2f} mm apart), and by how much that would shift the "
-        f"estimate is taken for one more error. Errors over these standard deviations: {with_it} "
-        f"(without: {without})."
+        f"standard deviations know nothing of it"
+    )
+    if told["status"] != "converged":
+        return f"{apart}; what the estimator's own mesh may shift is not known ({told['reason']})."
+    with_it, without = (", ".join(f"{v:+.1f}" for v in _in_std(entry)) for entry in (told, finer))
+    return (
+        f"{apart}. The second do: the estimator runs its own estimate once on a third mesh, finer "
+        f"than the truth's ({told['cells'][0]} x {told['cells'][1]} cells, half the time step, "
+        f"{told['distance_mm']:.2f} mm apart), and by how much that would shift each parameter is "
+        f"taken for one more error of it. Errors over these standard deviations: {with_it}, "
+        f"normalised squared error {told['nees']:.1f} for {len(told['std'])} parameters (without: "
+        f"{without}, {finer['nees']:.0f})."
     )
 
 
 def _in_std(entry: Mapping[str, Any]) -> list[float]:
     return [e / s for e, s in zip(entry["error"], entry["std"], strict=True)]
+
+
+def _band_words(record: Record) -> str:
+    """Where ratios to the bound lie if errors are normal with just that size."""
+    n = len(record["seeds"])
+    low, high = np.sqrt(np.array(chi_square_band(n)) / n)
+    return f"With {n} seeds a ratio lies between {low:.2f} and {high:.2f} in 95 % of cases."
 
 
 def _first_pass(record: Record) -> str:
@@ -224,12 +246,5 @@ def _draw_path(
 
 
 def write_joint(folder: Path, record: Record) -> list[Path]:
-    """A table, words and a figure, all named after the experiment."""
-    name = record["experiment"]
-    table = _table(record)
-    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_with(folder / f"{name}.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / f"{name}.md", text),
-        *save_figure(folder / name, joint_figure(record), record),
-    ]
+    """Table, words and figure, named after the experiment."""
+    return write_study(folder, record, _table(record), _words(record), joint_figure(record))

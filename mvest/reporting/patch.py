@@ -13,8 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.figures import write_study
 
 __all__ = ["patch_figure", "patch_text", "write_patch"]
 
@@ -82,7 +81,10 @@ def _words(record: Record) -> str:
     lines = ["| | " + " | ".join(titles[label] for label in results) + " |"]
     lines.append("|---" * (1 + len(results)) + "|")
     for words, key, form in rows:
-        values = " | ".join(f"{entry[key]:{form}}" for entry in results.values())
+        values = " | ".join(
+            "not known" if entry[key] is None else f"{entry[key]:{form}}"
+            for entry in results.values()
+        )
         lines.append(f"| {words} | {values} |")
     cells, own = record["cells_of_truth"], record["model"]["cells"]
     lines += [
@@ -98,6 +100,12 @@ def _words(record: Record) -> str:
         f"{record['noise_mm']:g} mm per coordinate. What is found beside the true modulus comes "
         "from the noise, the other mesh and the field's smoothness. What the estimator's own mesh "
         "may shift is found by one run of the estimate on a third mesh. Everything is simulated.",
+        *(
+            f"{titles[label]}: what the mesh may shift is not known "
+            f"({entry['shift_unknown']}), and standard deviations are of the noise alone."
+            for label, entry in results.items()
+            if entry["shift_unknown"]
+        ),
     ]
     return "\n".join(lines)
 
@@ -155,11 +163,5 @@ def _outline(axes: Axes, mesh: Triangulation, truth: list[float], colour: str) -
 
 
 def write_patch(folder: Path, record: Record) -> list[Path]:
-    """``patch.csv``, ``patch.md`` and the figure in ``folder``."""
-    table = _table(record)
-    text = f"# {record['title']}\n\n{_words(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_with(folder / "patch.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "patch.md", text),
-        *save_figure(folder / "patch", patch_figure(record), record),
-    ]
+    """Table, words and figure, named after the experiment."""
+    return write_study(folder, record, _table(record), _words(record), patch_figure(record))

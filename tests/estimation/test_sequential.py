@@ -283,12 +283,49 @@ class Saturating:
 
 def test_the_drift_smoother_shortens_passes_that_lead_away():
     prior = Gaussian.from_variance(np.array([2.5]), 100.0)
-    found = DriftSmoother((1,) * 3, 0.01, max_iterations=50)(Saturating(), prior, np.zeros(3), 1e-2)
+    model = Saturating()
+    found = DriftSmoother((1,), 0.01, tolerance=1e-9, max_iterations=50)(
+        model, prior, np.zeros(1), 1e-2
+    )
     assert found.converged
     assert found.smoothed is not None
+    # From 2.5 the first pass leads to -6.1 and a full second one to 48, where the model fails; its
+    # half and its quarter raise the objective.
+    assert found.forward_solves > len(found.objectives) + 1
     assert np.all(np.diff(found.objectives) < 0)
-    # The mode is where the prior's pull, 2.5 / 100, is that of three frames of variance 0.01.
-    np.testing.assert_allclose(found.smoothed.mean, 0.0, atol=1e-3)
+    batch = IteratedFilter(tolerance=1e-10, objective_tolerance=1e-16)(
+        lambda m: model.frame(0, m), prior, np.zeros(1), 1e-2
+    )
+    np.testing.assert_allclose(found.smoothed.mean, [batch.mean], atol=1e-9)
+    # The prior's pull is part of the objective: 2.5² / 200 at 0.
+    assert found.objectives[-1] == pytest.approx(batch.objective[-1], rel=1e-6)
+    assert found.objectives[-1] == pytest.approx(0.03125, rel=1e-2)
+
+
+class Mirrored(Saturating):
+    """The same with a derivative of the wrong sign: no step lowers the objective."""
+
+    def frame(self, k: int, m: FloatArray, /) -> Prediction:
+        found = super().frame(k, m)
+        return Prediction(found.y, -found.jacobian) if found.converged else found
+
+
+def test_a_drift_smoother_that_gives_up_returns_what_it_last_accepted():
+    prior = Gaussian.from_variance(np.array([0.5]), 1.0)
+    found = DriftSmoother((1,), 0.01)(Mirrored(), prior, np.zeros(1), 1e-2)
+    assert found.reason is Reason.NO_DECREASE
+    assert found.smoothed is not None
+    z = float(found.smoothed.mean[0, 0])
+    objective = 0.5 * np.arctan(z) ** 2 / 1e-2 + 0.5 * (z - 0.5) ** 2
+    assert objective == pytest.approx(found.objectives[-1])
+    stopped = DriftSmoother((1,), 0.01, max_iterations=1)(
+        Saturating(), Gaussian.from_variance(np.array([2.5]), 100.0), np.zeros(1), 1e-2
+    )
+    assert stopped.reason is Reason.MAX_ITERATIONS
+    assert stopped.smoothed is not None
+    z = float(stopped.smoothed.mean[0, 0])
+    objective = 0.5 * np.arctan(z) ** 2 / 1e-2 + 0.5 * (z - 2.5) ** 2 / 100.0
+    assert objective == pytest.approx(stopped.objectives[-1])
 
 
 def test_parameters_without_a_walk_stay_the_same_in_all_frames():

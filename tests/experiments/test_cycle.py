@@ -6,8 +6,13 @@ import sys
 import numpy as np
 import pytest
 
+from experiments import cycle, whole_cycle
 from experiments.cycle import frame_sets
 from experiments.run import main
+from experiments.whole_cycle import shift_by_check_mesh
+from mvest.cycle import CycleObservation
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
 
 TINY = (
     "mesh.columns=8",
@@ -90,6 +95,7 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
     assert told["distance_mm"] > finer["distance_mm"] > 0
     assert told["error"] == finer["error"]
     np.testing.assert_allclose(np.hypot(told["shift"], finer["std"]), told["std"], rtol=1e-6)
+    assert told["nees"] < finer["nees"]
     assert np.max(np.abs(np.divide(told["shift"], finer["std"]))) > 3
     assert {"joint.csv", "joint.md", "joint.png"} <= {path.name for path in folder.iterdir()}
     assert "target" in said.out
@@ -108,8 +114,9 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     steps = record["steps"]
     assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
     # So small a motion is smooth.
-    assert np.array(steps["path_rms_mm"]).shape == (3, 4)
-    uneven = [max(along) / np.median(along) for along in steps["path_rms_mm"]]
+    changes = np.array([along["rms_mm"] for along in steps["along"]])
+    assert changes.shape == (3, 4)
+    uneven = changes.max(axis=1) / np.median(changes, axis=1)
     assert max(uneven) < 1.5
     assert steps["path"][-1][0] / steps["path"][0][0] == pytest.approx(0.7)
     drift = record["drift"]
@@ -136,3 +143,66 @@ def test_a_check_says_what_a_cycle_will_tell_and_estimates_nothing(tmp_path, mon
     assert [row[2] for row in rows] == ["3.74", "2.93"]  # where the filter starts
     assert "No estimation was run." in said
     assert not list(tmp_path.rglob("result.json"))
+
+
+class LogLinear:
+    """Two vertices in two frames, linear in the logarithms of two parameters."""
+
+    H = np.random.default_rng(5).normal(size=(12, 2))
+
+    def __call__(self, m):
+        return Prediction(self.H @ np.log(m), self.H / m)
+
+
+def test_the_shift_by_a_mesh_is_the_difference_of_two_estimates(monkeypatch):
+    rng = np.random.default_rng(6)
+    frames = rng.normal(size=(2, 2, 3))
+    frames[1, 0] = np.nan  # not seen
+    observation = CycleObservation(frames, np.array([0.2, 0.3]))
+    model, prior = observation.of(LogLinear()), Gaussian.from_variance(np.ones(2), np.ones(2))
+
+    def estimated(y):
+        return IteratedFilter(1e-12)(model, prior, y, observation.R, transform=Log())
+
+    found = estimated(observation.y)
+    off = rng.normal(size=(2, 2, 3))
+    at = LogLinear()(found.mean).y.reshape(2, 2, 3)
+    monkeypatch.setattr(whole_cycle, "frames_on_mesh", lambda config, m, mesh: at + off)
+    told = shift_by_check_mesh({}, found, model, prior, observation)
+    moved = estimated(observation.y + off[observation.seen].ravel())
+    np.testing.assert_allclose(
+        told.shift, moved.transformed.mean - found.transformed.mean, rtol=1e-8
+    )
+    seen = np.linalg.norm(off[observation.seen], axis=1)
+    assert told.distance_mm == pytest.approx(seen.mean())
+
+
+def test_a_mesh_on_which_nothing_closes_is_told_and_not_raised(monkeypatch):
+    observation = CycleObservation(np.zeros((2, 2, 3)), np.full(2, 0.2))
+    model, prior = observation.of(LogLinear()), Gaussian.from_variance(np.ones(2), np.ones(2))
+    found = IteratedFilter()(model, prior, observation.y, observation.R, transform=Log())
+
+    def lost(config, m, mesh):
+        raise InputError("no cycle")
+
+    monkeypatch.setattr(whole_cycle, "frames_on_mesh", lost)
+    told = shift_by_check_mesh({}, found, model, prior, observation)
+    assert told == "on the mesh of the check: no cycle"
+
+
+def test_time_steps_that_are_not_halves_are_refused():
+    settings = {"time_steps": [0.05, 0.02], "path_steps": 1, "drift": -0.3}
+    with pytest.raises(ConfigurationError, match="each to be half of the one before"):
+        cycle._time_steps({"cycle": settings}, np.array([6.0]))
+
+
+def test_a_time_step_that_cannot_be_followed_is_told(monkeypatch):
+    def frames(config, model, m):
+        if m[0] < 2:
+            raise InputError("no cycle with the parameters")
+        return np.full((1, 1, 3), m[0])
+
+    monkeypatch.setattr(cycle, "stored_frames", frames)
+    found, reason = cycle._followed({}, None, np.array([[3.0], [2.5], [1.0], [0.5]]))
+    assert [f[0, 0, 0] for f in found] == [3.0, 2.5]
+    assert reason == "no cycle with the parameters"

@@ -4,6 +4,7 @@ In place of the mechanics there is a stretch that is known in closed form; that 
 scenarios is checked in tests/prediction.
 """
 
+import copy
 import json
 import sys
 from types import SimpleNamespace
@@ -125,6 +126,17 @@ def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
     assert "All 30 samples gave a closed valve." in text
     table = (folder / "prediction.csv").read_text().splitlines()
     assert len(table) == 1 + 10 * len(record["measures"])
+    # Without a check nothing is said of the mesh's error, and with a failed one that it is missing.
+    narrow = copy.deepcopy(record) | {"check_mesh": []}
+    for one in narrow["patients"]:
+        for found in one["scenarios"].values():
+            for row in found["measures"].values():
+                row |= {"wide_low": None, "wide_high": None, "inside_wide": None}
+    said = prediction_text(narrow)
+    assert "not the error of the mesh" in said
+    assert "truth inside |" not in said
+    assert "]°, true" in said
+    assert "]°" not in text
     figure = prediction_figure(record, folder / "fields.npz")
     valves, dots = figure.subfigs
     assert [axes.get_title().split("\n")[0] for axes in valves.axes] == list(

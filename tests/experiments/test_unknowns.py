@@ -114,6 +114,7 @@ def test_tables_say_what_missed_its_target(tmp_path):
         "at_centre": 9.0, "true_at_centre": 12.0, "log_std_at_centre": 0.2, "peak": 9.0,
         "peak_distance_mm": 4.0, "outside": 6.0, "rms_log_error": 0.1, "within_two_std": 0.9,
         "residual_mm": 0.5, "noise_log_std_at_centre": 0.1, "within_two_noise_std": 0.8,
+        "shift_unknown": "no cycle",
     }  # fmt: skip
     record = {
         "title": "t", "results": {"patch": entry, "no patch": {**entry, "truth": [6.0] * 3}},
@@ -128,6 +129,7 @@ def test_tables_say_what_missed_its_target(tmp_path):
     text = patch_text(record)
     # 9 of 12 MPa is 25 % less; 4 mm is more than 3.5 mm.
     assert "-25 % off, target 20 %: missed" in text
+    assert "may shift is not known (no cycle)" in text
     assert re.search(r"Place 4\.0 mm off, target 3\.5 mm .*: missed", text)
     files = write_patch(tmp_path, json.loads(json.dumps(record)))
     assert {path.suffix for path in files} == {".csv", ".md", ".png", ".pdf"}

@@ -145,14 +145,18 @@ def test_intervals_carry_the_error_of_the_mesh(linear):
     assert found.interval("load") == (7.0, 7.0)
 
 
-def test_a_measure_that_is_never_negative_has_no_negative_interval(linear, monkeypatch):
-    monkeypatch.setattr(
-        predict, "measure_closed", lambda model, system, x, changes=None: {"gap": abs(x[0, 0] - 16)}
-    )
+def test_only_measures_that_are_never_negative_have_no_negative_interval(linear, monkeypatch):
+    def measured(model, system, x, changes=None):
+        return {"gap_mm2": abs(x[0, 0] - 16), "tenting_height_mm": abs(x[0, 0] - 16)}
+
+    monkeypatch.setattr(predict, "measure_closed", measured)
     estimate = estimated()
     found = predict_scenario(linear, estimate, posterior_samples(estimate, 16, 3), finer=Finer())
-    assert found.mesh_error("gap") > 0
-    assert found.interval("gap")[0] >= 0
+    assert found.mesh_error("gap_mm2") == pytest.approx(0.5)
+    assert found.interval("gap_mm2")[0] == 0.0
+    # Leaflets above the annulus have a negative tenting height.
+    assert found.interval("tenting_height_mm")[0] < 0
+    assert found.interval("gap_mm2")[1] == found.interval("tenting_height_mm")[1]
 
 
 def test_a_finer_mesh_that_does_not_close_leaves_the_error_unknown(linear):

@@ -14,6 +14,7 @@ def entry(error: float, **more) -> dict:
         "error": [0.0, error, 0.0],
         "std": [0.01, 0.01, 0.001],
         "runs": 5,
+        "nees": 25.0,
         "residual_mm": 0.5,
         **more,
     }
@@ -44,7 +45,7 @@ RECORD = {
     "rms_over_bound": [0.8, 1.4, 0.9],
     "finer": entry(0.05, cells=[40, 5], distance_mm=0.2),
     "told": entry(0.05, shift=[0.0, 0.04, 0.0], cells=[48, 6], distance_mm=0.3)
-    | {"std": [0.01, 0.04, 0.001]},
+    | {"std": [0.01, 0.04, 0.001], "nees": 1.6},
     "provenance": {
         "versions": {"mvest": "0.1.0"},
         "git": {"sha": "0" * 40, "dirty": False},
@@ -65,6 +66,11 @@ def test_targets_are_met_or_missed_by_the_numbers():
     assert "1.100 %" in text
 
 
+def test_ratios_of_few_seeds_have_a_band():
+    # Chi-square with two degrees of freedom: 0.0506 and 7.378; half of them, and the root.
+    assert "between 0.16 and 1.92 in 95 % of cases" in joint_text(RECORD)
+
+
 def test_the_most_correlated_parameters_of_two_frames_are_named():
     text = joint_text(RECORD)
     assert "anterior modulus and posterior modulus correlated by -0.900" in text
@@ -77,7 +83,11 @@ def test_the_most_correlated_parameters_of_two_frames_are_named():
 
 def test_errors_on_another_mesh_are_told_in_standard_deviations():
     text = joint_text(RECORD)
-    assert "over these standard deviations: +0.0, +1.2, +0.0 (without: +0.0, +5.0, +0.0)" in text
+    assert "over these standard deviations: +0.0, +1.2, +0.0, normalised squared error 1.6" in text
+    assert "(without: +0.0, +5.0, +0.0, 25)" in text
+    lost = {**RECORD, "told": {"status": "failed", "reason": "too far", "cells": [48, 6]}}
+    assert "may shift is not known (too far)" in joint_text(lost)
+    assert "std with that shift" not in joint_text(lost)
 
 
 def test_files_are_written(tmp_path):
