@@ -361,6 +361,9 @@ class CycleConfig:
     noise_mm: float = 0.5  # SD of each coordinate
     exact_told_mm: float = 0.1  # SD that the filter is told of coordinates without noise
     seeds: int = 8
+    # Decrease of the objective below which a search ends that starts near its end: 0.02 moves no
+    # parameter by more than a fifth of its standard deviation, 0.05 by a third.
+    objective_tolerance: float = 0.02
     finer_columns: int = 32  # cells of the mesh of a truth that is not the estimator's
     finer_rows: int = 4
     finer_contact: list[int] = field(default_factory=lambda: [96, 21])  # points, around and along

@@ -55,7 +55,8 @@ def run_joint_study(
     frames = at_truth.y.reshape(len(maker.protocol.times), -1, 3)
     noise, told = settings["noise_mm"], settings["exact_told_mm"]
     seen = CycleObservation(frames, noise).of(stored_cycle(config, model))
-    study = _Study(parameters, transform, prior, seen, truth)
+    tolerance = settings["objective_tolerance"]
+    study = _Study(parameters, transform, prior, seen, truth, tolerance)
 
     def rows_of(wanted: list[int]) -> FloatArray:
         return at_truth.jacobian.reshape(*frames.shape, -1)[wanted].reshape(-1, len(truth))
@@ -132,10 +133,11 @@ class _Study:
         prior: Gaussian,
         seen: SeenFrames,
         truth: FloatArray,
+        tolerance: float,
     ) -> None:
         self.parameters, self.transform, self.prior = parameters, transform, prior
         self.seen = seen
-        self.truth = truth
+        self.truth, self.tolerance = truth, tolerance
 
     def sequential(self, observation: CycleObservation) -> SequentialEstimate:
         return SequentialFilter(observation.sizes, relinearise=0.1).run(
@@ -148,9 +150,9 @@ class _Study:
         )
 
     def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
-        # A decrease of 0.02 moves no parameter by more than a fifth of its standard deviation.
-        first = tuple(map(float, start))
-        filter_ = IteratedFilter(tolerance=1e-3, objective_tolerance=0.02, start=first)
+        filter_ = IteratedFilter(
+            tolerance=1e-3, objective_tolerance=self.tolerance, start=tuple(map(float, start))
+        )
         return filter_(
             self.seen,
             self.prior,
