@@ -89,6 +89,11 @@ def run_chord_study(
         "vertices": int(frames.shape[1]),
         "results": results,
         "bounds": bounds,
+        "measures": {
+            f"{what}.{name}": value
+            for what in ("error", "std")
+            for name, value in zip(parameters, results[1][what], strict=True)
+        },
         "forward_solves": sum(entry["runs"] for entry in results),
     }
     failed = [entry for entry in results if entry["status"] != "converged"]

@@ -128,7 +128,11 @@ def metrics(record: Values) -> list[tuple[str, float, int]]:
         (key, math.fsum(run.get(key) or 0 for run in runs), 0)
         for key in ("forward_solves", "seconds")
     ]
-    found += [(name, value, 0) for name, value in (record.get("measures") or {}).items()]
+    found += [
+        (name, value, 0)
+        for name, value in (record.get("measures") or {}).items()
+        if not isinstance(value, str)  # what a measure means
+    ]
     return [(name, float(value), step) for name, value, step in found if value is not None]
 
 
@@ -142,10 +146,9 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
         observation's digest is that of the recording where there is one, and otherwise of the
         settings that it is simulated from: valve, mechanics, truth, frames, noise and seed.
     """
-    mesh = record["mesh"]
-    model = record["model"]
+    mesh, model = record["mesh"], record.get("model")
     found = []
-    if "sha256" in mesh:
+    if "sha256" in mesh and model is not None:
         cells = " x ".join(str(count) for count in model["cells"])
         found.append(
             {

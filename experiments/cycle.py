@@ -78,6 +78,12 @@ def run_cycle_study(
         "phases": [bound(label, wanted) for label, wanted in phases.items() if wanted],
         "steps": _time_steps(config, truth),
     }
+    record["measures"] = {
+        f"bound_{entry['count']}_frames.{name}": value
+        for entry in record["sets"]
+        for name, value in zip(config["parameters"], entry["std"], strict=True)
+        if value is not None
+    }
     drift = _drift(config, truth)
     record["drift"] = drift
     record["forward_solves"] = 1 + record["steps"]["runs"] + drift["runs"]

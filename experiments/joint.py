@@ -108,6 +108,15 @@ def run_joint_study(
         ],
         "first": study.path(first),
         "passes": _passes(first.estimate, truth),
+        "measures": {
+            f"{what}.{name}": float(value)
+            for what, values in (
+                ("error_exact", exact.estimate.mean / truth - 1),
+                ("rms_over_bound", np.sqrt(np.mean(errors**2, axis=0)) / bound),
+                ("error_finer", other.mean / truth - 1),
+            )
+            for name, value in zip(parameters, values, strict=True)
+        },
         "rms_over_bound": (np.sqrt(np.mean(errors**2, axis=0)) / bound).tolist(),
         "finer": _entry(other, truth, seen_finer)
         | {

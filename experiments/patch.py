@@ -84,6 +84,10 @@ def run_patch_study(
         "prior_std": to_filter(transform, prior).std.tolist(),
         "map": leaflet.places(),
         "results": results,
+        "measures": {
+            key: results["patch"][key]
+            for key in ("at_centre", "peak", "peak_distance_mm", "rms_log_error", "within_two_std")
+        },
         "forward_solves": sum(entry["runs"] for entry in results.values()),
     }
     failed = [entry for entry in results.values() if entry["status"] != "converged"]

@@ -13,6 +13,7 @@ from experiments.whole_cycle import shift_by_check_mesh
 from mvest.cycle import CycleObservation
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
+from tests.experiments.logged import logged
 
 TINY = (
     "mesh.columns=8",
@@ -87,6 +88,8 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
     np.testing.assert_allclose(record["rms_over_bound"], expected)
     # Another mesh is another truth.
     assert record["finer"]["distance_mm"] > 1e-3
+    error = logged(folder)["error_exact.E_f.anterior"]
+    assert error == pytest.approx(record["exact"]["error"][0], abs=1e-12)
     # What is left of the observation is its noise.
     assert all(0.009 < entry["residual_mm"] < 0.011 for entry in record["seeds"])
     assert record["exact"]["residual_mm"] < 1e-3
@@ -111,6 +114,7 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     assert frames[0]["std_alone"] == [None, None, None]
     assert [entry["count"] for entry in record["sets"]] == [2, 3, 5]
     assert {entry["frames"] for entry in record["phases"]} == {"closing", "held closed", "opening"}
+    assert logged(folder)["bound_5_frames.E_f.anterior"] == record["sets"][-1]["std"][0]
     steps = record["steps"]
     assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
     # So small a motion is smooth.

@@ -9,6 +9,7 @@ import pytest
 from experiments.models import OTHER_LAW, OWN, PROGRAM, PROGRAM_ALONE, SECOND
 from experiments.run import main
 from mvest.reporting.models import models_text, write_models_tables
+from tests.experiments.logged import logged
 
 pytest.importorskip("skfem")
 
@@ -40,7 +41,8 @@ def done(tmp_path_factory):
 
 
 def test_every_model_estimates_from_the_data(done):
-    record, _ = done
+    record, folder = done
+    assert logged(folder)["failed"] == 0
     found = {(row["data"], row["model"]): row for row in record["rows"]}
     assert set(found) == {
         *((OWN, model) for model in (OWN, SECOND, OTHER_LAW, PROGRAM, PROGRAM_ALONE)),

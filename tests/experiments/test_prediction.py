@@ -19,6 +19,7 @@ from mvest.mechanics.valve_system import build_system
 from mvest.model import ClosedState, ClosureModel
 from mvest.reporting.prediction import SHOWN, coverage, prediction_text, write_prediction_tables
 from mvest.reporting.prediction_figure import PANELS, prediction_figure
+from tests.experiments.logged import logged
 
 SMALL = (
     "experiment=prediction",
@@ -39,6 +40,7 @@ SMALL = (
     "figures=false",
     "tracking.enabled=false",
 )
+
 RATE = np.array([0.05, 0.05, 2.0])
 
 
@@ -121,6 +123,7 @@ def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
     assert coverage(record, "tenting_height_mm", "own")[1] == 10
     assert coverage(record, "tenting_height_mm", "wide")[1] == 10
 
+    assert logged(folder)["forward_solves"] == record["forward_solves"]
     write_prediction_tables(folder, record)
     text = (folder / "prediction.md").read_text()
     assert "All 30 samples gave a closed valve." in text

@@ -10,6 +10,7 @@ import pytest
 from experiments.run import main
 from mvest.reporting.chord import chord_text, write_chord
 from mvest.reporting.patch import patch_text, write_patch
+from tests.experiments.logged import logged
 
 TINY = (
     "mesh.columns=8",
@@ -89,6 +90,7 @@ def test_a_patch_is_compared_with_the_truth_where_it_is(run):
         assert entry["shift_rms"] > 0
         assert entry["within_two_with_shift"] >= entry["within_two_std"]
         assert 0.45 < entry["residual_mm"] < 0.7
+    assert logged(folder)["peak"] == with_patch["peak"]
     assert (folder / "patch.png").is_file()
     assert "half the patch's radius" in patch_text(record)
 
@@ -105,6 +107,7 @@ def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
     assert np.all(two < 1.2 * prior)
     assert np.sum(np.log(whole)) < np.sum(np.log(two))
     assert len([e for e in record["results"] if e["frames"] == "whole cycle"]) == 2
+    assert logged(folder)["std.chord_stiffness.basal"] == whole[3]
     assert (folder / "chord.png").is_file()
 
 
