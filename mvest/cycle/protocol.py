@@ -32,6 +32,8 @@ class CycleProtocol:
     dt : float
         s, the largest time step: the time between two frames is divided evenly into steps no
         larger than this.
+        Leaflets flip within some milliseconds; where a step leaps over that, frames jump with the
+        parameters (`experiment=cycle` measures it).
     times : tuple of float
         s at which the valve is looked at, strictly increasing from >= 0; the run ends at the last.
     """
@@ -40,7 +42,7 @@ class CycleProtocol:
     rise: float = 0.3
     hold: float = 0.2
     fall: float = 0.3
-    dt: float = 0.025
+    dt: float = 0.00625
     times: tuple[float, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:
