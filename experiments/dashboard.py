@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from experiments.comparison import axes
+from experiments.runner.comparison import axes
+from experiments.runner.tracking import RECEIPT, Store, open_store, read_json, telling
 from experiments.sync import LAST_SWEEP, jobs_in
-from experiments.tracking import RECEIPT, Store, open_store, read_json, telling
 from mvest.errors import InputError, MvestError
 
 __all__ = ["Comparison", "command", "main", "save_comparison", "wait_for"]

@@ -18,9 +18,9 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from experiments.job import FailedRunError, run_job
-from experiments.slurm import register_launcher
-from experiments.sweep import StopApplication
+from experiments.runner.job import FailedRunError, run_job
+from experiments.runner.slurm import register_launcher
+from experiments.runner.sweep import StopApplication
 from mvest.errors import MvestError
 
 __all__ = ["main"]

@@ -21,8 +21,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from experiments.folder import is_done
-from experiments.tracking import (
+from experiments.runner.folder import is_done
+from experiments.runner.tracking import (
     RECEIPT,
     REMEDY,
     SWEEP_UPLOADS,

@@ -7,26 +7,26 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.common.cases.tables import write_patient_tables
+from experiments.results.page import write_report
+from experiments.studies.chord.report import write_chord
+from experiments.studies.closure.report import write_closure_tables
+from experiments.studies.cycle.report import write_cycle
+from experiments.studies.donor.report import write_donor_tables
+from experiments.studies.filters.report import write_filter_study
+from experiments.studies.gate.report import write_gate_tables
+from experiments.studies.identifiability.report import write_identifiability_study
+from experiments.studies.imaging.report import write_imaging_study
+from experiments.studies.imaging.tables import write_volume_tables
+from experiments.studies.joint.report import write_joint
+from experiments.studies.law.report import write_law_tables
+from experiments.studies.models.report import write_models_tables
+from experiments.studies.patch.report import write_patch
+from experiments.studies.patient.population import write_population_tables
+from experiments.studies.prediction.report import write_prediction_tables
+from experiments.studies.twin.publish import RECORDS, regenerate
+from experiments.sweeps.report import read_sweeps, write_sweep
 from mvest.errors import MvestError
-from mvest.reporting.chord import write_chord
-from mvest.reporting.closure import write_closure_tables
-from mvest.reporting.cycle import write_cycle
-from mvest.reporting.donor import write_donor_tables
-from mvest.reporting.filters import write_filter_study
-from mvest.reporting.gate import write_gate_tables
-from mvest.reporting.identifiability import write_identifiability_study
-from mvest.reporting.imaging_study import write_imaging_study
-from mvest.reporting.imaging_tables import write_volume_tables
-from mvest.reporting.joint import write_joint
-from mvest.reporting.law import write_law_tables
-from mvest.reporting.models import write_models_tables
-from mvest.reporting.patch import write_patch
-from mvest.reporting.patient_tables import write_patient_tables
-from mvest.reporting.population import write_population_tables
-from mvest.reporting.prediction import write_prediction_tables
-from mvest.reporting.publish import RECORDS, regenerate
-from mvest.reporting.report import write_report
-from mvest.reporting.sweeps import read_sweeps, write_sweep
 
 __all__ = ["main"]
 

@@ -17,9 +17,9 @@ from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
 from mvest.personalise import CaseMesh, PersonaliseSettings, Treatment, Unknown
-from mvest.registration import REGISTRATION, displace
-from mvest.valve.structured import structured_mesh
-from mvest.valve.template import Template
+from mvest.problem.registration import REGISTRATION, displace
+from mvest.valve.anatomy.template import Template
+from mvest.valve.mesh.structured import structured_mesh
 
 COLUMNS, ROWS = 32, 9
 TEMPLATE = Template()

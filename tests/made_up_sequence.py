@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
 
 HALF_GAP = 0.5
 """mm from the coaptation line to either closed midsurface."""

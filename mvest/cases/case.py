@@ -14,7 +14,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy import Chordae, LeafletSurface, Motion, Valve
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
 __all__ = ["ErrorSamples", "Frame", "Role", "Uncertainty", "ValveCase"]
 

@@ -21,9 +21,9 @@ from mvest.cases.rims import loop_vector_area
 from mvest.cases.schema import CaseFile, wrong
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy import Chordae
-from mvest.valve.proximity import surface_edges
-from mvest.valve.surfaces import check_surface
+from mvest.valve.anatomy.valve import Chordae
+from mvest.valve.geometry.proximity import surface_edges
+from mvest.valve.geometry.surfaces import check_surface
 
 __all__ = [
     "at",
@@ -49,7 +49,7 @@ LARGEST_THICKNESS = 5.0
 FARTHEST_TIP = 100.0
 """mm from the centre of the annulus."""
 CHORD_REACH = 3.0
-"""mm from an insertion to the nearest vertex, as `mvest.valve.anatomy.Valve` demands."""
+"""mm from an insertion to the nearest vertex, as `mvest.valve.anatomy.valve.Valve` demands."""
 
 
 @contextmanager

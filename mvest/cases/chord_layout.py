@@ -1,11 +1,11 @@
 """Chordae for a two-leaflet valve that brings none: the template's layout, in its coordinates.
 
-The template (`mvest.valve.template`) places its chordae by an angle phi, with the commissures at 0
-and 180 degrees and the anterior leaflet between them, and by s from the annulus to the free edge.
-Any band has harmonic coordinates (`mvest.valve.surface_coordinates`), but their angle is not spread
-along the edges as the template's is, and the leaflets' common borders are no lines of it. So phi is
-the share of the arc length between the commissures, on the annulus (s = 0) and on the free edge
-(s = 1), and between the two the harmonic angle of a phi is linear in s.
+The template (`mvest.valve.anatomy.template`) places its chordae by an angle phi, with the
+commissures at 0 and 180 degrees and the anterior leaflet between them, and by s from the annulus to
+the free edge. Any band has harmonic coordinates (`mvest.valve.geometry.surface_coordinates`), but
+their angle is not spread along the edges as the template's is, and the leaflets' common borders are
+no lines of it. So phi is the share of the arc length between the commissures, on the annulus (s =
+0) and on the free edge (s = 1), and between the two the harmonic angle of a phi is linear in s.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from mvest.cases.rims import arc_shares, commissures, directed
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy import Chordae
-from mvest.valve.surface_coordinates import SurfaceCoordinates, surface_coordinates
-from mvest.valve.template import ChordLayout
+from mvest.valve.anatomy.template import ChordLayout
+from mvest.valve.anatomy.valve import Chordae
+from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 
 __all__ = ["LeafletBand", "lay_out_chordae"]
 

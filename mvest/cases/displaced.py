@@ -11,7 +11,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.errors import InputError
 from mvest.typing import FloatArray
-from mvest.valve.anatomy import Chordae
+from mvest.valve.anatomy.valve import Chordae
 
 __all__ = ["displaced_case"]
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mvest.errors import GeometryError
 from mvest.typing import IntArray
-from mvest.valve.surface_coordinates import boundary_loops
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 
 __all__ = ["without_ears"]
 

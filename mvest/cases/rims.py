@@ -12,7 +12,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.surface_coordinates import boundary_loops
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 
 __all__ = [
     "Rims",

@@ -17,8 +17,8 @@ from mvest.cases.rims import Rims
 from mvest.cases.schema import CaseFile, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy import Chordae, LeafletSurface
-from mvest.valve.surface_coordinates import surface_coordinates
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface
+from mvest.valve.geometry.surface_coordinates import surface_coordinates
 
 __all__ = ["CHORD_COLUMNS", "GENERIC_THICKNESS", "point_data", "read_chordae", "read_leaflets"]
 

@@ -17,7 +17,7 @@ from mvest.cases.paths import CASE_FILE
 from mvest.cases.schema import VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError, cannot_write
-from mvest.valve.io import write_surface
+from mvest.valve.io.surface_files import write_surface
 
 __all__ = ["write_case"]
 

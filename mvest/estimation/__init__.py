@@ -6,9 +6,19 @@ textbook's: parameters m, covariance P, process noise Q, observation noise R, Ja
 covariance S, gain K.
 """
 
-from mvest.estimation.considered import SchmidtFilter
-from mvest.estimation.design import Design, together
-from mvest.estimation.diagnostics import (
+from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
+from mvest.estimation.filters.considered import SchmidtFilter
+from mvest.estimation.filters.drift import DriftEstimate, DriftSmoother, FrameModel
+from mvest.estimation.filters.ensemble import EnsembleFilter
+from mvest.estimation.filters.extended import ExtendedFilter
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.filters.monte_carlo import MonteCarloFilter
+from mvest.estimation.filters.paper import PaperFilter
+from mvest.estimation.filters.sampler import SamplerSettings
+from mvest.estimation.filters.sequential import SequentialEstimate, SequentialFilter
+from mvest.estimation.filters.unscented import UnscentedFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.consistency import (
     Consistency,
     ZTest,
     chi_square_band,
@@ -18,35 +28,25 @@ from mvest.estimation.diagnostics import (
     nees,
     zero_mean,
 )
-from mvest.estimation.drift import DriftEstimate, DriftSmoother, FrameModel
-from mvest.estimation.ensemble import EnsembleFilter
-from mvest.estimation.estimate import Estimate, Filter, InnovationSummary, Reason
-from mvest.estimation.extended import ExtendedFilter
-from mvest.estimation.frames import (
+from mvest.estimation.information.design import Design, together
+from mvest.estimation.information.identifiability import (
+    Confounded,
+    Identifiability,
+    cramer_rao_bound,
+    identifiability,
+)
+from mvest.estimation.information.model_error import shift_by_model_error
+from mvest.estimation.information.profile import Profile, profile
+from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.trajectory import (
     FrameState,
     Trajectory,
     filter_frames,
     random_walk,
     smooth_frames,
 )
-from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.identifiability import (
-    Confounded,
-    Identifiability,
-    cramer_rao_bound,
-    identifiability,
-)
-from mvest.estimation.iterated import IteratedFilter
-from mvest.estimation.model_error import shift_by_model_error
-from mvest.estimation.monte_carlo import MonteCarloFilter
-from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
-from mvest.estimation.paper import PaperFilter
-from mvest.estimation.prediction import ObservationModel, Prediction
-from mvest.estimation.profile import Profile, profile
-from mvest.estimation.sampler import SamplerSettings
-from mvest.estimation.sequential import SequentialEstimate, SequentialFilter
 from mvest.estimation.transform import Identity, Log, Transform
-from mvest.estimation.unscented import UnscentedFilter
 from mvest.estimation.update import Update, kalman_update
 
 __all__ = [

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from mvest.errors import InputError
-from mvest.estimation.diagnostics import chi_square_band
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.transform import Transform, covariance_to_physical

@@ -39,9 +39,9 @@ A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at 
 
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.box import box, outer_faces
-from mvest.mechanics.field import ModulusField, StiffPatch
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.field import ModulusField, StiffPatch
 from mvest.mechanics.steps import Damping, NewtonSettings, Reason, Simulation, Step
 from mvest.mechanics.system import Factors, Loads, Parameter, System
 

@@ -9,15 +9,15 @@ from numpy.typing import ArrayLike
 
 from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError, MaterialError
+from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law import BiotLaw, TransverselyIsotropic
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, Parameter, System
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["simulate_body"]
 

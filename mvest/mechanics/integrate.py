@@ -26,7 +26,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.assembly import add_forces
-from mvest.mechanics.contact import Contact, ContactPairs
+from mvest.mechanics.forces.contact import Contact, ContactPairs
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.contact import ContactSettings
-from mvest.mechanics.exponential import EXPONENTIAL_KINDS, ExponentialTissue
-from mvest.mechanics.field import ModulusField, StiffPatch
-from mvest.mechanics.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.forces.contact import ContactSettings
+from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialTissue
+from mvest.mechanics.law.field import ModulusField, StiffPatch
+from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
 
 __all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings", "smooth_step"]
@@ -34,10 +34,10 @@ class TissueSettings:
     nu : float
         Poisson ratio of the paper.
     reading : str
-        ``A`` or ``C`` (see :class:`mvest.mechanics.law.PoissonReading`).
+        ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
     law : str
         ``biot``, the linear law, to which all of the above belongs, or ``exponential``
-        (:mod:`mvest.mechanics.exponential`).
+        (:mod:`mvest.mechanics.law.exponential`).
     exponential : ExponentialTissue, optional
         Coefficients of the exponential law, where they are not parameters.
     """
@@ -169,10 +169,10 @@ class MechanicsSettings:
         mm over which a chord is spread at its insertion.
     solver : str
     fields : dict
-        Region name -> :class:`mvest.mechanics.field.ModulusField`, where the modulus varies within
-        it; the coefficients ``field.REGION.K`` that are given no value are 0.
+        Region name -> :class:`mvest.mechanics.law.field.ModulusField`, where the modulus varies
+        within it; the coefficients ``field.REGION.K`` that are given no value are 0.
     patches : dict
-        Any name -> :class:`mvest.mechanics.field.StiffPatch`, for simulations.
+        Any name -> :class:`mvest.mechanics.law.field.StiffPatch`, for simulations.
     """
 
     tissue: dict[str, TissueSettings]

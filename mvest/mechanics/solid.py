@@ -30,7 +30,7 @@ from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["Law", "Solid", "SolidState", "kernels_are_compiled"]
 
@@ -40,7 +40,7 @@ ENHANCED_TOLERANCE = 1e-11
 
 
 class Law(Protocol):
-    """What the solid needs from a material law (see :class:`mvest.mechanics.law.BiotLaw`)."""
+    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`)."""
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Strain measure ``(e, q, 6)`` whose rate is damped."""

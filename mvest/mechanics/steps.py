@@ -36,7 +36,7 @@ class Damping:
     alpha : float
         1/s, mass-proportional.
     beta : float
-        s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law`).
+        s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law.biot`).
     """
 
     alpha: float = 0.1

@@ -21,12 +21,12 @@ from mvest.mechanics.assembly import (
     scatter_blocks,
     scatter_matrices,
 )
-from mvest.mechanics.cables import Cables, Hinge
-from mvest.mechanics.contact import Contact, ContactPairs
+from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.contact import Contact, ContactPairs
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import Parameter, Part, kind_of
-from mvest.mechanics.pressure import PressureLoad
 from mvest.mechanics.solid import Law, Solid, SolidState
-from mvest.mechanics.ties import Ties
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]

@@ -13,24 +13,24 @@ from typing import Protocol
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.cables import Cables, Hinge
-from mvest.mechanics.contact import Contact
-from mvest.mechanics.exponential import EXPONENTIAL_KINDS, ExponentialLaw, ExponentialTissue
-from mvest.mechanics.field import FieldBasis, FieldLaw, at_quadrature
-from mvest.mechanics.law import BiotLaw
-from mvest.mechanics.moduli import LeafletModuli
+from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.contact import Contact
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.forces.ties import TiedPoints
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialLaw, ExponentialTissue
+from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
+from mvest.mechanics.law.moduli import LeafletModuli
+from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.parameters import Part, check_names, kind_of
-from mvest.mechanics.pressure import PressureLoad
-from mvest.mechanics.regional import RegionalLaw
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
-from mvest.mechanics.ties import TiedPoints
 from mvest.typing import FloatArray
 from mvest.units import mmhg_to_mpa
-from mvest.valve.anatomy import Valve
-from mvest.valve.embedding import Embedding, embed
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.embedding import Embedding, embed
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = [
     "HeldState",

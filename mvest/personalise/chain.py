@@ -26,10 +26,16 @@ from mvest.estimation import (
 )
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import to_filter
-from mvest.foresight import Foresight, foresee
 from mvest.mechanics.valve_system import HeldState
-from mvest.observation import Observation
-from mvest.observation_errors import SpatialCorrelation
+from mvest.observation.errors import SpatialCorrelation
+from mvest.observation.surfaces import (
+    UNKNOWN,
+    ObservedSurface,
+    PredictedSurface,
+    SurfaceObservation,
+    surface_distance,
+)
+from mvest.observation.vertices import Observation
 from mvest.personalise.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
@@ -39,17 +45,11 @@ from mvest.personalise.geometry_errors import (
 from mvest.personalise.model import build_model
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
-from mvest.registration import REGISTRATION, RegisteredModel
-from mvest.study import Case, Observed, SharedStart, StudyResult, estimate
-from mvest.surface_observation import (
-    UNKNOWN,
-    ObservedSurface,
-    PredictedSurface,
-    SurfaceObservation,
-    surface_distance,
-)
+from mvest.problem.expectation import Foresight, foresee
+from mvest.problem.registration import REGISTRATION, RegisteredModel
+from mvest.problem.study import Case, Observed, SharedStart, StudyResult, estimate
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.band import Band
+from mvest.valve.anatomy.band import Band
 
 __all__ = ["foresee_case", "personalise"]
 
@@ -82,7 +82,7 @@ def personalise(
     store : Path, optional
         Where an unstructured mesh is kept.
     on_step : callable, optional
-        Progress, see :class:`mvest.model.ClosureModel`.
+        Progress, see :class:`mvest.closure.model.ClosureModel`.
     """
     chain = _Chain(case, settings, store, on_step)
     started = time.perf_counter()

@@ -18,15 +18,15 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.displaced import displaced_case
+from mvest.closure.model import ClosureModel
 from mvest.errors import MvestError
 from mvest.estimation import ObservationModel, Prediction
 from mvest.estimation.noise import ObservationNoise
-from mvest.model import ClosureModel
-from mvest.observation import Observation
+from mvest.observation.surfaces import SurfaceObservation
+from mvest.observation.vertices import Observation
 from mvest.personalise.model import build_coarse
 from mvest.personalise.settings import PersonaliseSettings
-from mvest.study import Observed, PredictedFrames
-from mvest.surface_observation import SurfaceObservation
+from mvest.problem.study import Observed, PredictedFrames
 from mvest.typing import FloatArray
 
 __all__ = ["GeometryErrors", "WeighedObservation", "errors_of", "sample_geometry"]

@@ -6,17 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from mvest.cases.case import Role, ValveCase
+from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.valve_system import check_parameters
-from mvest.model import ClosureModel
 from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
-from mvest.registration import REGISTRATION
-from mvest.valve.anatomy import Valve
-from mvest.valve.band import Band
-from mvest.valve.mesh import SolidMesh
-from mvest.valve.structured import structured_mesh
-from mvest.valve.tetrahedral_leaflets import tetrahedral_leaflets
-from mvest.valve.tetrahedralize import TetwildSettings
+from mvest.problem.registration import REGISTRATION
+from mvest.valve.anatomy.band import Band
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.structured import structured_mesh
+from mvest.valve.mesh.tetrahedral_leaflets import tetrahedral_leaflets
+from mvest.valve.mesh.tetrahedralize import TetwildSettings
 
 __all__ = ["build_coarse", "build_model"]
 

@@ -9,9 +9,9 @@ from mvest.cases.case import ValveCase
 from mvest.estimation import Gaussian
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
-from mvest.study import StudyResult
+from mvest.problem.study import StudyResult
 from mvest.typing import FloatArray
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["FrameDistance", "Personalised"]
 

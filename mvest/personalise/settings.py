@@ -11,7 +11,7 @@ from mvest.errors import InputError
 from mvest.estimation import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
-from mvest.registration import REGISTRATION
+from mvest.problem.registration import REGISTRATION
 
 __all__ = ["CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
 
@@ -129,7 +129,7 @@ class PersonaliseSettings:
     max_iterations : int
     largest_change : float
         Of a parameter's logarithm from one equilibrium to the next, see
-        :class:`mvest.model.ClosureModel`.
+        :class:`mvest.closure.model.ClosureModel`.
     paper : PaperSettings or None
         Whether the moduli are also estimated as the paper does it.
     moduli_only : bool

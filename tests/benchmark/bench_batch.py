@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.batch import predict_many
+from mvest.closure.batch import predict_many
 from tests.benchmark.valves import VALUES, model
 
 CLOSURES = 8

@@ -43,11 +43,11 @@ from mvest.mechanics import (
     outer_faces,
     simulate,
 )
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 MESHES = ((40, 40, 1), (60, 60, 1))
 SIZE = (20.0, 20.0, 1.3)

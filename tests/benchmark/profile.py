@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from mvest.mechanics.contact import Contact
+from mvest.closure.model import ClosureModel
+from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import PardisoSolver
 from mvest.mechanics.system import System
-from mvest.model import ClosureModel
 from tests.benchmark.valves import VALUES, Closed, closed, model
 
 SIZES = ("3k", "25k")

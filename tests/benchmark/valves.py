@@ -8,17 +8,17 @@ from functools import cache
 
 import numpy as np
 
-from experiments.build import guide_of
-from mvest.mechanics.contact import ContactPairs
+from experiments.common.build import guide_of
+from mvest.closure.model import ClosureModel
+from mvest.mechanics.forces.contact import ContactPairs
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import Simulation
 from mvest.mechanics.system import Loads, Parameter, System
 from mvest.mechanics.valve_system import boundary_loading
-from mvest.model import ClosureModel
 from mvest.typing import FloatArray
-from mvest.valve.structured import structured_mesh
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
+from mvest.valve.mesh.structured import structured_mesh
 
 MODULI = ("E_f.anterior", "E_f.posterior")
 VALUES = np.array([6.23, 2.09])

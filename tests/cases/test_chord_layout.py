@@ -6,7 +6,7 @@ import pytest
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
-from mvest.valve.template import ChordLayout, Template
+from mvest.valve.anatomy.template import ChordLayout, Template
 from tests.cases.folders import closing, plain_folder, save, save_surface
 
 RADIUS, HEIGHT = 15.0, 12.0

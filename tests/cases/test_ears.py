@@ -4,8 +4,8 @@ import numpy as np
 
 from mvest.cases.ears import without_ears
 from mvest.cases.folder import read_case
-from mvest.valve.surface_coordinates import boundary_loops
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 from tests.cases.folders import closing, plain_folder, save, save_surface
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from mvest.cases.rims import commissures, directed, find_rims, match_annulus
 from mvest.errors import GeometryError, InputError
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
 from tests.cases.folders import TIPS
 
 

@@ -9,4 +9,4 @@ def compiled(monkeypatch):
 
     That it is given is tested in processes of their own (``test_first_use.py``).
     """
-    monkeypatch.setattr("experiments.progress.kernels_are_compiled", lambda: True)
+    monkeypatch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)

@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
 
 
 def normals(x, triangles):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.config import ImagedConfig, ImagingConfig
+from experiments.common.config import ImagedConfig, ImagingConfig
 from mvest.imaging.detection.model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout

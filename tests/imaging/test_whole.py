@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.detection.evaluation import surface_distances
 from mvest.imaging.detection.model import default_model
 from mvest.imaging.detection.tracking import NoValveError, detect_valve
 from mvest.imaging.landmarks import LANDMARKS, landmarks
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.evaluation import surface_distances
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume, true_sequence
-from mvest.valve.template import Template, TemplateParameters
+from mvest.valve.anatomy.template import Template, TemplateParameters
 
 LAYOUT = ValveLayout(64, 15)
 

@@ -4,14 +4,14 @@ import numpy as np
 
 from mvest.elements import ELEMENTS
 from mvest.mechanics.box import box, outer_faces
-from mvest.mechanics.cables import Cables, Hinge
-from mvest.mechanics.contact import Contact, ContactSettings
-from mvest.mechanics.law import BiotLaw, PoissonReading, TransverselyIsotropic
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.contact import Contact, ContactSettings
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
-from mvest.valve.embedding import Embedding, embed
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.embedding import Embedding, embed
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 ELEMENT_NAMES = tuple(ELEMENTS)
 MATERIALS = {

@@ -19,7 +19,7 @@ from mvest.mechanics import (
     simulate,
     simulate_body,
 )
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
 from tests.mechanics.bodies import MATERIALS, block, sandwich
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law import BiotLaw
+from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Loads, System

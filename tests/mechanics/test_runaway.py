@@ -6,7 +6,7 @@ import pytest
 from mvest.mechanics import integrate
 from mvest.mechanics.integrate import _largest_step, _StepError
 from mvest.mechanics.steps import Reason
-from tests.test_model import AT, CLOSING, TINY, model_of
+from tests.closure.test_model import AT, CLOSING, TINY, model_of
 
 
 class NoRoom:

@@ -8,12 +8,12 @@ the final size are asserted rather than a loose tolerance.
 import numpy as np
 import pytest
 
-from mvest.mechanics.cables import Cables, Hinge
-from mvest.mechanics.law import BiotLaw
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.forces.cables import Cables, Hinge
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Loads, System
-from mvest.valve.embedding import embed
+from mvest.valve.mesh.embedding import embed
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SIDE, block, sandwich
 
 STEPS = (2e-3, 1e-3, 1e-5)

@@ -5,10 +5,10 @@ import pytest
 
 from mvest.elements import ELEMENTS
 from mvest.mechanics import BiotLaw, Loads, Step, System, box, outer_faces, simulate
-from mvest.mechanics.law import TransverselyIsotropic
-from mvest.mechanics.pressure import PressureLoad
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law.biot import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
-from mvest.valve.mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 INNER, OUTER = 1.0, 2.0  # mm
 YOUNG, NU = 1.0, 0.3

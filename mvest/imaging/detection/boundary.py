@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.detection.boosting import Boosters
 from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.detection.sampling import Pattern, features
 from mvest.imaging.detection.shape_model import ShapeModel
-from mvest.imaging.detection.truth import Misses, TrueValve, missed_shapes
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.boosting import Boosters
+from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.truth import Misses, TrueValve, missed_shapes
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["BoundaryDetector", "boundary_samples", "leaflet_axes"]

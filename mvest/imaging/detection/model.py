@@ -17,7 +17,6 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from mvest.errors import InputError, cannot_write
-from mvest.imaging.detection.boosting import Boosters
 from mvest.imaging.detection.boundary import BoundaryDetector
 from mvest.imaging.detection.landmark_detector import LandmarkDetector
 from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch
@@ -27,6 +26,7 @@ from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.detection.shape_start import MODES, ShapeStart
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.boosting import Boosters
 from mvest.typing import FloatArray
 
 __all__ = ["MODEL_FILE", "Accuracy", "DetectionModel", "default_model", "load_model", "save_model"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.detection.boosting import Boosters
 from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.detection.sampling import Pattern, directions, features
-from mvest.imaging.detection.truth import TrueValve
+from mvest.imaging.learning.boosting import Boosters
+from mvest.imaging.learning.sampling import Pattern, directions, features
+from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
 __all__ = ["PLACES", "PositionDetector", "position_samples"]

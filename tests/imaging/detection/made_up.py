@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from mvest.imaging.detection.detect import FitSettings
 from mvest.imaging.detection.model import STAGES, DetectionModel
 from mvest.imaging.detection.pose import Poses
-from mvest.imaging.detection.truth import TrueValve
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.volume import VolumeSequence
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
 from tests.made_up_sequence import leaflets
 
 LAYOUT = ValveLayout(16, 7)

@@ -4,7 +4,7 @@ import numpy as np
 
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
-from mvest.valve.template import Template
+from mvest.valve.anatomy.template import Template
 
 FRAMES = 3
 

@@ -1,0 +1,1 @@
+"""What studies share: settings, building, records, the store."""

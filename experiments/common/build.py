@@ -1,0 +1,406 @@
+"""From a resolved configuration (plain data) to the objects of the library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.mirror import build
+from experiments.common.truth import StoredModel, truth_key
+from mvest.closure.model import ClosureModel
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation import (
+    EnsembleFilter,
+    ExtendedFilter,
+    Filter,
+    Gaussian,
+    Identity,
+    IteratedFilter,
+    Log,
+    MonteCarloFilter,
+    PaperFilter,
+    Transform,
+    UnscentedFilter,
+    observation_noise,
+)
+from mvest.mechanics.parameters import is_positive, kind_of
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.solver import linear_solver
+from mvest.mechanics.valve_system import check_parameters
+from mvest.observation.errors import (
+    AnnulusOffset,
+    CoaptationDropout,
+    CorrelatedNoise,
+    ObservationError,
+    SpatialCorrelation,
+    WhiteNoise,
+)
+from mvest.observation.vertices import require_frames
+from mvest.problem.study import Case
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.valve import LeafletSurface, Valve
+from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.structured import structured_mesh
+from mvest.valve.mesh.tetrahedral_leaflets import tetrahedral_leaflets
+from mvest.valve.mesh.tetrahedralize import TetwildSettings
+
+__all__ = ["Twin", "build_mesh", "build_twin", "filter_of", "mechanics_of", "template_of"]
+
+Values = Mapping[str, Any]
+OnStep = Callable[[float, int], None]
+
+ENVELOPE_SHARE = 0.05
+"""Envelope of an unstructured mesh over its edge length."""
+
+COARSEST = (24, 3)
+"""Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
+
+MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo")
+"""Filters that a configuration can name."""
+
+UNSTRUCTURED_SURFACE = (112, 29)
+"""Vertices of the surface that an unstructured mesh fills, whatever is observed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twin:
+    """A synthetic study: the estimator's case, and apart from it what makes its observation.
+
+    Attributes
+    ----------
+    case : Case
+    model : ClosureModel
+        The estimator's.
+    truth_model : ClosureModel
+        The observation's; an object of its own.
+    source : StoredModel
+        ``truth_model`` behind its store on disk.
+    truth_values : (p,)
+    valve : Valve
+        The observed surface.
+    variance : float or (f,) mm²
+    correlation : SpatialCorrelation or None
+    frames : tuple of str
+    errors : tuple of ObservationError
+    """
+
+    case: Case
+    model: ClosureModel
+    truth_model: ClosureModel
+    source: StoredModel
+    truth_values: FloatArray
+    valve: Valve
+    variance: float | FloatArray
+    correlation: SpatialCorrelation | None
+    frames: tuple[str, ...]
+    errors: tuple[ObservationError, ...]
+
+
+def build_twin(config: Values) -> Twin:
+    """Everything of a synthetic study.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible; the message names it.
+    """
+    parameters = tuple(config["parameters"])
+    truth = config["truth"]
+    settings = mechanics_of(config)
+    # What is cheap to refuse is refused before anything is meshed.
+    filter_, transform, prior = build_filter(config["filter"], parameters)
+    variance = _numbers("filter.R", config["filter"]["R"])
+    try:
+        observation_noise(np.atleast_1d(variance), np.size(variance))
+    except InputError as error:
+        raise ConfigurationError(f"filter.R = {config['filter']['R']}: {error}") from error
+    frames = tuple(config["observation"]["frames"])
+    require_frames(frames)
+    if np.size(variance) not in (1, len(frames)):
+        raise ConfigurationError(
+            f"filter.R = {config['filter']['R']}: R has shape ({np.size(variance)},); expected one "
+            f"variance, or one for each of the {len(frames)} observed frames"
+        )
+    values = np.array(truth["values"], dtype=float)
+    _one_each("truth.values", values, parameters)
+    _require_tissue(settings, parameters, values, prior.mean)
+    linear_solver(settings.solver)
+    if not truth["dt_factor"] > 0:
+        raise ConfigurationError(f"truth.dt_factor = {truth['dt_factor']}, expected > 0")
+    if config["repeats"] < 1:
+        raise ConfigurationError(f"repeats = {config['repeats']}, expected at least 1")
+    true_settings = truth_mechanics(settings, truth)
+    _require_tissue(true_settings, parameters, values)
+
+    template = template_of(config)
+    observation = config["observation"]
+    valve = template.valve(observation["columns"], observation["rows"])
+    check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
+    points = config["mechanics"]["contact_points"]
+    contact_valve = template.valve(points["columns"], points["rows"])
+    correlations = Correlations(valve.surface)
+    errors = observation_errors(observation, correlations)
+    told_length = config["filter"]["R_correlation_mm"]
+    correlation = correlations(told_length) if told_length else None
+    element = config["mechanics"]["element"]
+    store = Path(config["paths"]["outputs"]) / "meshes"
+    mesh = build_mesh(template, config["mesh"], element, store)
+    model = ClosureModel(
+        valve,
+        contact_valve,
+        mesh,
+        settings,
+        parameters,
+        dict(config["fixed"]),
+        continuation=config["continuation"],
+        reach=np.inf if config["continuation_reach"] is None else config["continuation_reach"],
+    )
+    if config["guided"]:
+        model.guide = guide_of(model, template, config["mesh"])
+
+    changed = truth_mesh(config["mesh"], truth)
+    other = truth["element"] or element
+    same = changed == dict(config["mesh"]) and other == element
+    truth_model = ClosureModel(
+        valve,
+        contact_valve,
+        mesh if same else build_mesh(template, changed, other, store),
+        true_settings,
+        parameters,
+        {**config["fixed"], **truth["fixed"]},
+    )
+    described = {
+        "valve": config["valve"],
+        "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
+        "mesh": changed if changed["source"] == "tetwild" else _cells(changed),
+        "element": other,
+        "dt_factor": truth["dt_factor"],
+        "tissue": {region: asdict(tissue) for region, tissue in true_settings.tissue.items()},
+        "fixed": truth_model.fixed,
+        "observed": [observation["columns"], observation["rows"]],
+        "parameters": list(parameters),
+    }
+    folder = Path(config["paths"]["outputs"]) / "truth"
+    case = Case(parameters, model, prior, filter_, transform, settings.tissue)
+    return Twin(
+        case,
+        model,
+        truth_model,
+        StoredModel(truth_model, folder, truth_key(described)),
+        values,
+        valve,
+        variance,
+        correlation,
+        frames,
+        errors,
+    )
+
+
+class Correlations:
+    """Correlations between the vertices of a surface, each length factorised once."""
+
+    def __init__(self, surface: LeafletSurface) -> None:
+        self.surface = surface
+        self._made: dict[float, SpatialCorrelation] = {}
+
+    def __call__(self, length: float) -> SpatialCorrelation:
+        """The correlation of one length, mm."""
+        if length not in self._made:
+            self._made[length] = SpatialCorrelation(self.surface.vertices, length)
+        return self._made[length]
+
+
+def observation_errors(
+    settings: Values, correlations: Correlations
+) -> tuple[ObservationError, ...]:
+    """The configured errors that are not zero, in the order in which they arise."""
+    offset = settings["annulus_offset_mm"]
+    made: list[ObservationError] = [AnnulusOffset(tuple(offset))] if np.any(offset) else []
+    made.append(WhiteNoise(settings["noise_mm"]))
+    if settings["correlated_mm"]:
+        correlation = correlations(settings["correlation_length_mm"])
+        made.append(CorrelatedNoise(settings["correlated_mm"], correlation))
+    if settings["dropout_mm"]:
+        made.append(CoaptationDropout(settings["dropout_mm"], correlations.surface))
+    return tuple(made)
+
+
+def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSettings:
+    """The estimator's mechanics with the truth's changes."""
+    for name in truth["fixed"]:
+        try:
+            kind_of(name)
+        except InputError as error:
+            raise ConfigurationError(f"truth.fixed: {error}") from error
+    tissue = dict(settings.tissue)
+    for region, ratio in truth["ratio"].items():
+        if region not in tissue:
+            raise ConfigurationError(
+                f"truth.ratio has the region {region!r}; known: {', '.join(tissue)}"
+            )
+        tissue[region] = replace(tissue[region], ratio=ratio)
+    if truth["reading"] is not None:
+        tissue = {r: replace(old, reading=truth["reading"]) for r, old in tissue.items()}
+    protocol = replace(settings.protocol, dt=settings.protocol.dt * truth["dt_factor"])
+    return replace(settings, tissue=tissue, protocol=protocol)
+
+
+def template_of(config: Values) -> Template:
+    """The configured anatomy."""
+    return Template(build(TemplateParameters, config["valve"]))
+
+
+def mechanics_of(config: Values) -> MechanicsSettings:
+    """The configured mechanics."""
+    return build(MechanicsSettings, config["mechanics"])
+
+
+def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
+    """The estimator's mesh settings with the truth's changes."""
+    if truth["refine"] < 1:
+        raise ConfigurationError(f"truth.refine = {truth['refine']}, expected at least 1")
+    changed = dict(mesh)
+    changed["source"] = truth["source"] or mesh["source"]
+    changed["edge_length"] = mesh["edge_length"] / truth["refine"]
+    for name in ("columns", "rows"):
+        given = truth[name]
+        changed[name] = mesh[name] * truth["refine"] if given is None else given
+    changed["layers"] = mesh["layers"] if truth["layers"] is None else truth["layers"]
+    return changed
+
+
+def _cells(mesh: Values) -> dict[str, Any]:
+    """What decides a structured mesh besides its element."""
+    return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
+
+
+def guide_of(model: ClosureModel, template: Template, mesh: Values) -> ClosureModel | None:
+    """The model on a mesh of half as many cells each way, guided itself; None at the coarsest.
+
+    Guides have solid-shells, whatever the element and the source of the model's mesh.
+    """
+    if mesh["columns"] <= COARSEST[0]:
+        return None
+    cells = COARSEST
+    if mesh["columns"] > 2.5 * COARSEST[0]:
+        cells = (2 * round(mesh["columns"] / 4), max(mesh["rows"] // 2, COARSEST[1]))
+    coarse = replace(model, mesh=structured_mesh(template, "hex18", *cells), guide=None)
+    coarse.guide = guide_of(coarse, template, {"columns": cells[0], "rows": cells[1]})
+    return coarse
+
+
+def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> SolidMesh:
+    """The mesh of a template; an unstructured one is made once and kept in ``store``."""
+    if mesh["source"] == "structured":
+        return structured_mesh(template, element, mesh["columns"], mesh["rows"], mesh["layers"])
+    if mesh["source"] != "tetwild":
+        raise ConfigurationError(
+            f"mesh.source = {mesh['source']!r}, expected structured or tetwild"
+        )
+    if element not in ("tet4", "tet10"):
+        raise ConfigurationError(
+            f"mechanics.element = {element!r}: an unstructured mesh needs tet10 or tet4"
+        )
+    columns, rows = UNSTRUCTURED_SURFACE
+    j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    normals = template.normal(360.0 * i / columns, j / (rows - 1))
+    settings = TetwildSettings(mesh["edge_length"], ENVELOPE_SHARE * mesh["edge_length"])
+    surface = template.valve(columns, rows).surface
+    return tetrahedral_leaflets(surface, settings, element, store, normals)
+
+
+def build_filter(
+    settings: Values, parameters: tuple[str, ...], *, positive: bool = False
+) -> tuple[Filter, Transform, Gaussian]:
+    """The filter, its coordinates, and the prior of the parameters.
+
+    Those of our mechanics are known to be positive or not; those of another model are ``positive``.
+    """
+    mean = np.array(settings["initial"], dtype=float)
+    _one_each("filter.initial", mean, parameters)
+    prior = _gaussian("filter.P0", mean, settings["P0"])
+    transforms: dict[str, Transform] = {
+        "identity": Identity(),
+        "log": Log(None if positive else tuple(map(is_positive, parameters))),
+    }
+    if settings["transform"] not in transforms:
+        raise ConfigurationError(
+            f"filter.transform = {settings['transform']!r}, expected identity or log"
+        )
+    transform = transforms[settings["transform"]]
+    transform.forward(mean)
+    return filter_of(settings, mean), transform, prior
+
+
+def filter_of(settings: Values, mean: FloatArray) -> Filter:
+    """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
+    tolerance, most = settings["tolerance"], settings["max_iterations"]
+    match settings["mode"]:
+        case "paper":
+            Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
+            return PaperFilter(Q, tolerance, most)
+        case "extended":
+            return ExtendedFilter()
+        case "iterated":
+            return IteratedFilter(tolerance, max_iterations=most)
+        case "unscented":
+            return UnscentedFilter(tolerance, most, settings["spread"])
+        case "ensemble":
+            return build(EnsembleFilter, settings["ensemble"])
+        case "monte_carlo":
+            return build(MonteCarloFilter, settings["monte_carlo"])
+    raise ConfigurationError(
+        f"filter.mode = {settings['mode']!r}, expected one of {', '.join(MODES)}"
+    )
+
+
+def _one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:
+    if values.shape != (len(parameters),):
+        raise ConfigurationError(
+            f"{name} has {values.size} values; expected one for each of {', '.join(parameters)}"
+        )
+
+
+def _gaussian(name: str, mean: FloatArray, variance: Any) -> Gaussian:
+    """Prior with one variance, one for each parameter, or a full covariance."""
+    numbers = _numbers(name, variance)
+    try:
+        return Gaussian.from_variance(mean, numbers)
+    except InputError as error:
+        raise ConfigurationError(f"{name} = {variance}: {error}") from error
+
+
+def _require_tissue(
+    settings: MechanicsSettings, parameters: tuple[str, ...], *points: FloatArray
+) -> None:
+    """Refuse moduli of a region without tissue, and values that no tissue can have."""
+    for parameter in parameters:
+        kind_of(parameter)
+        kind, _, region = parameter.partition(".")
+        if kind == "E_f" and region not in settings.tissue:
+            raise ConfigurationError(
+                f"parameter {parameter!r}: no tissue is given for the region {region!r}; known: "
+                f"{', '.join(settings.tissue)}"
+            )
+    for point in points:
+        values = dict(zip(parameters, map(float, point), strict=True))
+        for region, tissue in settings.tissue.items():
+            if tissue.law == "exponential":
+                given = {k: f"{k}.{region}" for k in tissue.kinds if f"{k}.{region}" in values}
+                tissue.coefficients({k: values[name] for k, name in given.items()})
+            elif f"E_f.{region}" in values:
+                own = [values.get(f"{kind}.{region}") for kind in ("ratio", "G")]
+                _ = tissue.moduli(values[f"E_f.{region}"], *own).material  # refuses what is none
+
+
+def _numbers(name: str, value: Any) -> float | FloatArray:
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{name} = {value!r}, expected a number or numbers") from None
+    return float(numbers) if numbers.ndim == 0 else numbers

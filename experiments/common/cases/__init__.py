@@ -1,0 +1,1 @@
+"""Cases, volumes and patients: what the studies that personalise a valve share."""

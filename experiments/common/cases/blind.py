@@ -1,0 +1,135 @@
+"""Estimates a case in a process that cannot open what the case hides.
+
+A virtual patient's truth lies in a folder of its own. This process is started for the estimation
+alone, is told nothing of the patient but the folder of its case, and refuses to open, list or
+rename anything within the sealed folder for as long as it lives: Python's audit hooks cannot be
+removed once they are set (PEP 578). They see what Python opens; a file that a compiled library or a
+program started from here opened by itself would not be seen.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import experiments
+from experiments.common.cases.own_case import run_case
+from experiments.common.cases.volume import run_volume
+from experiments.common.config import register
+from mvest.errors import InputError, MvestError
+from mvest.provenance import THREAD_VARIABLES, write_json
+
+__all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
+
+ESTIMATE = "estimate.json"
+"""What the process leaves in the output folder."""
+
+MOST_MEMORY = 10 * 2**30
+"""Bytes that the process may ask for: a leaflet that crumples while no equilibrium is found can
+take all there is, and what else runs on the machine with it."""
+
+SECRET = ("patient", "echo", "truth", "valve", "seed", "parameters", "row", "factors")
+"""Parts of a configuration that describe the patient, and that the estimator is not given."""
+
+
+def seal(folder: Path) -> None:
+    """From now on let this process open nothing within ``folder``."""
+    sealed = os.path.realpath(folder)
+
+    def refuse(event: str, arguments: tuple[Any, ...]) -> None:
+        if not (event == "open" or event.startswith(("os.", "shutil.", "glob.", "sqlite3."))):
+            return
+        for argument in arguments:
+            if not isinstance(argument, (str, bytes, os.PathLike)):
+                continue
+            path = os.path.realpath(os.fsdecode(argument))
+            # Under another name of a folder above, the sealed one would not be known again.
+            renamed = event in ("os.rename", "shutil.move") and sealed.startswith(path + os.sep)
+            if renamed or path == sealed or path.startswith(sealed + os.sep):
+                raise PermissionError(f"{path} is sealed: an estimator does not see the truth")
+
+    sys.addaudithook(refuse)
+
+
+def estimate_blindly(
+    values: Mapping[str, Any], config_hash: str, folder: Path, case: Path, sealed: Path
+) -> dict[str, Any]:
+    """Personalise a case, or what is found in a volume, in a process apart: its record.
+
+    Parameters
+    ----------
+    values : mapping
+        The configuration; what describes the patient is left out.
+    config_hash : str
+    folder : Path
+        Output folder of the job, which exists.
+    case : Path
+        Folder of the case, or the file of a volume over time.
+    sealed : Path
+        Folder that the process cannot open.
+
+    Raises
+    ------
+    InputError
+        If the process left no record; the message ends with its last words.
+    """
+    given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
+    request = {
+        "values": {k: v for k, v in values.items() if k not in SECRET} | given,
+        "config_hash": config_hash,
+        "folder": str(folder),
+        "sealed": str(sealed),
+    }
+    path = folder / ESTIMATE
+    path.unlink(missing_ok=True)
+    places = [
+        str(Path(experiments.__file__).resolve().parents[1]),
+        os.environ.get("PYTHONPATH", ""),
+    ]
+    ended = subprocess.run(
+        [sys.executable, "-m", "experiments.common.cases.blind"],
+        input=json.dumps(request),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
+        env=os.environ
+        | dict.fromkeys(THREAD_VARIABLES, "1")
+        | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+        check=False,
+    )
+    if ended.returncode or not path.is_file():
+        last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
+        raise InputError(f"the estimation of {case} left no result: {last.removeprefix('error: ')}")
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def main() -> int:
+    """Answer the one request on the standard input; returns the exit status."""
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, hard))
+    request = json.load(sys.stdin)
+    folder = Path(request["folder"])
+    seal(Path(request["sealed"]))
+    register()
+    # The case says what it is; nothing here does.
+    values = request["values"] | {"seed": None, "parameters": [], "row": None}
+    try:
+        run = run_case if values.get("volume") is None else run_volume
+        record, _ = run(values, request["config_hash"], folder, time.time())
+        write_json(folder / ESTIMATE, record)
+    except MvestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

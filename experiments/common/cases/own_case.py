@@ -1,0 +1,175 @@
+"""A case from its folder to its moduli, its record and its report."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.common.build import mechanics_of
+from experiments.common.cases.record import case_record, fields_of
+from experiments.common.mirror import build
+from experiments.common.progress import SolveBar
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.folder import read_case
+from mvest.errors import ConfigurationError
+from mvest.personalise import (
+    CaseMesh,
+    PaperSettings,
+    PersonaliseSettings,
+    Treatment,
+    Unknown,
+    build_model,
+    personalise,
+)
+from mvest.reporting.case.fields import turn_of
+from mvest.reporting.case.frames import frame_fields, frames_figure
+from mvest.reporting.case.report import write_case_report
+from mvest.reporting.figures import save_figure_with
+
+__all__ = [
+    "check_case",
+    "read_configured",
+    "run_case",
+    "settings_of",
+]
+
+Values = Mapping[str, Any]
+
+TYPICAL_SOLVES = 8
+"""Forward solves of one case; only the progress bar's first guess."""
+
+
+def settings_of(config: Values) -> PersonaliseSettings:
+    """How the configuration wants a case to be personalised.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible.
+    """
+    personal = config["personal"]
+    known = [treatment.value for treatment in Treatment]
+    unknowns = []
+    for name, about in personal["unknowns"].items():
+        if about["treatment"] not in known:
+            raise ConfigurationError(
+                f"personal.unknowns.{name}.treatment = {about['treatment']!r}, expected one of "
+                f"{', '.join(known)}"
+            )
+        unknowns.append(Unknown(name, about["mean"], about["std"], Treatment(about["treatment"])))
+    paper = personal["paper"]
+    return PersonaliseSettings(
+        tuple(unknowns),
+        mechanics_of(config),
+        build(CaseMesh, personal["mesh"]),
+        personal["tolerance"],
+        personal["max_iterations"],
+        personal["largest_change"],
+        None if paper is None else build(PaperSettings, paper),
+        personal["moduli_only"],
+        personal["confirm"],
+        personal["correspondence"],
+    )
+
+
+def read_configured(config: Values) -> ValveCase:
+    """The case that the configuration names."""
+    if config["case"] is None:
+        raise ConfigurationError(
+            "case is not given; expected case=FOLDER, a folder with case.yaml; "
+            "mvest/cases/README.md says what it holds"
+        )
+    return read_case(Path(config["case"]))
+
+
+def check_case(config: Values, folder: Path) -> str:
+    """Read, check and draw a case without simulating anything: what to tell the user.
+
+    Raises
+    ------
+    MvestError
+        If the case is not in order.
+    """
+    case = read_configured(config)
+    settings = settings_of(config)
+    model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")
+    files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
+    surface = case.surface
+    lines = [
+        f"{case.name}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles, "
+        f"leaflets {', '.join(surface.region_names)}; {len(case.chordae)} chordae from "
+        f"{len(case.frame(Role.REFERENCE).papillary_tips)} papillary tips",
+        *(f"  {_told(frame)}" for frame in case.frames),
+        *(f"  derived: {sentence}" for sentence in case.derived),
+        f"  mesh: {len(model.mesh.nodes)} nodes, {len(model.mesh.elements)} "
+        f"{model.mesh.element_type}",
+        f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
+        f"In order; drawn in {files[0]}",
+    ]
+    return "\n".join(lines)
+
+
+def _drawn(case: ValveCase) -> Figure:
+    surface, chordae = case.surface, case.chordae
+    tips = case.frame(Role.REFERENCE).papillary_tips
+    middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
+    shapes = {}
+    for frame in case.frames:
+        at_rest = frame.role is Role.REFERENCE
+        title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
+        shapes[title] = frame_fields(
+            (frame.vertices - middle) @ axes,
+            frame.triangles,
+            frame.region,
+            (frame.annulus - middle) @ axes,
+            (frame.papillary_tips - middle) @ axes,
+            chordae.tip if at_rest else None,
+            (chordae.insertion - middle) @ axes if at_rest else None,
+        )
+    return frames_figure(shapes, case.surface.region_names)
+
+
+def _told(frame: Frame) -> str:
+    same = ", same vertices as the reference" if frame.corresponds else ", without correspondence"
+    return (
+        f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
+        f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices"
+        f"{'' if frame.role is Role.REFERENCE else same}"
+    )
+
+
+def run_case(
+    config: Values,
+    config_hash: str,
+    folder: Path,
+    started: float,
+    about: Values | None = None,
+) -> tuple[dict[str, Any], list[Path]]:
+    """Read a case and personalise it: its record; fields and report are written.
+
+    ``about`` is added to the record, before the report is.
+    """
+    fields = folder / "fields.npz"
+    # Of an earlier run: there are none where nothing is found now.
+    fields.unlink(missing_ok=True)
+    case = read_configured(config)
+    for sentence in case.derived:
+        print(f"derived: {sentence}", file=sys.stderr)
+    settings = settings_of(config)
+    steps = len(settings.mechanics.protocol.steps())
+    store = Path(config["paths"]["outputs"]) / "meshes"
+    with SolveBar(case.name, steps, TYPICAL_SOLVES) as bar:
+        found = personalise(case, settings, store=store, on_step=bar.step)
+    record = {**case_record(config, found, config_hash, started), **(about or {})}
+    files: list[Path] = []
+    if found.distances:
+        np.savez_compressed(fields, **fields_of(found))
+        files.append(fields)
+        if config["figures"]:
+            files += write_case_report(folder, {**record, "parameters": record["unknowns"]}, fields)
+    return record, files

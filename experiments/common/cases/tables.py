@@ -1,0 +1,386 @@
+"""Tables 2 and 3 and Figure 3 of the paper for the virtual patients.
+
+Made from the kept records (``results/patients``, simulated), each with the truth that was revealed
+after its estimation.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from mvest.errors import InputError
+from mvest.reporting.case.drawing import ATRIUM, draw_valve, same_scale
+from mvest.reporting.case.fields import CaseFields, read_case_fields
+from mvest.reporting.case.figures import corner_colours, distance_top, spread
+from mvest.reporting.figures import DISTANCE_MAP, save_figure
+from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
+
+__all__ = [
+    "PATIENTS",
+    "POPULATION",
+    "Record",
+    "distance_words",
+    "interval_words",
+    "provenance_of",
+    "read_kept",
+    "table2",
+    "table3",
+    "write_patient_tables",
+    "write_table",
+]
+
+Record = Mapping[str, Any]
+
+PATIENTS, POPULATION = "patients", "population"
+"""Folders of the kept records within the results."""
+
+ORDER = ("normal_small", "normal_large", "functional_mr", "prolapse", "fibroelastic")
+"""In which the five patients are listed; others follow by name."""
+
+
+WHICH = ("generic", "registered", "personalised")
+"""The closed valves whose distances are told; registered is generic, laid on the frame rigidly."""
+
+NOTE = (
+    "Simulated valves; the moduli and distances in the rows of the paper belong to five patients "
+    "whose images are not public, and the anatomies here have nothing to do with theirs. The truth "
+    "was revealed after the estimation."
+)
+
+
+def read_kept(results: Path, table: str) -> dict[str, Record]:
+    """Name -> record of what is kept of a table, in its order.
+
+    Raises
+    ------
+    InputError
+        If a record cannot be read.
+    """
+    found = {}
+    for path in sorted((results / table).glob("*.json")):
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            rank = record["case"]["name"]
+        except OSError as error:
+            raise InputError(f"cannot read {path}: {error.strerror}") from error
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path} is no record of a patient: {error}") from error
+        found[path.stem] = (ORDER.index(rank) if rank in ORDER else len(ORDER), rank, record)
+    return {name: record for name, (_, _, record) in sorted(found.items(), key=lambda i: i[1][:2])}
+
+
+# -- Tables 2 and 3 -------------------------------------------------------------------------------
+def table2(records: Sequence[Record]) -> pd.DataFrame:
+    """One row for each patient and modulus E_f: estimates with intervals beside the truth, MPa."""
+    rows = []
+    for record in records:
+        for k, row in enumerate(_moduli(record["unknowns"])):
+            plain: dict[str, Any] = {
+                "patient": record["case"]["name"],
+                "modulus": row["name"],
+                "hidden truth [MPa]": row["truth"],
+                "estimate [MPa]": row["estimate"],
+                "95 % low [MPa]": row["low"],
+                "95 % high [MPa]": row["high"],
+                "inside": row.get("inside"),
+            }
+            for key, words in (
+                ("without_nuisances", "without nuisances"),
+                ("as_in_the_paper", "paper's filter"),
+            ):
+                other = record[key]
+                found = None if other is None else _moduli(other["parameters"])[k]
+                plain |= {
+                    f"{words} [MPa]": None if found is None else found["estimate"],
+                    f"{words} 95 % low [MPa]": None if found is None else found["low"],
+                    f"{words} 95 % high [MPa]": None if found is None else found["high"],
+                    f"{words} inside": None if found is None else found.get("inside"),
+                    f"{words} ended": None if other is None else other["reason"],
+                }
+            paper = record["paper_patient"]["moduli"]
+            plain["paper's estimate for its patient [MPa]"] = paper[k] if paper else None
+            rows.append(plain)
+    return pd.DataFrame(rows)
+
+
+def table3(records: Sequence[Record]) -> pd.DataFrame:
+    """One row for each patient and frame: distances generic, registered, personalised, mm."""
+    rows = []
+    for record in records:
+        for distance in record["distances"]:
+            plain: dict[str, Any] = {
+                "patient": record["case"]["name"],
+                "frame": distance["frame"],
+                "shown to the filter": distance["seen"],
+            }
+            for which in WHICH:
+                plain[f"{which} mean [mm]"] = distance[which]["mean"]
+                plain[f"{which} SD [mm]"] = distance[which]["std"]
+            generic, own = distance["generic"]["mean"], distance["personalised"]["mean"]
+            plain["closer [%]"] = 100.0 * (generic - own) / generic
+            truth = distance["to_truth"]
+            for which in WHICH:
+                plain[f"{which} to the truth [mm]"] = (
+                    None if truth is None else truth[which]["mean"]
+                )
+            paper = record["paper_patient"]["distance_mm"] if distance["seen"] else []
+            plain["paper generic [mm]"] = paper[0] if paper else None
+            plain["paper personalised [mm]"] = paper[1] if paper else None
+            rows.append(plain)
+    return pd.DataFrame(rows)
+
+
+def write_patient_tables(results: Path) -> list[Path]:
+    """``table2.*``, ``table3.*`` and ``figure3.*`` from the kept patients; none if there are none.
+
+    Raises
+    ------
+    InputError
+        If a record is damaged or a file cannot be written.
+    """
+    kept = read_kept(results, PATIENTS)
+    records = list(kept.values())
+    if not records:
+        return []
+    line = provenance_of(records)
+    second, third = table2(records), table3(records)
+    written = write_table(
+        results / "table2", second, _readable2(records), line, [NOTE, *_words2(second, records)]
+    )
+    if not third.empty:
+        written += write_table(
+            results / "table3", third, _readable3(third), line, [NOTE, *distance_words(third)]
+        )
+    fields = {
+        records[k]["case"]["name"]: read_case_fields(results / PATIENTS / f"{name}.npz")
+        for k, name in enumerate(kept)
+        if (results / PATIENTS / f"{name}.npz").is_file()
+    }
+    if fields:
+        written += save_figure(results / "figure3", figure3(fields), records[0])
+    return written
+
+
+def _readable2(records: Sequence[Record]) -> list[dict[str, str]]:
+    rows = []
+    for record in records:
+        row = {"patient (simulated)": _name(record)}
+        others = {
+            "without nuisances": record["without_nuisances"],
+            "paper's filter": record["as_in_the_paper"],
+        }
+        for k, found in enumerate(_moduli(record["unknowns"])):
+            short = "E_AL" if k == 0 else "E_PL"
+            row[f"{short} truth"] = number(found["truth"])
+            row[f"{short} estimate, 95 %"] = interval_words(found)
+            for words, other in others.items():
+                row[f"{short} {words}"] = _other_words(other, k)
+        rows.append(row)
+    return rows
+
+
+def _other_words(other: Mapping[str, Any] | None, k: int) -> str:
+    """What another estimation says of modulus k."""
+    if other is None:
+        return MISSING
+    row = _moduli(other["parameters"])[k]
+    if row["estimate"] is None:
+        return "none found"
+    return interval_words(row) + ("" if other["status"] == "converged" else ", not converged")
+
+
+def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
+    rows = []
+    for _, row in table.iterrows():
+        frame = row["frame"] + ("" if row["shown to the filter"] else " (not shown)")
+        rows.append(
+            {
+                "patient (simulated)": _words(row["patient"]),
+                "frame": frame,
+                **{f"{which} [mm]": _mean_and_sd(row, which) for which in WHICH},
+                "closer": f"{row['closer [%]']:.0f} %",
+                "to the truth, each of these [mm]": " / ".join(
+                    number(row[f"{which} to the truth [mm]"], 2) for which in WHICH
+                ),
+                "paper [mm]": MISSING
+                if pd.isna(row["paper generic [mm]"])
+                else f"{row['paper generic [mm]']:.2f} → {row['paper personalised [mm]']:.2f}",
+            }
+        )
+    return rows
+
+
+def _mean_and_sd(row: Any, which: str) -> str:
+    return f"{row[f'{which} mean [mm]']:.2f} ± {row[f'{which} SD [mm]']:.2f}"
+
+
+def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
+    """What Table 2 says, in numbers."""
+    known = table[table["inside"].notna()]
+    said = [
+        f"The 95 % interval contains the truth for {int(known['inside'].sum())} of {len(known)} "
+        "moduli"
+    ]
+    for words in ("without nuisances", "paper's filter"):
+        column = table[f"{words} inside"]
+        if column.notna().any():
+            said.append(f"{words} for {int(column.sum())} of {int(column.notna().sum())}")
+    if known.empty:
+        return ["No estimation of these patients found moduli."]
+    relative = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
+    out = [
+        "; ".join(said) + ".",
+        f"Width of the interval over the estimate: {relative.min():.2f} to {relative.max():.2f}, "
+        f"mean {relative.mean():.2f}.",
+    ]
+    narrow = _narrower(records)
+    if narrow:
+        out.append("What would narrow it, on average: " + "; ".join(narrow) + ".")
+    return out
+
+
+def _narrower(records: Sequence[Record]) -> list[str]:
+    """By how much intervals would shrink if something were known, the most first."""
+    ratios: dict[str, list[float]] = {}
+    for record in records:
+        for row in record["narrow"]:
+            what = row["what"].partition(", ")[2]
+            ratios.setdefault(what, []).append(1.0 - row["std_if_known"] / row["std_now"])
+    ordered = sorted(ratios.items(), key=lambda item: -np.mean(item[1]))
+    return [f"{what} by {100 * np.mean(values):.0f} %" for what, values in ordered]
+
+
+def distance_words(table: pd.DataFrame) -> list[str]:
+    """What a table of distances (see :func:`table3`) says, in numbers."""
+    out: list[str] = []
+    if table.empty:
+        return out
+    for seen, group in table.groupby("shown to the filter", sort=False):
+        closer = group["closer [%]"]
+        out.append(
+            f"{'Frame that the filter was shown' if seen else 'Frame that it was not shown'}: "
+            f"personalised closer than generic in {int((closer > 0).sum())} of {len(group)}, by "
+            f"{closer.mean():.0f} % on average; "
+            f"closer than the generic valve laid rigidly on the closed frame in "
+            f"{int((group['personalised mean [mm]'] < group['registered mean [mm]']).sum())}."
+        )
+    held = table[~table["shown to the filter"].astype(bool)]
+    if len(held):
+        columns = [f"{which} mean [mm]" for which in WHICH]
+        mean = held.groupby("patient", sort=False)[columns].mean()
+        own = mean["personalised mean [mm]"]
+        patients = int((own < mean["generic mean [mm]"]).sum())
+        nearer = int((own < mean["registered mean [mm]"]).sum())
+        out.append(
+            f"On the mean of the frames that it was not shown: closer than generic for "
+            f"{patients} of {len(mean)} patients, than the rigidly laid one for {nearer}."
+        )
+    columns = [f"{which} to the truth [mm]" for which in WHICH]
+    if table[columns].notna().all(axis=None):
+        told = ", ".join(
+            f"{table[c].mean():.2f} mm {w}" for c, w in zip(columns, WHICH, strict=True)
+        )
+        out.append(f"Mean distance to where the valve truly was, all frames: {told}.")
+    return out
+
+
+def figure3(fields: Mapping[str, CaseFields]) -> Figure:
+    """The closed valves from the atrium, generic beside personalised, on one scale for all.
+
+    Parameters
+    ----------
+    fields : mapping
+        Name of each patient -> its arrays.
+    """
+    distances = []
+    for found in fields.values():
+        if found.distance_generic is None or found.distance_fitted is None:
+            raise InputError("Figure 3 needs the distances of the generic and personalised valves")
+        distances += [found.distance_generic[found.closed], found.distance_fitted[found.closed]]
+    top = distance_top(*distances)
+    scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
+    columns = len(fields)
+    figure = Figure(figsize=(2.6 * columns + 0.6, 5.4), layout="constrained")
+    grid = figure.subplots(2, columns, squeeze=False)
+    for column, (name, found) in enumerate(fields.items()):
+        k = found.closed
+        shapes = (
+            ("generic", found.generic, found.distance_generic),
+            ("personalised", found.fitted, found.distance_fitted),
+        )
+        drawn = []
+        for row, (words, positions, distance) in enumerate(shapes):
+            assert positions is not None
+            assert distance is not None
+            axes = grid[row, column]
+            colours = corner_colours(scale, distance[k], found.triangles)
+            draw_valve(axes, found, positions[k], colours, ATRIUM, k + 1, strength=0.3)
+            title = f"{_words(name)}\n" if row == 0 else ""
+            axes.set_title(f"{title}{spread(distance[k])}", fontsize=9)
+            if column == 0:
+                axes.text(
+                    -0.06, 0.5, words, transform=axes.transAxes, rotation=90, va="center",
+                    ha="right", fontsize=11,
+                )  # fmt: skip
+            drawn.append(positions[k])
+        same_scale(list(grid[:, column]), drawn, ATRIUM)
+    bar = figure.colorbar(scale, ax=grid, shrink=0.7, pad=0.01, extend="max")
+    bar.set_label("distance from the observed closed valve [mm]")
+    figure.suptitle(
+        "Closed valves of virtual patients (simulated), seen from the atrium", fontsize=11
+    )
+    return figure
+
+
+# -- words ----------------------------------------------------------------------------------------
+def _moduli(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    return [row for row in rows if row["name"].startswith("E_f.")]
+
+
+def interval_words(row: Mapping[str, Any]) -> str:
+    """Estimate and interval of an unknown, crossed if the truth is not in it."""
+    if row["estimate"] is None:
+        return MISSING
+    outside = " ✗" if row.get("inside") is False else ""
+    return f"{number(row['estimate'])} ({number(row['low'])} to {number(row['high'])}){outside}"
+
+
+def _name(record: Record) -> str:
+    return _words(record["case"]["name"])
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def provenance_of(records: Sequence[Record]) -> str:
+    """Where the first of several records came from, and how many there are besides."""
+    lines = sorted({provenance_line(record) for record in records})
+    return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
+
+
+def write_table(
+    base: Path,
+    table: pd.DataFrame,
+    readable: Sequence[Mapping[str, str]],
+    line: str,
+    notes: Sequence[str],
+) -> list[Path]:
+    """Write a table as CSV, Markdown and LaTeX, with notes and provenance; returns the paths."""
+    words = "\n\n".join(notes)
+    comment = "".join(f"% {note}\n" for note in [*notes, line])
+    return [
+        write_text(base.with_suffix(".csv"), f"# {line}\n" + table.to_csv(index=False)),
+        write_text(base.with_suffix(".md"), f"{markdown_rows(readable)}\n\n{words}\n\n{line}\n"),
+        write_text(base.with_suffix(".tex"), comment + latex_rows(readable)),
+    ]

@@ -1,0 +1,356 @@
+"""A volume over time to its moduli: valve found, measured, written as a case, and personalised."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.cases.own_case import run_case
+from experiments.common.progress import PartBar
+from mvest.cases.case import ValveCase
+from mvest.cases.csv_files import read_numbers
+from mvest.cases.from_images import (
+    CaseFrames,
+    CaseTexts,
+    case_of_sequence,
+    choose_frames,
+    closed_frame,
+    measure_sequence,
+    samples_in_world,
+    without_mean_error,
+    write_for_slicer,
+    write_measures,
+    write_surfaces,
+)
+from mvest.cases.from_images.measures import Row
+from mvest.cases.pressure_curve import PressureCurve
+from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.writer import write_case
+from mvest.errors import ConfigurationError, InputError
+from mvest.imaging.detection.model import (
+    MODEL_FILE,
+    DetectionModel,
+    default_model,
+    load_model,
+)
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.landmarks import LANDMARKS
+from mvest.imaging.markups import read_markups
+from mvest.imaging.reading.reader import read_volume
+from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reporting.figures import save_figure_with
+from mvest.reporting.images.figures import measures_figure
+from mvest.reporting.images.montage import montage_figure
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["FoundValve", "check_volume", "find_valve", "run_volume", "write_image_step"]
+
+Values = Mapping[str, Any]
+
+IMAGES, CASE = "images", "case"
+"""Folders of what the image step writes, and of the case."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundValve:
+    """What the image step found in a volume.
+
+    Attributes
+    ----------
+    volume : VolumeSequence
+    valve : ValveSequence
+    rows : list of dict
+        Measures of every frame.
+    frames : CaseFrames
+    case : ValveCase
+    model : dict
+        What is known of the detection model, plain data.
+    """
+
+    volume: VolumeSequence
+    valve: ValveSequence
+    rows: list[Row]
+    frames: CaseFrames
+    case: ValveCase
+    model: dict[str, Any]
+
+
+def run_volume(
+    config: Values, config_hash: str, folder: Path, started: float
+) -> tuple[dict[str, Any], list[Path]]:
+    """Find the valve of the configured volume and personalise it: its record, and the files."""
+    found = find_valve(config)
+    about = write_image_step(found, folder)
+    for sentence in about["sentences"]:
+        print(sentence, file=sys.stderr)
+    case = folder / CASE
+    record, files = run_case(
+        {**config, "case": str(case)}, config_hash, folder, started, {"image_step": about}
+    )
+    return record, files
+
+
+def check_volume(config: Values, folder: Path) -> str:
+    """Find, measure and draw the valve without simulating anything: what to tell the user."""
+    about = write_image_step(find_valve(config), folder)
+    return "\n".join([*about["sentences"], f"In order; drawn in {folder / 'montage.png'}"])
+
+
+def find_valve(config: Values) -> FoundValve:
+    """The valve of the configured volume, and the case that it makes.
+
+    Raises
+    ------
+    MvestError
+        If the volume cannot be read, shows no valve, or the valve found makes no case.
+    """
+    told = config["imaged"]
+    if config["volume"] is None:
+        raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
+    # What is asked for, before anything that takes long.
+    by_hand = _landmarks(_pairs("landmarks", told["landmarks"], str))
+    held = _pairs("held_out", told["held_out"], float)
+    curve = _pressure_curve(told)
+    thickness = _thickness(told["thickness_mm"])
+    volume = read_volume(
+        Path(config["volume"]),
+        modality=_modality(told["modality"]),
+        frame_interval_s=told["frame_interval_s"],
+        time_unit=told["time_unit"],
+    )
+    if len(volume.times) < 2:
+        raise InputError(
+            f"{volume.source}: one frame, expected two or more: the valve open and closed"
+        )
+    if told["model"] is None and volume.modality is not Modality.ULTRASOUND:
+        raise ConfigurationError(
+            f"imaged.model is not given; for {volume.modality.value} no model comes with the "
+            "package: expected a detection model's file"
+        )
+    model = default_model() if told["model"] is None else load_model(Path(told["model"]))
+    if model.accuracy is None:
+        raise InputError(
+            f"{told['model'] or MODEL_FILE}: its accuracy was never measured, expected a model "
+            "whose was"
+        )
+    if thickness is not None and set(thickness) != set(model.shape.layout.region_names):
+        raise ConfigurationError(
+            f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
+            f"{', '.join(model.shape.layout.region_names)}"
+        )
+    tracking = TrackingSettings(least_confidence=told["valve_confidence"])
+    with PartBar("valve in the frames", len(volume.times), "frame") as bar:
+        valve = detect_valve(
+            volume,
+            model,
+            tracking,
+            landmarks=by_hand,
+            progress=lambda _done, _all: bar.step(),
+        )
+    rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
+    frames = _frames(told, curve, held, valve, rows)
+    texts = CaseTexts(
+        told["name"] or Path(config["volume"]).name.partition(".")[0],
+        told["description"],
+        told["source"] or volume.source,
+        told["licence"],
+        told["simulated"],
+    )
+    accuracy = model.accuracy
+    corrected, errors, tip_errors = without_mean_error(
+        valve, frames, accuracy.samples, accuracy.tip_samples
+    )
+    kept = _thinned(len(errors), told["error_samples"])
+    case = case_of_sequence(
+        corrected,
+        frames,
+        texts,
+        thickness_mm=thickness,
+        error_samples=samples_in_world(corrected, frames, errors[kept], tip_errors[kept]),
+    )
+    off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
+    case = replace(
+        case,
+        derived=(
+            *case.derived,
+            "leaflets and tips: less the mean error of the detectors in simulated volumes "
+            f"({off.mean():.2f} mm in the closed frame)",
+        ),
+    )
+    return FoundValve(volume, valve, rows, frames, case, _about(model))
+
+
+def write_image_step(found: FoundValve, folder: Path) -> dict[str, Any]:
+    """Write pictures, measures, surfaces, landmarks and the case; what the record says of it."""
+    images, case = folder / IMAGES, folder / CASE
+    for place in (images, case):
+        # Of an earlier run.
+        shutil.rmtree(place, ignore_errors=True)
+    images.mkdir(parents=True)
+    name, line = found.case.name, f"volume {found.volume.sha256[:12]}"
+    drawn = {
+        "montage": (
+            montage_figure(found.volume, found.valve, title=name, closed=found.frames.closed),
+            "The valve as it was found, drawn on the volume.",
+        ),
+        "measures_over_time": (
+            measures_figure(found.rows, title=name),
+            "Measures of the valve over time. Hollow: frames of low confidence.",
+        ),
+    }
+    pictures = {}
+    for key, (figure, caption) in drawn.items():
+        save_figure_with(folder / key, figure, line)
+        pictures[key] = {"file": f"{key}.png", "caption": caption}
+    write_measures(images, found.rows)
+    write_surfaces(images, found.valve)
+    write_for_slicer(
+        images,
+        found.volume,
+        found.valve,
+        float(found.case.surface.thickness.mean()),
+        [found.frames.open, found.frames.closed],
+    )
+    write_case(case, found.case)
+    return {
+        "pictures": pictures,
+        "sentences": _sentences(found),
+        "frames": [dict(row) for row in found.rows],
+        "files": [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"],
+        "model": found.model,
+        "volume": {
+            "source": found.volume.source,
+            "sha256": found.volume.sha256,
+            "modality": found.volume.modality.value,
+            "shape": list(found.volume.frames.shape),
+            "spacing_mm": found.volume.spacing.tolist(),
+        },
+        "open_frame": found.frames.open,
+        "closed_frame": found.frames.closed,
+        "confidence": found.valve.frame_confidence.tolist(),
+        "std_mm": found.case.uncertainty.typical_mm,
+        "correlation_length_mm": found.case.uncertainty.correlation_length_mm,
+    }
+
+
+def _sentences(found: FoundValve) -> list[str]:
+    volume, valve = found.volume, found.valve
+    confidence = valve.frame_confidence
+    size = " x ".join(map(str, volume.frames.shape[1:]))
+    return [
+        f"{volume.source}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
+        f"Valve found with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
+        f"(open frame {found.frames.open}: {confidence[found.frames.open]:.2f}, closed frame "
+        f"{found.frames.closed}: {confidence[found.frames.closed]:.2f}).",
+        "The detectors were trained and tested on simulated volumes only; their error there is "
+        f"{found.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
+        f"{found.case.uncertainty.correlation_length_mm:.0f} mm.",
+        *(f"Derived: {sentence}." for sentence in found.case.derived),
+    ]
+
+
+def _modality(name: str | None) -> Modality | None:
+    known = [modality.value for modality in Modality]
+    if name is not None and name not in known:
+        raise ConfigurationError(f"imaged.modality = {name!r}, expected one of {', '.join(known)}")
+    return None if name is None else Modality(name)
+
+
+def _thickness(given: Sequence[float]) -> dict[str, float] | None:
+    names = ("anterior", "posterior")
+    if given and len(given) != len(names):
+        raise ConfigurationError(
+            f"imaged.thickness_mm = {list(given)}, expected one number for each of "
+            f"{', '.join(names)}, or none"
+        )
+    return dict(zip(names, given, strict=True)) if given else None
+
+
+def _pressure_curve(told: Values) -> PressureCurve | None:
+    """The configured curve, or None where the pressure in the closed frame is given."""
+    if (told["pressure_mmHg"] is None) == (told["pressure_curve"] is None):
+        raise ConfigurationError(
+            "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
+            "pressure on the closed valve"
+        )
+    if told["pressure_curve"] is None:
+        return None
+    table = read_numbers(Path(told["pressure_curve"]), ("time", "pressure"))
+    return PressureCurve(table[:, 0], table[:, 1])
+
+
+def _pairs(setting: str, given: Sequence[Any], kind: type) -> dict[int, Any]:
+    """Frame -> value of a setting that is a list of pairs."""
+    found: dict[int, Any] = {}
+    for pair in given:
+        whole = isinstance(pair, Sequence) and len(pair) == 2 and isinstance(pair[0], int)
+        if not whole or not isinstance(pair[1], (kind, int) if kind is float else kind):
+            raise ConfigurationError(
+                f"imaged.{setting} has {pair!r}, expected [frame, "
+                f"{'mmHg' if kind is float else 'FILE'}]"
+            )
+        found[pair[0]] = kind(pair[1])
+    return found
+
+
+def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | None:
+    """Frame -> name -> position, of the files that a configuration names."""
+    found: dict[int, dict[str, FloatArray]] = {}
+    for frame, file in files.items():
+        points = {
+            label: item.points[k]
+            for item in read_markups(Path(file)).values()
+            if item.kind == "Fiducial"
+            for k, label in enumerate(item.labels)
+        }
+        strange = sorted(set(points) - set(LANDMARKS))
+        if strange or not points:
+            raise InputError(
+                f"{file}: points {', '.join(strange) or 'none'}, expected some of "
+                f"{', '.join(LANDMARKS)}"
+            )
+        found[frame] = points
+    return found or None
+
+
+def _frames(
+    told: Values,
+    curve: PressureCurve | None,
+    held: Mapping[int, float],
+    valve: ValveSequence,
+    rows: list[Row],
+) -> CaseFrames:
+    pressure, closed, count = told["pressure_mmHg"], told["closed_frame"], len(valve.times)
+    least = told["least_confidence"]
+    if curve is not None:
+        if closed is None:
+            sure = [row for row in rows if (row["confidence"] or 0.0) >= least]
+            closed = closed_frame(sure)
+        if closed is None or not 0 <= closed < count:
+            raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
+        pressure = curve(float(valve.times[closed]))
+    return choose_frames(
+        valve,
+        rows,
+        float(pressure),
+        open_=told["open_frame"],
+        closed=closed,
+        held_out=held,
+        least_confidence=least,
+    )
+
+
+def _thinned(count: int, wanted: int) -> IntArray:
+    """Numbers of evenly spread samples of the errors, at most ``wanted``."""
+    return np.unique(np.linspace(0, count - 1, wanted).round().astype(np.int64))
+
+
+def _about(model: DetectionModel) -> dict[str, Any]:
+    return {"sha256": model.sha256, "trained_on": model.trained_on}

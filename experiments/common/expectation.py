@@ -1,0 +1,164 @@
+"""What ``check=true`` says before any data are taken: the answer of the Fisher information."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.build import Twin, build_filter, build_twin
+from experiments.common.cases.own_case import read_configured, settings_of
+from experiments.common.progress import SolveBar
+from experiments.common.whole_cycle import cycle_model, stored_cycle
+from experiments.studies.patient.study import make_patient
+from mvest.estimation import Prediction
+from mvest.personalise import foresee_case
+from mvest.problem.expectation import Foresight, foresee, foresee_model
+from mvest.problem.study import SharedStart, simulate_observation
+from mvest.provenance import config_hash
+from mvest.reporting.expectation import foresight_text
+from mvest.typing import FloatArray
+
+__all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "foresee_patient", "told"]
+
+Values = Mapping[str, Any]
+
+OF_THE_MODEL = ("valve", "mesh", "mechanics", "parameters", "fixed", "guided")
+"""Parts of a configuration on which a closure depends, besides where it is computed."""
+
+
+@dataclass(slots=True)
+class TwinForesight:
+    """Answers for synthetic studies; jobs of a sweep that begin alike share their closure."""
+
+    _known: dict[str, Prediction] = field(default_factory=dict)
+
+    def __call__(self, config: Values, _folder: Path | None = None) -> str:
+        """The answer for one configuration.
+
+        Raises
+        ------
+        MvestError
+            If a setting is inadmissible.
+        """
+        twin = build_twin(config)
+        start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
+        observed = config["observation"]
+        key = config_hash(
+            {part: config[part] for part in OF_THE_MODEL}
+            | {"at": start.tolist(), "observed": [observed["columns"], observed["rows"]]}
+        )
+        with SolveBar(config["name"], len(twin.model.settings.protocol.steps()), 1) as bar:
+            twin.model.on_step = bar.step
+            if key not in self._known:
+                self._known[key] = SharedStart(twin.model, start)(start)
+        title = f"{config['name']}, {config['row']}"
+        return told(title, _foreseen(twin, self._known[key], start), _noise(config))
+
+
+def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Foresight | str:
+    """What to expect where the model is known at the start alone; the reason if it is not."""
+
+    def model(m: FloatArray) -> Prediction:
+        return first if np.array_equal(m, start) else Prediction.failed("not the start")
+
+    if not first.converged:
+        return first.reason
+    data = simulate_observation(
+        model,
+        twin.case.parameters,
+        start,
+        frames=twin.frames,
+        variance=twin.variance,
+        correlation=twin.correlation,
+        errors=twin.errors,
+        rng=np.random.default_rng(0),
+    )
+    assert data.observation is not None
+    return foresee(replace(twin.case, model=model), data.observation)
+
+
+def _noise(config: Values) -> str:
+    """How well coordinates are assumed to be seen, in words."""
+    std = np.sqrt(np.atleast_1d(np.asarray(config["filter"]["R"], dtype=float)))
+    length = config["filter"]["R_correlation_mm"]
+    errors = f"alike over {length:g} mm" if length else "independent"
+    return f"{' and '.join(f'{s:.3g}' for s in std)} mm of noise assumed, {errors}"
+
+
+def foresee_own(config: Values, _folder: Path | None = None) -> str:
+    """The answer for a case.
+
+    Raises
+    ------
+    MvestError
+        If the case is not in order.
+    """
+    case, settings = read_configured(config), settings_of(config)
+    store = Path(config["paths"]["outputs"]) / "meshes"
+    with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
+        found = foresee_case(case, settings, store=store, on_step=bar.step)
+    doubt = case.uncertainty
+    length = doubt.correlation_length_mm
+    errors = f"alike over {length:g} mm" if length else "independent"
+    return told(case.name, found, f"{doubt.typical_mm:.3g} mm of noise stated, {errors}")
+
+
+def foresee_patient(config: Values, folder: Path | None = None) -> str:
+    """The answer for the case of a virtual patient, which is simulated first unless it is there.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or the patient's valve does not close.
+    """
+    return foresee_own({**config, "case": str(make_patient(config).case)}, folder)
+
+
+def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
+    """The answer for all frames of a cycle.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible.
+    """
+    parameters = tuple(config["parameters"])
+    _, transform, prior = build_filter(config["filter"], parameters)
+    noise = config["cycle"]["noise_mm"]
+    model = cycle_model(config)
+    with SolveBar(config["name"], len(model.protocol.steps()), 1) as bar:
+        model.closure.on_step = bar.step
+        found = foresee_model(
+            stored_cycle(config, model),
+            prior,
+            noise**2,
+            parameters=parameters,
+            transform=transform,
+            frames=tuple(f"{t:g} s" for t in model.protocol.times),
+        )
+    return told(
+        f"{config['name']}, {config['row']}", found, f"{noise:g} mm of noise assumed, independent"
+    )
+
+
+def told(title: str, found: Foresight | str, noise: str) -> str:
+    """A foresight as text."""
+    if isinstance(found, str) or found.data is None:
+        reason = found if isinstance(found, str) else found.reason
+        return (
+            f"{title}: what the data will tell is not known, the model has no prediction at the "
+            f"assumed parameters ({reason})"
+        )
+    return foresight_text(
+        title,
+        found.assumed,
+        found.prior,
+        found.transform,
+        found.data,
+        found.informed,
+        f"{found.observations} numbers of {', '.join(found.frames)}; {noise}",
+    )

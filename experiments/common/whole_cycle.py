@@ -1,0 +1,162 @@
+"""The model of a whole cycle as it is configured, and what studies of it have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.forward import model_of
+from experiments.common.mirror import build
+from experiments.common.truth import StoredModel, truth_key
+from mvest.closure.cycle import CycleModel, CycleObservation, CycleProtocol
+from mvest.closure.robustness import GateCase
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation import (
+    Estimate,
+    Gaussian,
+    Identifiability,
+    ObservationModel,
+    Prediction,
+    shift_by_model_error,
+)
+from mvest.estimation.transform import to_filter
+from mvest.typing import FloatArray
+
+__all__ = [
+    "MeshShift",
+    "bound_entry",
+    "closed_frame",
+    "cycle_model",
+    "frames_on_mesh",
+    "shift_by_check_mesh",
+    "stored_cycle",
+    "stored_frames",
+]
+
+Values = Mapping[str, Any]
+
+
+def cycle_model(config: Values, **changes: Any) -> CycleModel:
+    """The configured model of a cycle, its protocol with ``changes``."""
+    protocol = build(CycleProtocol, {**config["cycle"]["protocol"], **changes})
+    return CycleModel(model_of(config, GateCase("reference")), protocol)
+
+
+def closed_frame(protocol: CycleProtocol) -> int:
+    """The last frame in which the valve is held closed."""
+    held = [k for k, t in enumerate(protocol.times) if protocol.phase(t) > 1 - 1e-9]
+    if not held:
+        raise ConfigurationError("cycle.protocol.times has no frame on the plateau of the pressure")
+    return held[-1]
+
+
+def bound_entry(label: str, frames: list[int], bound: Identifiability) -> dict[str, Any]:
+    """Plain data of a Cramér-Rao bound; standard deviations relative to the parameters."""
+    relative = bound.std / bound.scale
+    return {
+        "frames": label,
+        "count": len(frames),
+        "std": [float(v) if np.isfinite(v) else None for v in relative],
+        "correlation": [[_finite(v) for v in row] for row in bound.correlation],
+        "condition_number": _finite(bound.condition_number),
+        "flat": list(bound.flat(0.05)),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def stored_cycle(config: Values, model: CycleModel) -> StoredModel:
+    """A model of ``config`` whose runs are kept, so that a study goes on where it was stopped."""
+    return StoredModel(model, _store(config), _key(config, model), jacobian=True)
+
+
+def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArray:
+    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)``, simulated once."""
+
+    def positions(values: FloatArray) -> Prediction:
+        y = model.frames(values).ravel()
+        return Prediction(y, np.zeros((len(y), len(values))))
+
+    found = StoredModel(positions, _store(config), _key(config, model))(m)
+    return found.y.reshape(len(model.protocol.times), -1, 3)
+
+
+def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
+    """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh.
+
+    Cells and contact points are those of ``cycle.finer_...`` or ``cycle.check_...``, the time step
+    is shorter by ``cycle.finer_dt_factor``.
+
+    Raises
+    ------
+    InputError
+        If the cycle cannot be followed to its end.
+    """
+    settings = config["cycle"]
+    cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
+    points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
+    mechanics = {**config["mechanics"], "contact_points": points}
+    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
+    dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
+    return stored_frames(changed, cycle_model(changed, dt=dt), m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshShift:
+    """What a model's own mesh does to an estimate.
+
+    Attributes
+    ----------
+    shift : (p,)
+        Of the estimate, in the filter's coordinates.
+    distance_mm : float
+        Mean distance of what is seen on the two meshes.
+    """
+
+    shift: FloatArray
+    distance_mm: float
+
+
+def shift_by_check_mesh(
+    config: Values,
+    found: Estimate,
+    model: ObservationModel,
+    prior: Gaussian,
+    observation: CycleObservation,
+) -> MeshShift | str:
+    """How far its mesh may have moved an estimate, from one run of it on the "check" mesh.
+
+    ``model`` predicts what is seen in the observation, ``prior`` is of the parameters themselves. A
+    reason where there is no estimate or the cycle cannot be followed on that mesh.
+    """
+    if not found.converged:
+        return f"no estimate: {found.reason.value}"
+    predicted = model(found.mean)
+    try:
+        check = frames_on_mesh(config, found.mean, "check")
+    except InputError as error:
+        return f"on the mesh of the check: {error}"
+    off = check[observation.seen].ravel() - predicted.y
+    H = predicted.jacobian * found.transform.derivative(found.transform.forward(found.mean))
+    shift = shift_by_model_error(H, observation.R, off, to_filter(found.transform, prior))
+    return MeshShift(shift, float(np.linalg.norm(off.reshape(-1, 3), axis=1).mean()))
+
+
+def _store(config: Values) -> Path:
+    return Path(config["paths"]["outputs"]) / "cycles"
+
+
+def _key(config: Values, model: CycleModel) -> str:
+    parts = ("valve", "mechanics", "mesh", "parameters", "fixed")
+    described = {name: config[name] for name in parts}
+    observed = [config["observation"][name] for name in ("columns", "rows")]
+    return truth_key(
+        {**described, "observed": observed, "protocol": repr(model.protocol)},
+        more=("closure/cycle",),
+    )

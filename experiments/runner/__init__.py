@@ -1,0 +1,1 @@
+"""How a study is run: alone, in a sweep, on a cluster, tracked."""

@@ -1,0 +1,182 @@
+"""The folder of a job: whether it is done, who is at work in it, and why it has no estimate.
+
+A job is done when its marker is there and its result belongs to the asked configuration. The marker
+is made last, after everything else is on disk.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from experiments.runner.request import Request, model_settings
+from mvest.errors import InputError
+from mvest.provenance import provenance, write_json
+
+__all__ = [
+    "CONFIG",
+    "LOG",
+    "RESULT",
+    "clear",
+    "finished_record",
+    "is_done",
+    "last_record",
+    "lock",
+    "mark_done",
+    "read_result",
+    "require_writable",
+    "result_time",
+    "write_failure",
+]
+
+DONE, RESULT, CONFIG, LOG = "done", "result.json", "config.json", "log.txt"
+"""Files of a job: its marker, its record, its configuration, and what it said."""
+
+ABSENT = (
+    "estimate",
+    "std",
+    "relative_error",
+    "moduli_error_percent",
+    "distance_mm",
+    "distance_to_truth_mm",
+    "closure",
+    "iterates",
+    "iterate_std",
+    "innovation",
+    "identifiability",
+    "confirmed_mm",
+)
+"""What the record of a lost job has no value for."""
+
+
+def lock(folder: Path) -> FileLock:
+    """Keeps a second process out of the folder; falls with the process that holds it."""
+    return FileLock(folder / ".lock")
+
+
+def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
+    """The record in a folder if it is there and belongs to the configuration."""
+    try:
+        record = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    belongs = isinstance(record, dict) and record["provenance"]["config_hash"] == config_hash
+    return record if belongs else None
+
+
+def is_done(folder: Path) -> bool:
+    """Whether the job's marker is there."""
+    return (folder / DONE).exists()
+
+
+def result_time(folder: Path) -> int | None:
+    """When the record in a folder was written, in ns; None if there is none."""
+    try:
+        return (folder / RESULT).stat().st_mtime_ns
+    except OSError:
+        return None
+
+
+def finished_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+    """The record of a job that is done; None if it has to be run."""
+    return read_result(folder, config_hash) if is_done(folder) else None
+
+
+def last_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+    """What the last attempt ended with; None if it did not get to its end.
+
+    A record of success without the marker comes from a process that died before everything else was
+    on disk.
+    """
+    record = read_result(folder, config_hash)
+    if record is None or is_done(folder) == (record["status"] == "converged"):
+        return record
+    return None
+
+
+def mark_done(folder: Path) -> None:
+    """Say that everything of the job is on disk."""
+    (folder / DONE).touch()
+
+
+def clear(folder: Path) -> None:
+    """Take away what an earlier attempt left, its marker first."""
+    for name in (DONE, RESULT):
+        (folder / name).unlink(missing_ok=True)
+    # Files are written under such names and then take their own: these never did.
+    for place in folder.glob(".*.*"):
+        if place.suffix in (".tmp", ".npz", ".png", ".pdf", ".csv", ".md", ".tex"):
+            place.unlink(missing_ok=True)
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse a folder that cannot be written, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def write_failure(request: Request, reason: str, started: float) -> dict[str, Any]:
+    """Record that a job ended without anyone left to record it, and why.
+
+    Parameters
+    ----------
+    request : Request
+    reason : str
+    started : float
+        Seconds since the epoch.
+
+    Returns
+    -------
+    dict
+        The record, with the keys of a finished one.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    values = request.values
+    record: dict[str, Any] = {
+        **{key: values[key] for key in ("title", "row", "table", "paper", "parameters", "factors")},
+        "schema": 1,
+        "experiment": values["name"],
+        "status": "failed",
+        "reason": reason,
+        "detail": "",
+        "truth": values["truth"].get("values"),
+        "initial": values["filter"].get("initial"),
+        **dict.fromkeys(ABSENT),
+        "moduli": [],
+        "iterations": 0,
+        "forward_solves": 0,
+        "seconds": 0.0,
+        "seconds_total": time.time() - started,
+        "repeats": [],
+        "mesh": {},
+        "model": model_settings(values),
+        "provenance": {
+            **provenance(),
+            "config_hash": request.config_hash,
+            "mesh_hash": "none",
+            "seed": values["seed"],
+            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        },
+    }
+    write_json(request.folder / CONFIG, values)
+    write_json(request.folder / RESULT, record)
+    return record

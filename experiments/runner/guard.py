@@ -1,0 +1,207 @@
+"""Runs a job in a process apart, so that its death costs its own row and nothing else.
+
+Every worker of a launcher keeps one such process and gives it job after job: what is imported and
+compiled is paid for once. A process that was killed, or ran out of memory or time, is replaced.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+import experiments
+from experiments.runner.folder import (
+    clear,
+    finished_record,
+    lock,
+    read_result,
+    require_writable,
+    write_failure,
+)
+from experiments.runner.request import Request
+from experiments.runner.tracking import track_job
+from mvest.errors import MvestError
+from mvest.provenance import THREAD_VARIABLES
+
+__all__ = ["WorkerProcess", "run_apart", "run_guarded"]
+
+WORKER = (sys.executable, "-m", "experiments.runner.worker")
+"""Command of a process that runs jobs."""
+
+
+class WorkerProcess:
+    """A process that runs jobs, started when the first one comes and again when one has ended it.
+
+    Parameters
+    ----------
+    command : sequence of str
+    """
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+        self._process: subprocess.Popen[str] | None = None
+        atexit.register(self.close)
+
+    def run(self, request: Request, time_limit_s: float | None = None) -> str | None:
+        """Run one job; None if it left its record, otherwise the reason why it did not."""
+        process = self._started()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        expired = threading.Event()
+
+        def stop() -> None:
+            expired.set()
+            _kill(process)
+
+        timer = threading.Timer(time_limit_s or 0.0, stop)
+        timer.daemon = True
+        if time_limit_s is not None:
+            timer.start()
+        try:
+            process.stdin.write(json.dumps(request.to_json()) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        except BaseException:
+            # Interrupted: the job's process is not to go on alone.
+            self.close()
+            raise
+        finally:
+            timer.cancel()
+        if line.endswith("\n") and not expired.is_set():
+            answered = json.loads(line)
+            if not answered["healthy"]:
+                self.close()
+            return None if answered["reason"] is None else str(answered["reason"])
+        self.close()
+        if expired.is_set():
+            return f"time limit of {time_limit_s:g} s"
+        return _end(process.returncode)
+
+    def close(self) -> None:
+        """End the process, and whatever it has started."""
+        if self._process is not None:
+            _kill(self._process)
+            self._process.communicate()
+            self._process = None
+
+    def _started(self) -> subprocess.Popen[str]:
+        if self._process is not None and self._process.poll() is not None:
+            self.close()
+        if self._process is None:
+            # The package itself, wherever the command is typed.
+            places = [
+                str(Path(experiments.__file__).resolve().parents[1]),
+                os.environ.get("PYTHONPATH", ""),
+            ]
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                env=os.environ
+                | dict.fromkeys(THREAD_VARIABLES, "1")
+                | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+                start_new_session=True,
+            )
+        return self._process
+
+
+@cache
+def own_worker() -> WorkerProcess:
+    """The one that this process keeps."""
+    return WorkerProcess(WORKER)
+
+
+def run_guarded(config: DictConfig) -> dict[str, Any]:
+    """What a launcher runs for each job of a sweep: never raises for what happens to the job.
+
+    Returns
+    -------
+    dict
+        ``hash``, ``status`` and ``reason`` of the job, when it ``started`` and ``finished``
+        (seconds since the epoch) and in which ``process``.
+    """
+    started = time.time()
+    request = Request.of(config)
+    try:
+        record = run_apart(request)
+        status, reason = record["status"], record["reason"]
+    except (MvestError, OSError) as error:
+        status, reason = "failed", str(error)
+    return {
+        "hash": request.config_hash[:16],
+        "status": status,
+        "reason": reason,
+        "started": started,
+        "finished": time.time(),
+        "process": f"{os.uname().nodename}:{os.getpid()}",
+    }
+
+
+def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str, Any]:
+    """Run a job in a process apart unless it is done already; its record, whatever happened.
+
+    Parameters
+    ----------
+    request : Request
+    worker : WorkerProcess, optional
+        The one kept by this process if not given.
+
+    Raises
+    ------
+    MvestError
+        If nothing can be recorded.
+    """
+    values, started = request.values, time.time()
+    require_writable(request.folder)
+    worker = worker or own_worker()
+    with lock(request.folder):
+        if not values["force"]:
+            done = finished_record(request.folder, request.config_hash)
+            if done is not None:
+                return done
+        clear(request.folder)
+        reason = worker.run(request, values["time_limit_s"])
+        if reason is None:
+            record = read_result(request.folder, request.config_hash)
+            if record is not None:
+                return record
+            reason = "it left no record"
+        record = write_failure(request, reason, started)
+    track_job(request.folder, values)
+    return record
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    """End a process and its group."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+
+
+def _end(code: int | None) -> str:
+    """How a process ended, in words."""
+    if code is None or code >= 0:
+        return f"its process ended with exit status {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = "unknown"
+    hint = "; the system does so when memory runs out" if name == "SIGKILL" else ""
+    return f"killed by signal {-code} ({name}{hint})"

@@ -1,0 +1,92 @@
+"""One job, asked for in plain data, so that another process can be asked for it as well."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from experiments.common.config import NOT_THE_RESULT, hash_of, plain
+
+__all__ = ["Request", "as_published", "model_settings"]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One composed configuration and where it is run.
+
+    Attributes
+    ----------
+    values : dict
+        The resolved configuration.
+    config_hash : str
+        SHA-256 of what in it can change the result.
+    folder : Path
+        Output folder of the job.
+    publish_as : str or None
+        Name of its record in the results; None where they are not to be touched.
+    """
+
+    values: dict[str, Any]
+    config_hash: str
+    folder: Path
+    publish_as: str | None = None
+
+    @classmethod
+    def of(cls, config: DictConfig) -> Request:
+        """What Hydra composed for the job it is just starting."""
+        hydra = HydraConfig.get()
+        values = plain(config)
+        # A sweep is published as a whole.
+        publish = values["publish"] and not values["sweep"]
+        as_configured = as_published(hydra.overrides.task, hydra.sweeper.get("params"))
+        return cls(
+            values,
+            hash_of(config),
+            Path(hydra.runtime.output_dir),
+            _slug(values, hydra) if publish and as_configured else None,
+        )
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Request:
+        """The request that :meth:`to_json` wrote."""
+        return cls(**{**data, "folder": Path(data["folder"])})
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "values": self.values,
+            "config_hash": self.config_hash,
+            "folder": str(self.folder),
+            "publish_as": self.publish_as,
+        }
+
+
+def model_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a record says of the estimator's model."""
+    return {
+        "element": values["mechanics"]["element"],
+        "cells": [values["mesh"][key] for key in ("columns", "rows", "layers")],
+        "source": values["mesh"]["source"],
+        "filter": values["filter"]["mode"],
+        "noise_mm": values["observation"]["noise_mm"],
+    }
+
+
+def as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
+    """Whether a run is its experiment as configured: nothing overridden that changes the result."""
+    allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
+    keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
+    return all(key in allowed or key.partition(".")[0] in allowed for key in keys)
+
+
+def _slug(values: Mapping[str, Any], hydra: Any) -> str:
+    """Name of a published record: the experiment's, with its row if it has several."""
+    if str(hydra.mode).endswith("MULTIRUN"):
+        return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
+    return str(values["name"])

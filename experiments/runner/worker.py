@@ -1,0 +1,136 @@
+"""Runs jobs one after the other for the process that started it.
+
+Started as ``python -m experiments.runner.worker``.
+
+Requests come as lines of JSON on standard input, answers leave as lines of JSON on standard output.
+What a job itself prints, crashes of compiled code included, goes to the log in its folder. The
+process ends with the one that started it, also in the middle of a job: its input is then closed.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from experiments.runner.folder import LOG
+from experiments.runner.job import FailedRunError, compute
+from experiments.runner.request import Request
+from mvest.errors import MvestError
+
+__all__ = ["answer", "main"]
+
+PREFERRED_VICTIM = "500"
+"""Added to the badness by which Linux chooses whom to kill when memory runs out."""
+
+
+def main() -> None:
+    """Answer requests until the input is closed."""
+    requests = os.fdopen(os.dup(sys.stdin.fileno()), "r", encoding="utf-8")
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    # Neither what a job prints nor a program that it starts may reach these two.
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1):
+        os.dup2(nothing, stream)
+    faulthandler.enable()
+    _volunteer()
+    waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
+    while True:
+        request = Request.from_json(json.loads(waiting.get()))
+        with _output_to(request.folder / LOG):
+            answered = answer(request)
+        answers.write(json.dumps(answered) + "\n")
+        answers.flush()
+
+
+def answer(request: Request) -> dict[str, Any]:
+    """Run one job: ``{"reason": None}`` if it left its record, otherwise why it did not.
+
+    ``healthy`` says whether another job may be run in this process.
+    """
+    try:
+        compute(request)
+    except FailedRunError:
+        return {"reason": None, "healthy": True}
+    except MvestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return {"reason": _line(error), "healthy": True}
+    except MemoryError as error:
+        _trace(error)
+        return {"reason": f"out of memory: {_line(error)}".rstrip(": "), "healthy": False}
+    except OSError as error:
+        _trace(error)
+        return {"reason": _line(error), "healthy": True}
+    except Exception as error:
+        # Whatever it is costs its own job; the traceback is in the log.
+        _trace(error)
+        return {"reason": f"{type(error).__name__}: {_line(error)}", "healthy": False}
+    return {"reason": None, "healthy": True}
+
+
+def _line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return (str(error).strip().splitlines() or [""])[0]
+
+
+def _trace(error: BaseException) -> None:
+    sys.excepthook(type(error), error, error.__traceback__)
+
+
+def _listen(requests: TextIO, waiting: queue.SimpleQueue[str]) -> None:
+    """Pass requests on; at the end of the input, end this process and those it started."""
+    for line in requests:
+        waiting.put(line)
+    if os.getpgrp() == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(0)
+
+
+@contextmanager
+def _output_to(path: Path) -> Iterator[None]:
+    """Standard output and error of this process go to a file."""
+    log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o644)
+    before = [os.dup(stream) for stream in (1, 2)]
+    try:
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        yield
+    finally:
+        for stream, usual in zip((1, 2), before, strict=True):
+            _flush()
+            os.dup2(usual, stream)
+            os.close(usual)
+        os.close(log)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            # The log's disk is full; what became of the job is told by its answer.
+            continue
+
+
+def _volunteer() -> None:
+    """Let the system take this process before the one that could record its death."""
+    place = Path("/proc/self/oom_score_adj")
+    if place.exists():
+        try:
+            place.write_text(PREFERRED_VICTIM, encoding="ascii")
+        except OSError:
+            return
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Chordae by family: what of them is identified."""

@@ -1,0 +1,1 @@
+"""A closing valve, step by step."""

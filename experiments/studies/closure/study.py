@@ -1,0 +1,63 @@
+"""How the valve closes: one closure, every stored step measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.build import template_of
+from experiments.common.forward import forward_record, model_of, without_nan
+from mvest.closure.measures import measure_steps
+from mvest.closure.robustness import GateCase
+from mvest.typing import FloatArray
+from mvest.valve.geometry.surfaces import thicken
+from mvest.valve.mesh.embedding import embed
+
+__all__ = ["run_closure_study"]
+
+Values = Mapping[str, Any]
+Outcome = tuple[dict[str, Any], list[Path]]
+
+
+def run_closure_study(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
+    """Close the valve once and measure every stored step."""
+    from experiments.studies.closure.report import closure_figure
+    from mvest.reporting.figures import save_figure
+
+    values = np.array(config["truth"]["values"], dtype=float)
+    model = model_of(config, GateCase("reference"))
+    result = model.close(values, sensitivities=False, every_frame=True)
+    thickness = float(model.valve.surface.thickness.mean())
+    distance = (
+        0.5
+        * thickness
+        * (model.settings.contact.reference_distance + model.settings.contact.activation_distance)
+    )
+    observed = config["observation"]
+    normals = _normals(config, observed["columns"], observed["rows"])
+    steps = measure_steps(model, result, distance, normals)
+    record = forward_record(config, config_hash, model, values, started, 1)
+    record |= {"rows": [without_nan(asdict(s)) for s in steps], "contact_distance_mm": distance}
+    if not result.simulation.converged:
+        record |= {"status": "failed", "reason": result.simulation.reason.value}
+    surface = thicken(model.valve.surface, normals)
+    faces = embed(model.mesh, surface.vertices)
+    frames = np.stack([faces(x) for x in result.simulation.frames])
+    fields = folder / "fields.npz"
+    np.savez_compressed(
+        fields,
+        frames=frames.astype(np.float32),
+        times=result.simulation.times,
+        triangles=surface.triangles.astype(np.int32),
+        region=surface.region.astype(np.int8),
+    )
+    return record, save_figure(folder / "closure", closure_figure(record, fields), record)
+
+
+def _normals(config: Values, columns: int, rows: int) -> FloatArray:
+    j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    return template_of(config).normal(360.0 * i / columns, j / (rows - 1))

@@ -1,0 +1,1 @@
+"""What the frames of a cycle tell, and a modulus that drifts over beats."""

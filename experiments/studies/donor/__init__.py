@@ -1,0 +1,1 @@
+"""The recorded donor valve."""

@@ -1,0 +1,1 @@
+"""All filters on the same problems."""

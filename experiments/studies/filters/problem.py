@@ -1,0 +1,263 @@
+"""One estimation problem on which all filters are compared, and a surrogate of its model.
+
+The surrogate serves where hundreds of estimations are needed: for the share of intervals that hold
+the truth. What filters cost, and what they say of one observation, comes from the model itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from experiments.common.build import build_twin
+from mvest.errors import ConfigurationError
+from mvest.estimation import (
+    Gaussian,
+    Log,
+    ObservationModel,
+    Prediction,
+)
+from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
+from mvest.estimation.transform import to_filter
+from mvest.observation.vertices import ObservedFrames
+from mvest.reporting.files import write_with
+from mvest.typing import FloatArray
+
+__all__ = ["Problem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
+
+Values = Mapping[str, Any]
+
+TRANSFORM = Log()
+"""All unknowns are positive."""
+
+SPARE = 2.0
+"""Numbers to which a surrogate is fitted for each of its terms."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is estimated from what, for every filter.
+
+    Attributes
+    ----------
+    name : str
+    parameters : tuple of str, (p,)
+    model : TimedModel
+        Predicts the observation ``y (n,)`` mm.
+    prior : Gaussian
+        Of the parameters; normal in their logarithms.
+    truth : (p,)
+        Of the one observation that every filter is given. No filter is.
+    noise : float
+        Standard deviation of each coordinate, mm.
+    observations : int
+        n.
+    mesh_hash : str
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    model: TimedModel
+    prior: Gaussian
+    truth: FloatArray
+    noise: float
+    observations: int
+    mesh_hash: str
+
+    @cached_property
+    def exact(self) -> FloatArray:
+        """The observation ``y (n,)`` mm of the truth without errors.
+
+        Raises
+        ------
+        ConfigurationError
+            If the true valve does not close.
+        """
+        self.model.restart()
+        prediction = self.model(self.truth)
+        if not prediction.converged:
+            raise ConfigurationError(f"{self.name}: the true valve fails: {prediction.reason}")
+        return prediction.y
+
+    @property
+    def log_prior(self) -> Gaussian:
+        """The prior of the logarithms."""
+        return to_filter(TRANSFORM, self.prior)
+
+
+class TimedModel:
+    """A model, the CPU seconds that it took and how often it was run.
+
+    Every estimation begins from the same closed state (``restart``), so that no filter gains from
+    what another has computed before it.
+    """
+
+    def __init__(self, model: ObservationModel, restart: Any) -> None:
+        self._model, self._restart = model, restart
+        self.seconds, self.runs = 0.0, 0
+
+    def restart(self) -> None:
+        """Forget all closed states, so that the next run begins with the open valve."""
+        self._restart()
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        began = time.process_time()
+        prediction = self._model(m)
+        self.seconds += time.process_time() - began
+        self.runs += 1
+        return prediction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurrogateModel:
+    """A surrogate of the logarithms' prior, N(0, I), as a model of the parameters themselves.
+
+    Beyond its region it fails, as a valve does that does not close.
+    """
+
+    surrogate: Surrogate
+    prior: Gaussian
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        x = (np.log(m) - self.prior.mean) / self.prior.std
+        if not self.surrogate.region.holds(x[None])[0]:
+            return Prediction.failed("beyond the region of the surrogate")
+        jacobian = self.surrogate.jacobian(x) / (self.prior.std * m)
+        return Prediction(self.surrogate(x[None])[0], jacobian)
+
+
+def build_problem(config: Values, name: str) -> Problem:
+    """One of the configured problems.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible.
+    """
+    settings = config["filters"]["problems"][name]
+    parameters = tuple(settings["parameters"])
+    mean = np.array(settings["initial"], dtype=float)
+    spread = np.array(settings["log_std"], dtype=float)
+    if mean.shape != (len(parameters),) or spread.shape != mean.shape:
+        raise ConfigurationError(
+            f"filters.problems.{name}: expected one initial and one log_std for each of "
+            f"{', '.join(parameters)}"
+        )
+    prior = Gaussian.from_variance(mean, (spread * mean) ** 2)
+    values = {
+        **config,
+        "parameters": list(parameters),
+        "fixed": {**config["fixed"], **settings["fixed"]},
+        "truth": {**config["truth"], "values": settings["truth"]},
+        "filter": {**config["filter"], "initial": mean.tolist(), "P0": np.diag(prior.covariance)},
+        "observation": {
+            **config["observation"],
+            "frames": ["closed"],
+            "columns": settings["columns"],
+            "rows": settings["rows"],
+        },
+        "guided": False,
+    }
+    twin = build_twin(values)
+    model = twin.model
+    seen = np.zeros((1, len(twin.valve.surface.vertices)), dtype=np.bool_)
+    seen[:, :: settings["every"]] = True
+    return Problem(
+        name,
+        parameters,
+        TimedModel(ObservedFrames(model, ("closed",), seen), lambda: model.restart(None)),
+        prior,
+        twin.truth_values,
+        float(settings["noise_mm"]),
+        3 * int(seen.sum()),
+        model.mesh.sha256,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedSurrogate:
+    """A surrogate over the prior, and how far it is from the model.
+
+    Attributes
+    ----------
+    model : SurrogateModel
+    runs : int
+        To which it was fitted.
+    held_out : int
+        Further runs.
+    rms_mm, largest_mm : float
+        Error of a coordinate over the held-out runs.
+    """
+
+    model: SurrogateModel
+    runs: int
+    held_out: int
+    rms_mm: float
+    largest_mm: float
+
+
+def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurrogate:
+    """A polynomial over the prior out to ``reach`` standard deviations.
+
+    Each run of the model is kept in the folder ``store`` and read from there if it is there.
+    """
+    p, count = len(problem.parameters), settings["surrogate_runs"]
+    wanted = count + settings["held_out"]
+    region = Region(np.zeros(p), settings["reach"] * np.eye(p))
+    sobol = qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
+    # The first of Sobol's points are a design by themselves; the further ones lie between them.
+    points = region.points(2.0 * sobol.random_base2((wanted - 1).bit_length())[:wanted] - 1.0)
+    _run_all(problem, points, store)
+    kept = {k: run for k in range(wanted) if (run := _read(store, k))[0].size}
+    number = np.array(sorted(kept), dtype=np.int64)
+    at, fitted = points[number], int(np.sum(number < count))
+    if fitted < 3 * p or len(number) == fitted:
+        raise ConfigurationError(
+            f"{problem.name}: the model fails at too many of {wanted} points of the prior"
+        )
+    y, by_x = (np.array([kept[k][part] for k in number]) for part in (0, 1))
+    degree = affordable_degree(fitted * (1 + p), p, settings["degree"], SPARE)
+    surrogate = fit_surrogate(at[:fitted], y[:fitted], by_x[:fitted], region, degree)
+    error = surrogate(at[fitted:]) - y[fitted:]
+    return FittedSurrogate(
+        SurrogateModel(surrogate, problem.log_prior),
+        fitted,
+        len(number) - fitted,
+        float(np.sqrt(np.mean(error**2))),
+        float(np.abs(error).max()),
+    )
+
+
+def _run_all(problem: Problem, points: FloatArray, store: Path) -> None:
+    """Run the model at points of the logarithms' prior, N(0, I), that are not in the store.
+
+    They are run from neighbour to neighbour, since a closure goes on from the one before.
+    """
+    store.mkdir(parents=True, exist_ok=True)
+    log_prior = problem.log_prior
+    left = {k for k in range(len(points)) if not (store / f"{k}.npz").is_file()}
+    at = np.zeros(points.shape[1])
+    while left:
+        k = min(left, key=lambda i: float(np.linalg.norm(points[i] - at)))
+        left.remove(k)
+        at = points[k]
+        m = np.exp(log_prior.mean + log_prior.std * at)
+        prediction = problem.model(m)
+        scale = m * log_prior.std if prediction.converged else 1.0
+        write = partial(np.savez, y=prediction.y, by_x=prediction.jacobian * scale)
+        write_with(store / f"{k}.npz", write)
+
+
+def _read(store: Path, number: int) -> tuple[FloatArray, FloatArray]:
+    """Prediction of a stored run and its derivatives; empty if it failed."""
+    with np.load(store / f"{number}.npz", allow_pickle=False) as stored:
+        return stored["y"], stored["by_x"]

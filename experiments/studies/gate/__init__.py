@@ -1,0 +1,1 @@
+"""The gate: whether the closed valve is one state."""

@@ -1,0 +1,1 @@
+"""Detectors for valves in volumes: training and tests."""

@@ -1,0 +1,193 @@
+"""Detectors on volumes of held-out valves: which volumes, and what was found in them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.mirror import build
+from experiments.common.progress import PartBar
+from experiments.studies.imaging.parallel import in_processes
+from experiments.studies.imaging.store import ImagingStore, write_arrays
+from experiments.studies.imaging.trials import (
+    SEQUENCES,
+    VOLUMES,
+    WITHOUT_VALVE,
+    Trial,
+    try_sequence,
+    try_volume,
+)
+from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.moving_valve import MovingValve
+from mvest.typing import FloatArray
+
+__all__ = ["HeldOut", "hold_out"]
+
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """What detectors found in volumes of valves that no training saw.
+
+    Attributes
+    ----------
+    volumes : dict
+        Volumes trained on -> rows of :func:`experiments.studies.imaging.trials.try_volume`.
+    sequences : dict
+        Kind -> rows of :func:`experiments.studies.imaging.trials.try_sequence` and their arrays.
+    """
+
+    volumes: dict[int, list[dict[str, Any]]]
+    sequences: dict[str, list[tuple[dict[str, Any], dict[str, FloatArray]]]]
+
+    def found(self, kind: str, least_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
+        """Only volumes over time of a kind whose valve is believed in, and is not a wrong one.
+
+        Parameters
+        ----------
+        kind : str
+        least_confidence : float
+            Of the best frame.
+        wrong_mm : float
+            Mean distance of points over all frames from which on it is a wrong one.
+        """
+        kept = [
+            (row, arrays)
+            for row, arrays in self.sequences[kind]
+            if max(frame["confidence"] for frame in row["frames"]) >= least_confidence
+            and np.mean([frame["points"] for frame in row["frames"]]) < wrong_mm
+        ]
+        return HeldOut(self.volumes, {kind: kept})
+
+    def stacked(self, kind: str, name: str) -> FloatArray:
+        """Arrays of all volumes over time: ``errors (S, 2, n, 3)``, ``tip_errors``, ``rest`` mm."""
+        return np.stack([arrays[name] for _, arrays in self.sequences[kind]])
+
+
+def hold_out(
+    store: ImagingStore,
+    config: Values,
+    calibration: Sequence[MovingValve],
+    test: Sequence[MovingValve],
+) -> HeldOut:
+    """Simulate all held-out volumes and search them; what was done before is read."""
+    imaging = config["imaging"]
+    # The verdict changes nothing of what is found.
+    settings = replace(build(TrackingSettings, imaging["detection"]), least_confidence=0.0)
+    held_out = imaging["held_out"]
+    counts = dict(zip(VOLUMES, (held_out["volumes"], held_out["shifted"]), strict=True))
+    counts |= dict.fromkeys(WITHOUT_VALVE, held_out["without_valve"])
+    every = [store.training.volumes, *sorted(imaging["curve"], reverse=True)]
+    asked = []
+    for kind, count in counts.items():
+        for number in range(count):
+            also = kind in VOLUMES and number < held_out["curve_volumes"]
+            asked.append((_trial(store, kind, number), every if also else every[:1]))
+    volumes = _volumes(store, asked, test, settings)
+    lengths = (len(calibration), held_out["sequences"], held_out["shifted_sequences"])
+    sequences = {
+        kind: _sequences(
+            store,
+            [_trial(store, kind, number) for number in range(count)],
+            "calibration" if kind == "calibration" else "test",
+            calibration if kind == "calibration" else test,
+            settings,
+        )
+        for kind, count in zip(SEQUENCES, lengths, strict=True)
+    }
+    return HeldOut(volumes, sequences)
+
+
+def _trial(store: ImagingStore, kind: str, number: int) -> Trial:
+    return Trial(kind, number, store.seed, store.training.acquisition)
+
+
+def _volumes(
+    store: ImagingStore,
+    asked: Sequence[tuple[Trial, Sequence[int]]],
+    valves: Sequence[MovingValve],
+    settings: TrackingSettings,
+) -> dict[int, list[dict[str, Any]]]:
+    """Rows of single frames, by the number of volumes that detectors were trained on."""
+    population = store.population_key("test")
+    jobs = []
+    for trial, sizes in asked:
+        places = {
+            size: store.kept("volumes", _described(trial, population, store, size, settings))
+            for size in sizes
+        }
+        jobs.append((trial, places))
+    left = [(trial, _missing(places)) for trial, places in jobs if _missing(places)]
+
+    def calls() -> Iterator[tuple[Any, ...]]:
+        for trial, places in left:
+            models = {str(size): store.model_file(size) for size in places}
+            yield valves[trial.number % len(valves)], trial, models, settings
+
+    with PartBar("held-out volumes", len(left), "volume") as bar:
+        done = in_processes(try_volume, calls(), store.processes)
+        for (_, places), (found, _) in zip(left, done, strict=True):
+            for size, place in places.items():
+                write_arrays(place, {"row": np.array(json.dumps(found[str(size)]))})
+            bar.step()
+    rows: dict[int, list[dict[str, Any]]] = {}
+    for _, places in jobs:
+        for size, place in places.items():
+            rows.setdefault(size, []).append(_read(place)[0])
+    return rows
+
+
+def _sequences(
+    store: ImagingStore,
+    trials: Sequence[Trial],
+    which: str,
+    valves: Sequence[MovingValve],
+    settings: TrackingSettings,
+) -> list[tuple[dict[str, Any], dict[str, FloatArray]]]:
+    """Rows and arrays of sequences."""
+    population, size = store.population_key(which), store.training.volumes
+    closed = store.population_settings.motion.frames - 1
+    places = {
+        trial: store.kept("sequences", _described(trial, population, store, size, settings))
+        for trial in trials
+    }
+    left = _missing(places)
+    title = trials[0].kind if trials else "sequences"
+    if left:
+        calls = (
+            (valves[t.number % len(valves)], t, closed, store.model_file(size), settings)
+            for t in left
+        )
+        with PartBar(f"volumes over time, {title}", len(left), "volume") as bar:
+            done = in_processes(try_sequence, calls, store.processes)
+            for place, (found, _) in zip(left.values(), done, strict=True):
+                write_arrays(place, found)
+                bar.step()
+    return [_read(place) for place in places.values()]
+
+
+def _described(
+    trial: Trial, population: str, store: ImagingStore, size: int, settings: TrackingSettings
+) -> dict[str, Any]:
+    return {
+        "trial": asdict(trial),
+        "valves": population,
+        "model": store.model_key(size),
+        "settings": asdict(settings),
+    }
+
+
+def _missing(places: Mapping[Any, Path]) -> dict[Any, Path]:
+    return {key: place for key, place in places.items() if not place.is_file()}
+
+
+def _read(place: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+    with np.load(place, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files if name != "row"}
+        return json.loads(str(stored["row"])), arrays

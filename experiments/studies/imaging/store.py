@@ -1,0 +1,390 @@
+"""What the study of detectors makes on its way and keeps: valves, samples and trained detectors.
+
+Everything is named by what it was made from and by the code that made it, written whole or not at
+all, and made once: an interrupted study goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+from joblib.externals.loky import get_reusable_executor
+from numpy.typing import NDArray
+
+import mvest
+from experiments.common.build import mechanics_of
+from experiments.common.mirror import build
+from experiments.common.progress import PartBar
+from experiments.common.truth import truth_key
+from experiments.studies.imaging.parallel import in_processes
+from mvest.errors import cannot_write
+from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
+from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
+from mvest.imaging.learning.boosting import Boosters
+from mvest.imaging.learning.training import (
+    Draft,
+    Samples,
+    TrainingSettings,
+    draft_of,
+    train_stage,
+    volume_samples,
+)
+from mvest.imaging.moving_valve import MovingValve
+from mvest.provenance import write_json
+from mvest.simulation.motion import (
+    Population,
+    PopulationSettings,
+    draw_population,
+    load_population,
+    save_population,
+)
+from mvest.valve.anatomy.template import TemplateParameters
+
+__all__ = ["ImagingStore", "Spent", "imaging_source"]
+
+Values = Mapping[str, Any]
+
+DRAWN_BY = (
+    "simulation/motion",
+    "simulation/virtual_patient.py",
+    "imaging/layout.py",
+    "imaging/moving_valve.py",
+)
+"""What decides how a simulated valve moves, besides the forward model."""
+
+DRAFT = "draft.json"
+"""File beside samples that says what their draft cost."""
+
+NOT_SAMPLED_BY = (
+    "reading",
+    "writing",
+    "learning/accuracy.py",
+    "detection/detect.py",
+    "learning/evaluation.py",
+    "detection/fit.py",
+    "detection/model.py",
+    "detection/tracking.py",
+)
+"""What of mvest.imaging has no part in a detector's training."""
+
+NOT_DETECTED_BY = ("reading", "writing", "learning/accuracy.py")
+"""What of mvest.imaging has no part in a test of detectors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What one part of the study cost.
+
+    Attributes
+    ----------
+    cpu_s : float or None
+        Of all processes together; None where it was not measured.
+    wall_s : float or None
+    """
+
+    cpu_s: float | None
+    wall_s: float | None
+
+
+def imaging_source(without: Sequence[str]) -> list[str]:
+    """Modules of mvest.imaging but some, for the key of what they make."""
+    root = Path(mvest.__file__).parent
+    left_out = [root / "imaging" / name for name in without]
+    return [
+        str(path.relative_to(root))
+        for path in sorted((root / "imaging").rglob("*.py"))
+        if not any(path == place or place in path.parents for place in left_out)
+    ]
+
+
+class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]):
+    """Samples of one volume in a file, read stage by stage.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __getitem__(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        with np.load(self._path, allow_pickle=False) as stored:
+            return stored[f"{name}.x"], stored[f"{name}.y"]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(STAGES)
+
+    def __len__(self) -> int:
+        return len(STAGES)
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU seconds that it took to simulate the volume and to sample it."""
+        with np.load(self._path, allow_pickle=False) as stored:
+            return float(stored["cpu_s"])
+
+
+class ImagingStore:
+    """Makes and finds the parts of a study of detectors.
+
+    Parameters
+    ----------
+    config : mapping
+        The resolved configuration, checked.
+    """
+
+    def __init__(self, config: Values) -> None:
+        imaging = config["imaging"]
+        self.folder = Path(config["paths"]["outputs"]) / "detectors"
+        self.processes = int(imaging["processes"])
+        self.seed = int(config["seed"])
+        self.training = build(TrainingSettings, imaging["training"])
+        self.population_settings = build(PopulationSettings, imaging["population"])
+        self.mechanics = mechanics_of(config)
+        self.bases = {
+            name: build(TemplateParameters, values) for name, values in imaging["bases"].items()
+        }
+        self._drawn = {which: dict(imaging[which]) for which in ("train", "calibration", "test")}
+        self._shapes: ShapeModel | None = None
+
+    # -- valves -----------------------------------------------------------------------------------
+    def population_key(self, which: str) -> str:
+        """Key of a population: ``train``, ``calibration`` or ``test``."""
+        described = {
+            "drawn": self._drawn[which],
+            "bases": [[name, asdict(values)] for name, values in self.bases.items()],
+            "settings": asdict(self.population_settings),
+            "mechanics": asdict(self.mechanics),
+        }
+        return truth_key(described, DRAWN_BY)[:16]
+
+    def population(self, which: str) -> Population:
+        """A population of simulated valves.
+
+        Raises
+        ------
+        MvestError
+            If a valve does not close in 20 draws, or the store cannot be written.
+        """
+        place = self._place("valves", f"{self.population_key(which)}.npz")
+        with self._alone(place):
+            if not place.is_file():
+                about = self._drawn[which]
+                began = _cpu_s(), time.monotonic()
+                title = f"valves to {'train on' if which == 'train' else which}"
+                with PartBar(title, about["count"], "valve") as bar:
+                    made = draw_population(
+                        about["count"],
+                        about["seed"],
+                        self.bases,
+                        self.population_settings,
+                        self.mechanics,
+                        processes=self.processes,
+                        progress=lambda _number, _valve: bar.step(),
+                    )
+                save_population(place, made)
+                if self.processes > 1:
+                    # What processes have spent is known when they have ended.
+                    get_reusable_executor().shutdown(wait=True)
+                spent = Spent(_cpu_s() - began[0], time.monotonic() - began[1])
+                write_json(place.with_suffix(".json"), asdict(spent))
+        return load_population(place)
+
+    def population_spent(self, which: str) -> Spent:
+        """What a population cost."""
+        return _spent(self._place("valves", f"{self.population_key(which)}.json"))
+
+    # -- training ---------------------------------------------------------------------------------
+    @property
+    def samples_key(self) -> str:
+        """Key of the samples of all volumes, however many there are."""
+        settings = {
+            key: value
+            for key, value in asdict(self.training).items()
+            if key in ("modes", "samples", "acquisition", "draft_volumes", "boosting")
+        }
+        described = {
+            "valves": self.population_key("train"),
+            "settings": settings,
+            "seed": self.seed,
+        }
+        return truth_key(described, imaging_source(NOT_SAMPLED_BY))[:16]
+
+    def model_key(self, volumes: int) -> str:
+        """Key of the detectors that are trained on the first so many volumes."""
+        described = {
+            "samples": self.samples_key,
+            "settings": asdict(self.training) | {"volumes": volumes},
+        }
+        return truth_key(described, imaging_source(NOT_SAMPLED_BY))[:16]
+
+    def samples(self, valves: Sequence[MovingValve], count: int) -> list[StoredSamples]:
+        """Samples of the first ``count`` training volumes, simulated where they are missing."""
+        first = min(count, self.training.draft_volumes)
+        drafted = self._samples(valves, range(first), None)
+        if count == first:
+            return drafted
+        return [*drafted, *self._samples(valves, range(first, count), drafted)]
+
+    def _samples(
+        self,
+        valves: Sequence[MovingValve],
+        numbers: Sequence[int],
+        drafted: Sequence[StoredSamples] | None,
+    ) -> list[StoredSamples]:
+        """Samples of some volumes, with the mistakes of what is learned from those ``drafted``."""
+        folder = self._place("samples", self.samples_key)
+        folder.mkdir(parents=True, exist_ok=True)
+        places = {number: folder / f"{number:05d}.npz" for number in numbers}
+        with self._alone(folder):
+            missing = [number for number, place in places.items() if not place.is_file()]
+            if missing:
+                shape = self.shapes(valves)
+                draft = self._draft(drafted, folder) if drafted else None
+                calls = (
+                    (valves[k % len(valves)], k, shape, self.training, self.seed, draft)
+                    for k in missing
+                )
+                with PartBar("training volumes", len(missing), "volume") as bar:
+                    found = in_processes(volume_samples, calls, self.processes)
+                    for number, (samples, cpu_s) in zip(missing, found, strict=True):
+                        _write_samples(places[number], samples, cpu_s)
+                        bar.step()
+        return [StoredSamples(place) for place in places.values()]
+
+    def _draft(self, drafted: Sequence[StoredSamples], folder: Path) -> Draft:
+        with PartBar("draft of the search", 1, "search") as bar:
+            began = time.process_time(), time.monotonic()
+            draft = draft_of(drafted, self.training, self.seed)
+            spent = Spent(time.process_time() - began[0], time.monotonic() - began[1])
+            write_json(folder / DRAFT, asdict(spent))
+            bar.step()
+        return draft
+
+    def draft_spent(self) -> Spent:
+        """What the draft cost whose mistakes were learned from; nothing where there was none."""
+        if self.training.volumes <= self.training.draft_volumes:
+            return Spent(0.0, 0.0)
+        return _spent(self._place("samples", self.samples_key) / DRAFT)
+
+    def shapes(self, valves: Sequence[MovingValve]) -> ShapeModel:
+        """The shape model of all training valves."""
+        if self._shapes is None:
+            self._shapes = fit_shape_model(valves, self.training.modes)
+        return self._shapes
+
+    def model(
+        self, valves: Sequence[MovingValve], volumes: int, trained_on: Values
+    ) -> tuple[DetectionModel, Path]:
+        """Detectors trained on the first ``volumes`` volumes, and their file.
+
+        Raises
+        ------
+        MvestError
+            If there is nothing to train on, or the store cannot be written.
+        """
+        place = self.model_file(volumes)
+        with self._alone(place):
+            if not place.is_file():
+                samples = self.samples(valves, volumes)
+                began, cpu_s = time.monotonic(), 0.0
+                boosters: dict[str, Boosters] = {}
+                calls = (
+                    (
+                        name,
+                        np.concatenate([part[name][0] for part in samples]),
+                        np.concatenate([part[name][1] for part in samples]),
+                        self.training,
+                        self.seed,
+                    )
+                    for name in STAGES
+                )
+                with PartBar(f"detectors from {volumes} volumes", len(STAGES), "stage") as bar:
+                    grown = in_processes(train_stage, calls, self.processes)
+                    for name, (trees, seconds) in zip(STAGES, grown, strict=True):
+                        boosters[name], cpu_s = trees, cpu_s + seconds
+                        bar.step()
+                save_model(place, DetectionModel(self.shapes(valves), boosters, trained_on))
+                spent = Spent(cpu_s, time.monotonic() - began)
+                write_json(place.with_suffix(".json"), asdict(spent))
+        return load_model(place), place
+
+    def model_file(self, volumes: int) -> Path:
+        """Where detectors are that were trained on so many volumes."""
+        return self._place("models", f"{self.model_key(volumes)}.npz")
+
+    def model_spent(self, volumes: int) -> Spent:
+        """What growing the trees cost, the volumes apart."""
+        return _spent(self.model_file(volumes).with_suffix(".json"))
+
+    # -- tests ------------------------------------------------------------------------------------
+    def kept(self, kind: str, described: Values) -> Path:
+        """Where the result of a trial lies: by what is tried on what, and by the code for it."""
+        key = truth_key(dict(described), imaging_source(NOT_DETECTED_BY))[:24]
+        return self._place(kind, f"{key}.npz")
+
+    # -- files ------------------------------------------------------------------------------------
+    def _place(self, part: str, name: str) -> Path:
+        try:
+            (self.folder / part).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(self.folder / part, error) from error
+        return self.folder / part / name
+
+    @contextmanager
+    def _alone(self, place: Path) -> Iterator[None]:
+        """Of several processes that need the same part, the first makes it and the others wait."""
+        with FileLock(place.with_name(f".{place.name}.lock")):
+            yield
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an ``.npz`` file, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
+    try:
+        try:
+            with part.open("xb") as stream:
+                np.savez(stream, **arrays)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def _cpu_s() -> float:
+    """CPU seconds of this process and of those that it started and that have ended."""
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in usage)
+
+
+def _write_samples(path: Path, samples: Samples, cpu_s: float) -> None:
+    arrays: dict[str, Any] = {"cpu_s": np.array(cpu_s)}
+    for name, (x, y) in samples.items():
+        arrays |= {f"{name}.x": x, f"{name}.y": y}
+    write_arrays(path, arrays)
+
+
+def _spent(path: Path) -> Spent:
+    """What a part cost, from beside it; unknown where it was brought here without that."""
+    try:
+        return Spent(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return Spent(None, None)

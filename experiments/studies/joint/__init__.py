@@ -1,0 +1,1 @@
+"""Chordal length and moduli from a whole cycle."""

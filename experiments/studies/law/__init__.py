@@ -1,0 +1,1 @@
+"""Two material laws on the same valve."""

@@ -1,0 +1,1 @@
+"""One sheet in two finite-element codes."""

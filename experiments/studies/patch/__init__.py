@@ -1,0 +1,1 @@
+"""A stiff patch of a leaflet."""

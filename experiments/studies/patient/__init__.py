@@ -1,0 +1,1 @@
+"""Virtual patients: cases that hide their truth."""

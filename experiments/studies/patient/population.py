@@ -1,0 +1,162 @@
+"""How often the intervals of the virtual patients drawn at random contain the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import beta
+
+from experiments.common.cases.tables import (
+    POPULATION,
+    Record,
+    distance_words,
+    provenance_of,
+    read_kept,
+    table3,
+    write_table,
+)
+from mvest.reporting.figures import save_figure
+from mvest.reporting.markup import MISSING
+
+__all__ = ["population_frame", "write_population_tables"]
+
+
+# -- the population -------------------------------------------------------------------------------
+def population_frame(records: Sequence[Record]) -> pd.DataFrame:
+    """One row for each patient and unknown: truth, estimate and interval."""
+    rows = []
+    for record in records:
+        for key, source in (
+            ("with nuisances", record["unknowns"]),
+            (
+                "without nuisances",
+                []
+                if record["without_nuisances"] is None
+                else record["without_nuisances"]["parameters"],
+            ),
+        ):
+            for row in source:
+                rows.append(
+                    {
+                        "patient": record["case"]["name"],
+                        "estimation": key,
+                        "status": record["status"],
+                        **{k: row.get(k) for k in ("name", "unit", "truth", "estimate", "std")},
+                        **{k: row.get(k) for k in ("low", "high", "inside")},
+                    }
+                )
+    return pd.DataFrame(rows)
+
+
+def write_population_tables(results: Path) -> list[Path]:
+    """``population.*`` from the kept patients drawn at random; none if there are none."""
+    records = list(read_kept(results, POPULATION).values())
+    if not records:
+        return []
+    table = population_frame(records)
+    readable = []
+    for (estimation, name), group in table.groupby(["estimation", "name"], sort=False):
+        known = group[group["inside"].notna()]
+        inside, n = int(known["inside"].sum()), len(known)
+        low, high = _clopper_pearson(inside, n)
+        error = (known["estimate"] - known["truth"]).astype(float)
+        relative = str(name).startswith("E_f.") or "_" in str(name)
+        scale = known["truth"].astype(float) if relative else 1.0
+        width = (known["high"] - known["low"]).astype(float) / scale
+        readable.append(
+            {
+                "estimation": str(estimation),
+                "unknown": str(name),
+                "patients": f"{n} of {len(group)}",
+                "95 % interval contains the truth": f"{inside} ({100 * inside / max(n, 1):.0f} %)",
+                "95 % bounds of that share": f"{100 * low:.0f} to {100 * high:.0f} %",
+                "mean error": _amount((error / scale).mean(), relative),
+                "median size of the error": _amount((error / scale).abs().median(), relative),
+                "mean width": _amount(width.mean(), relative),
+            }
+        )
+    distances = table3(records)
+    notes = [
+        "Simulated valves with anatomies and moduli drawn at random; the truth was revealed after "
+        "the estimation.",
+        *_both_moduli(table),
+        *distance_words(distances),
+    ]
+    written = write_table(results / "population", table, readable, provenance_of(records), notes)
+    return [*written, *save_figure(results / "population", population_figure(table), records[0])]
+
+
+def _both_moduli(table: pd.DataFrame) -> list[str]:
+    out = []
+    for estimation, group in table.groupby("estimation", sort=False):
+        known = group[group["name"].str.startswith("E_f.") & group["inside"].notna()]
+        inside = int(known["inside"].sum())
+        out.append(
+            f"Both moduli, {estimation}: the 95 % interval contains the truth {inside} times of "
+            f"{len(known)} ({100 * inside / max(len(known), 1):.0f} %)."
+        )
+    return out
+
+
+def population_figure(table: pd.DataFrame) -> Figure:
+    """Estimates with their intervals against the truth, with and without nuisances."""
+    names = [n for n in table["name"].unique() if n.startswith("E_f.")]
+    kinds = list(table["estimation"].unique())
+    figure = Figure(figsize=(4.2 * len(names), 3.9 * len(kinds)), layout="constrained")
+    grid = figure.subplots(len(kinds), len(names), squeeze=False)
+    for i, kind in enumerate(kinds):
+        for j, name in enumerate(names):
+            axes = grid[i, j]
+            part = table[(table["estimation"] == kind) & (table["name"] == name)]
+            part = part[part["inside"].notna()]
+            axes.set_title(f"{name.replace('E_f.', 'E_f ')}, {kind}", fontsize=10)
+            if part.empty:
+                axes.set_axis_off()
+                continue
+            truth, found = part["truth"].astype(float), part["estimate"].astype(float)
+            inside = part["inside"].astype(bool)
+            for chosen, colour, words in (
+                (inside, "#2b6ca3", "contains the truth"),
+                (~inside, "#c8452f", "does not"),
+            ):
+                reach = np.array(
+                    [
+                        (found - part["low"].astype(float))[chosen],
+                        (part["high"].astype(float) - found)[chosen],
+                    ]
+                )
+                axes.errorbar(
+                    truth[chosen], found[chosen], yerr=reach, fmt="o", ms=3.5, lw=1.0,
+                    color=colour, label=f"{words} ({int(chosen.sum())})",
+                )  # fmt: skip
+            ends = np.array([truth.min() * 0.8, truth.max() * 1.25])
+            axes.plot(ends, ends, color="0.4", lw=0.8, zorder=0)
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_formatter(lambda v, _: f"{v:g}")
+                axis.set_minor_formatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "2357" else "")
+                axis.set_tick_params(which="minor", labelsize=8)
+            axes.set_xlabel("hidden truth [MPa]")
+            axes.set_ylabel("estimate, 95 % interval [MPa]")
+            axes.legend(fontsize=8, loc="upper left", frameon=False)
+            axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _clopper_pearson(inside: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact interval of a share (Clopper and Pearson 1934, Biometrika 26:404)."""
+    tail = 0.5 * (1 - level)
+    low = 0.0 if inside == 0 else float(beta.ppf(tail, inside, n - inside + 1))
+    high = 1.0 if inside == n else float(beta.ppf(1 - tail, inside + 1, n - inside))
+    return low, high
+
+
+def _amount(value: float, relative: bool) -> str:
+    if not np.isfinite(value):
+        return MISSING
+    return f"{100 * value:.1f} %" if relative else f"{value:.2f}"

@@ -1,0 +1,240 @@
+"""Virtual patients: simulated, estimated by a process that cannot see the truth, then revealed."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+
+from experiments.common.build import mechanics_of, template_of
+from experiments.common.cases.blind import estimate_blindly
+from experiments.common.cases.record import of_all_unknowns
+from experiments.common.mirror import build
+from experiments.common.truth import truth_key
+from mvest.cases.writer import write_case
+from mvest.errors import ConfigurationError, GeometryError, InputError, cannot_write
+from mvest.provenance import write_json
+from mvest.reporting.case.report import write_case_report
+from mvest.simulation.virtual_patient import (
+    Deviations,
+    Hidden,
+    Simulation,
+    draw_hidden,
+    simulate_patient,
+)
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.variation import vary
+
+__all__ = ["PatientPlace", "make_patient", "reveal", "run_patient"]
+
+Values = Mapping[str, Any]
+
+MADE_BY = (
+    "simulation/virtual_patient.py",
+    "problem/registration.py",
+    "observation/errors.py",
+    "cases",
+)
+"""Modules that decide what a virtual patient is, besides the forward model."""
+
+HIDDEN, POSITIONS = "hidden.json", "positions.npz"
+MOST_DRAWS = 5
+"""Anatomies that are drawn, one after another, until one closes."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatientPlace:
+    """Where a virtual patient lies.
+
+    Attributes
+    ----------
+    case : Path
+        The folder that an estimator is given.
+    hidden : Path
+        The folder that it cannot open.
+    """
+
+    case: Path
+    hidden: Path
+
+
+def run_patient(
+    config: Values, config_hash: str, folder: Path, started: float
+) -> tuple[dict[str, Any], list[Path]]:
+    """Simulate, estimate apart, reveal: the record, and the files written to ``folder``."""
+    place = make_patient(config)
+    record = estimate_blindly(config, config_hash, folder, place.case, place.hidden)
+    fields = folder / "fields.npz"
+    record = reveal(record, place, fields)
+    record["provenance"]["seed"] = config["seed"]
+    record["paper_patient"] = {
+        "moduli": list(config["patient"]["paper_moduli"]),
+        "distance_mm": list(config["patient"]["paper_distance_mm"]),
+    }
+    files: list[Path] = []
+    if config["figures"] and fields.is_file():
+        files = write_case_report(folder, of_all_unknowns(record), fields)
+    return record, files
+
+
+def make_patient(config: Values) -> PatientPlace:
+    """Simulate the configured patient, unless that was done: where it lies.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or the valve does not close.
+    """
+    patient = config["patient"]
+    if patient is None:
+        raise ConfigurationError("patient is not given; expected one of conf/patient")
+    described = {
+        "patient": {k: v for k, v in patient.items() if not k.startswith("paper")},
+        "valve": config["valve"],
+        "mechanics": config["mechanics"],
+        "seed": config["seed"],
+    }
+    root = Path(config["paths"]["outputs"]) / "virtual" / truth_key(described, MADE_BY)[:16]
+    place = PatientPlace(root / "case", root / "hidden")
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(root, error) from error
+    with FileLock(root / ".lock"):
+        if not (place.hidden / HIDDEN).is_file():
+            _simulate(config, described, place)
+    return place
+
+
+def _simulate(config: Values, described: Values, place: PatientPlace) -> None:
+    patient = config["patient"]
+    rng = np.random.default_rng(config["seed"])
+    moduli = {
+        name: float(value * np.exp(patient["moduli_spread"] * rng.standard_normal()))
+        for name, value in sorted(patient["moduli"].items())
+    }
+    values = draw_hidden(moduli, build(Deviations, patient["deviations"]), rng)
+    template = template_of(config)
+    draws = 0
+    while True:
+        draws += 1
+        drawn = template
+        if patient["variation"]:
+            drawn = Template(vary(template.parameters, rng, patient["variation"]))
+        try:
+            made = simulate_patient(
+                patient["name"],
+                patient["description"],
+                drawn,
+                values,
+                build(Simulation, patient["simulation"]),
+                mechanics_of(config),
+                rng,
+            )
+        except GeometryError:
+            if not patient["variation"] or draws == MOST_DRAWS:
+                raise
+            continue
+        break
+    # What an interrupted run left.
+    shutil.rmtree(place.case, ignore_errors=True)
+    write_case(place.case, made.case)
+    _hide(place.hidden, made.hidden, described, draws)
+
+
+def _hide(folder: Path, hidden: Hidden, described: Values, draws: int) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays: dict[str, Any] = dict(hidden.positions)
+        np.savez_compressed(folder / POSITIONS, **arrays)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    # Written last: where it is, the patient is whole.
+    write_json(
+        folder / HIDDEN,
+        {"values": dict(hidden.values), "made_from": dict(described), "anatomies_drawn": draws},
+    )
+
+
+def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[str, Any]:
+    """The finished record of an estimation, beside what its case had hidden.
+
+    Parameters
+    ----------
+    record : dict
+        Of the estimation, which is over.
+    place : PatientPlace
+    fields : Path
+        The estimation's arrays; the true positions are added to them.
+    """
+    try:
+        hidden = json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
+        with np.load(place.hidden / POSITIONS, allow_pickle=False) as stored:
+            positions = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{place.hidden} does not hold what a patient hides: {error}") from error
+    values = hidden["values"]
+    revealed = copy.deepcopy(record)
+    groups = [revealed["unknowns"]] + [
+        revealed[key]["parameters"]
+        for key in ("without_nuisances", "as_in_the_paper")
+        if revealed[key] is not None
+    ]
+    for rows in groups:
+        for row in rows:
+            row["truth"] = values[row["name"]]
+            row["inside"] = (
+                None if row["low"] is None else bool(row["low"] <= row["truth"] <= row["high"])
+            )
+    for modulus in revealed["moduli"]:
+        truth = values[f"E_f.{modulus['region']}"]
+        ratio = modulus["estimate"] / _estimate(record, f"E_f.{modulus['region']}")
+        modulus["truth"] = ratio * truth
+        modulus["relative_error"] = (modulus["estimate"] - modulus["truth"]) / modulus["truth"]
+    revealed["truth"] = [values[name] for name in record["parameters"]]
+    if record["estimate"] is not None:
+        revealed["relative_error"] = [
+            (found - true) / true
+            for found, true in zip(record["estimate"], revealed["truth"], strict=True)
+        ]
+    if fields.is_file():
+        _reveal_positions(revealed, positions, fields)
+    revealed["made_from"] = hidden["made_from"]
+    revealed["anatomies_drawn"] = hidden["anatomies_drawn"]
+    return revealed
+
+
+def _estimate(record: Mapping[str, Any], name: str) -> float:
+    return float(next(row["estimate"] for row in record["unknowns"] if row["name"] == name))
+
+
+def _reveal_positions(
+    record: dict[str, Any], positions: Mapping[str, FloatArray], fields: Path
+) -> None:
+    """Distances to where the valve truly was, and its shape among the arrays."""
+    with np.load(fields, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    frames = [str(name) for name in arrays["frames"]]
+    arrays["truth"] = np.stack([positions[name] for name in frames]).astype(np.float32)
+    for k, row in enumerate(record["distances"]):
+        row["to_truth"] = {
+            which: _spread(np.linalg.norm(arrays[key][k] - arrays["truth"][k], axis=1))
+            for which, key in (
+                ("generic", "generic"),
+                ("registered", "registered"),
+                ("personalised", "fitted"),
+            )
+        }
+    np.savez_compressed(fields, **arrays)
+
+
+def _spread(values: FloatArray) -> dict[str, float]:
+    return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}

@@ -1,0 +1,1 @@
+"""What an estimated valve would do."""

@@ -1,0 +1,1 @@
+"""A synthetic study: simulate, estimate, compare."""

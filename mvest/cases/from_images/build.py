@@ -1,0 +1,186 @@
+"""The case that a sequence tells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
+from mvest.cases.checks import (
+    check_annulus_size,
+    check_band,
+    check_normals,
+    check_thickness,
+    check_tips,
+    ventricular_side,
+)
+from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.cases.from_images.frame_choice import CaseFrames
+from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.errors import GeometryError, InputError
+from mvest.imaging.sequence import ValveSequence
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.surface_coordinates import surface_coordinates
+
+__all__ = ["CaseTexts", "case_of_sequence"]
+
+UNSEEN_STD_MM = 10.0
+"""Standard deviation of a vertex whose error was never measured: it is given no weight."""
+
+
+@dataclass(frozen=True, slots=True)
+class CaseTexts:
+    """What a case says of itself."""
+
+    name: str
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False
+
+
+def case_of_sequence(
+    sequence: ValveSequence,
+    frames: CaseFrames,
+    texts: CaseTexts,
+    *,
+    thickness_mm: Mapping[str, float] | None = None,
+    error_samples: ErrorSamples | None = None,
+) -> ValveCase:
+    """The case that a sequence tells.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frames : CaseFrames
+    texts : CaseTexts
+    thickness_mm : mapping, optional
+        Of each leaflet; generic values if not given.
+    error_samples : ErrorSamples, optional
+        In the frames of the case, in the order of time.
+
+    Raises
+    ------
+    InputError, GeometryError
+        A surface is no valve: the message names the frame and says what is wrong.
+    """
+    layout = sequence.layout
+    derived = list(frames.derived)
+    reference = sequence.vertices[frames.open]
+    annulus = reference[layout.annulus]
+    side = ventricular_side(annulus, reference[layout.free_edge])
+    for number in frames.in_order:
+        _check_frame(sequence, number, side, is_reference=number == frames.open)
+    given = GENERIC_THICKNESS if thickness_mm is None else thickness_mm
+    if set(given) != set(layout.region_names):
+        raise InputError(
+            f"thickness of {', '.join(given)}, expected of {', '.join(layout.region_names)}"
+        )
+    if thickness_mm is None:
+        listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
+        derived.append(f"thickness: {listed} assumed")
+    region = np.where(np.mod(layout.phi, 360.0) < 180.0, 0, 1)
+    thickness = np.array([given[name] for name in layout.region_names])[region]
+    check_thickness(thickness)
+    derived += [
+        "fibre: circumferential, perpendicular to the gradient from annulus to free edge",
+        "annulus and free edge: the first and the last row of the image step's layout",
+    ]
+    around = surface_coordinates(reference, layout.triangles, layout.annulus, layout.free_edge)
+    surface = LeafletSurface(
+        reference,
+        layout.triangles,
+        layout.region,
+        layout.region_names,
+        around.circumferential,
+        thickness,
+    )
+    band = LeafletBand.of(
+        reference,
+        layout.triangles,
+        layout.region,
+        layout.annulus,
+        layout.free_edge,
+        layout.region_names.index("anterior"),
+    )
+    chordae = lay_out_chordae(
+        band,
+        sequence.tips[frames.open],
+        sequence.vertices[frames.closed],
+        sequence.tips[frames.closed],
+    )
+    derived.append(
+        f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
+        "rest lengths from the closed frame (through its vertices)"
+    )
+    return ValveCase(
+        name=texts.name,
+        description=texts.description,
+        source=texts.source,
+        licence=texts.licence,
+        simulated=texts.simulated,
+        surface=surface,
+        annulus=layout.annulus,
+        free_edge=layout.free_edge,
+        frames=tuple(_frame(sequence, frames, number) for number in frames.in_order),
+        chordae=chordae,
+        uncertainty=_uncertainty(sequence, derived),
+        derived=tuple(derived),
+        error_samples=error_samples,
+        chordae_follow=True,
+    )
+
+
+def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_reference: bool) -> None:
+    layout, vertices, tips = sequence.layout, sequence.vertices[number], sequence.tips[number]
+    try:
+        if not (np.isfinite(vertices).all() and np.isfinite(tips).all()):
+            raise GeometryError("a position is not finite, expected a valve in this frame")
+        check_band(vertices, layout.triangles, self_intersections=is_reference)
+        check_annulus_size(vertices[layout.annulus])
+        check_tips(vertices[layout.annulus], side, tips)
+        check_normals(vertices, layout.triangles, layout.annulus, tips)
+    except InputError as fault:
+        kind = "open" if is_reference else "closed"
+        raise type(fault)(f"valve from images, {kind} frame {number}: {fault}") from fault
+
+
+def _frame(sequence: ValveSequence, frames: CaseFrames, number: int) -> Frame:
+    layout, vertices = sequence.layout, sequence.vertices[number]
+    if number == frames.open:
+        name, role, pressure = "open", Role.REFERENCE, 0.0
+    elif number == frames.closed:
+        name, role, pressure = "closed", Role.CLOSED, frames.pressure_mmHg
+    else:
+        name, role, pressure = f"frame_{number}", Role.HELD_OUT, frames.held_out[number]
+    return Frame(
+        name,
+        float(sequence.times[number]),
+        role,
+        float(pressure),
+        vertices,
+        layout.triangles,
+        layout.region,
+        vertices[layout.annulus],
+        vertices[layout.free_edge],
+        sequence.tips[number],
+        True,
+    )
+
+
+def _uncertainty(sequence: ValveSequence, derived: list[str]) -> Uncertainty:
+    std, length = sequence.std_mm, sequence.correlation_length_mm
+    unknown = ~np.isfinite(std)
+    if unknown.all():
+        raise InputError(
+            "valve from images: no vertex has a standard deviation; expected a detection model "
+            "whose accuracy was measured"
+        )
+    if unknown.any():
+        derived.append(
+            f"observation: {int(unknown.sum())} vertices whose error was never measured are given "
+            f"{UNSEEN_STD_MM:g} mm"
+        )
+    return Uncertainty(np.where(unknown, UNSEEN_STD_MM, std), float(length))

@@ -1,0 +1,119 @@
+"""Errors measured on other valves, in the axes of a valve that was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mvest.cases.case import ErrorSamples
+from mvest.cases.from_images.frame_choice import CaseFrames
+from mvest.errors import InputError
+from mvest.imaging.sequence import ValveSequence
+from mvest.typing import FloatArray
+
+__all__ = ["samples_in_world", "valve_axes", "without_mean_error"]
+
+
+def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Axes of the valve in a frame, the columns of ``(3, 3)``.
+
+    As of a moving valve: z is normal to the annulus, to the atrium; x points from phi = 180 to
+    phi = 0 within its plane, and y, which completes them, to the first leaflet.
+    """
+    layout, annulus = sequence.layout, sequence.annulus[frame]
+    about = annulus - annulus.mean(axis=0)
+    area = np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)
+    down = sequence.free_edge[frame].mean(axis=0) - annulus.mean(axis=0)
+    z = -area * np.sign(area @ down) / np.linalg.norm(area)
+    across = annulus[layout.column(0.0)] - annulus[layout.column(180.0)]
+    x = across - (across @ z) * z
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    return np.stack([x, y, z], axis=1)
+
+
+def samples_in_world(
+    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray, tip_errors: FloatArray
+) -> ErrorSamples:
+    """Errors measured on other valves, as displacements in the frames of a case.
+
+    Parameters
+    ----------
+    sequence : ValveSequence
+    frames : CaseFrames
+    errors : (K, 2, n, 3) mm
+        Found less true, in the axes of each valve, in its open and its closed frame.
+    tip_errors : (K, 2, 2, 3) mm
+
+    Raises
+    ------
+    InputError
+        They are not of this layout.
+    """
+    _require_layout(sequence, errors, tip_errors)
+    numbers, which = _frames_and_errors(frames)
+    axes = np.stack([valve_axes(sequence, number) for number in numbers])
+    # Where it may have been is where it was found less the error.
+    return ErrorSamples(
+        -np.einsum("fij,kfnj->kfni", axes, errors[:, which]),
+        -np.einsum("fij,kfnj->kfni", axes, tip_errors[:, which]),
+    )
+
+
+def without_mean_error(
+    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray, tip_errors: FloatArray
+) -> tuple[ValveSequence, FloatArray, FloatArray]:
+    """The valve less the mean error of other valves, and the errors that are left of these.
+
+    What detectors are off by on average, closed free edges that lie where most do for instance, no
+    spread of errors can make up for. Only the frames of the case are changed: the open one by the
+    mean error of open frames, the others by that of closed ones.
+
+    Parameters
+    ----------
+    sequence, frames, errors, tip_errors
+        As of :func:`samples_in_world`.
+
+    Returns
+    -------
+    sequence : ValveSequence
+    errors, tip_errors : as they were
+        About their mean, and larger by sqrt((K + 1) / (K - 1)): of a valve that is none of the K
+        the error varies so much about the mean of these.
+
+    Raises
+    ------
+    InputError
+        They are not of this layout, or of fewer than two valves.
+    """
+    _require_layout(sequence, errors, tip_errors)
+    if len(errors) < 2:
+        raise InputError(f"errors of {len(errors)} valves, expected two or more")
+    mean, tip_mean = errors.mean(axis=0), tip_errors.mean(axis=0)
+    vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
+    for number, which in zip(*_frames_and_errors(frames), strict=True):
+        axes = valve_axes(sequence, number)
+        vertices[number] -= mean[which] @ axes.T
+        tips[number] -= tip_mean[which] @ axes.T
+    larger = np.sqrt((len(errors) + 1) / (len(errors) - 1))
+    return (
+        replace(sequence, vertices=vertices, tips=tips),
+        larger * (errors - mean),
+        larger * (tip_errors - tip_mean),
+    )
+
+
+def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:
+    """Frames of the case, and for each whether it is open (0) or closed (1)."""
+    numbers = list(frames.in_order)
+    return numbers, [0 if number == frames.open else 1 for number in numbers]
+
+
+def _require_layout(sequence: ValveSequence, errors: FloatArray, tip_errors: FloatArray) -> None:
+    n = sequence.layout.size
+    if errors.shape[1:] != (2, n, 3) or tip_errors.shape[1:] != (2, 2, 3):
+        raise InputError(
+            f"errors of shape {errors.shape} and of tips {tip_errors.shape}, expected (samples, 2, "
+            f"{n}, 3) and (samples, 2, 2, 3)"
+        )

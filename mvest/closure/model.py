@@ -1,0 +1,399 @@
+"""The joint of valve and mechanics: moduli in, geometry of the leaflets and its derivative out.
+
+``ClosureModel`` is what a filter sees: a function from parameters to predicted positions and their
+Jacobian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation.prediction import Prediction
+from mvest.mechanics.forces.ties import TiedPoints
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.parameters import is_positive
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.solver import LinearSolver, linear_solver
+from mvest.mechanics.steps import Damping, Simulation, Step
+from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.valve_system import (
+    HeldState,
+    boundary_loading,
+    build_system,
+    held_loading,
+    retune,
+)
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.embedding import Embedding, embed
+from mvest.valve.mesh.solid_mesh import SolidMesh
+
+__all__ = ["ClosedState", "ClosureModel", "ClosureResult"]
+
+
+REST = (0.05, 0.15)
+"""s, steps of time in which a state taken over from another mesh comes to rest under the final
+loads. Damping by stiffness holds what the coarser mesh could not tell; without it the equilibrium
+of large meshes (160 x 19 cells) is not found from there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosureResult:
+    """A closure with the system it was computed on."""
+
+    system: System
+    simulation: Simulation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedState:
+    """A closed valve from which further closures may be continued.
+
+    Attributes
+    ----------
+    at : (p,)
+        Its parameters.
+    positions : (n, 3) mm
+        Of the mesh's nodes.
+    guide : ClosedState or None
+        That of the model's guide.
+    """
+
+    at: FloatArray
+    positions: FloatArray
+    guide: ClosedState | None = None
+
+
+@dataclass(eq=False)
+class ClosureModel:
+    """Predicted positions of the observed vertices as a function of the parameters.
+
+    Attributes
+    ----------
+    valve : Valve
+        Its surface vertices are what is observed.
+    contact_valve : Valve
+        The same valve where contact is sampled.
+    mesh : SolidMesh
+    settings : MechanicsSettings
+    names : tuple of str
+        Names of the parameters (see :class:`mvest.mechanics.system.Parameter`).
+    fixed : dict
+        Values of the parameters that are not estimated.
+    continuation : bool
+        Whether closures after the first start from the last closed state and go straight to the new
+        equilibrium (where the protocol ends in one), instead of closing the open valve again. The
+        closed state is the same as long as there is one only, which the gate
+        (:mod:`mvest.closure.robustness`) examines.
+    reach : float
+        Largest change of any parameter's logarithm (of a field's coefficient: times its standard
+        deviation of log E_f) over which a closure is continued; beyond it the valve is closed from
+        the open state. A much softer valve may close in another way, and what is continued from
+        there may keep to that way.
+    guide : ClosureModel, optional
+        The same valve with the same parameters on a coarser mesh. A closure that would start from
+        the open valve is followed there, and its closed state is where the equilibrium on this
+        mesh is looked for; a guide may have a guide itself. The same closed state comes out, for
+        the same reason as with ``continuation``.
+    repeat : bool
+        Whether a continued closure that fails is repeated with the guide, and one that fails with
+        the guide from the open valve, which takes long and seldom finds what the others did not.
+    largest_change : float
+        Of any parameter, measured as for ``reach``, from one continued equilibrium to the next: one
+        farther away is reached through others between. Newton's method does not find an equilibrium
+        that lies millimetres away.
+    on_step : callable, optional
+        Progress: called with (time, Newton iterations).
+    ties : TiedPoints, optional
+        Pairs of points that are held together while the valve closes, as by a clip.
+    """
+
+    valve: Valve
+    contact_valve: Valve
+    mesh: SolidMesh
+    settings: MechanicsSettings
+    names: tuple[str, ...]
+    fixed: dict[str, float] = field(default_factory=dict)
+    continuation: bool = False
+    reach: float = np.inf
+    guide: ClosureModel | None = None
+    repeat: bool = True
+    largest_change: float = np.inf
+    on_step: Callable[[float, int], None] | None = None
+    ties: TiedPoints | None = None
+
+    _closed: ClosedState | None = field(default=None, init=False, repr=False)
+    _in_guide: Embedding | None = field(default=None, init=False, repr=False)
+    _system: System | None = field(default=None, init=False, repr=False)
+    _solver: LinearSolver | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.reach >= 0:
+            raise InputError(f"reach of a continuation = {self.reach}, expected >= 0")
+        if not self.largest_change > 0:
+            raise InputError(f"largest_change = {self.largest_change}, expected > 0")
+        if self.guide is not None and self.guide.names != self.names:
+            raise InputError(
+                f"the guide's parameters are {', '.join(self.guide.names)}, expected those of the "
+                f"model: {', '.join(self.names)}"
+            )
+
+    def fresh(self) -> ClosureModel:
+        """A model of the same that has not built or closed anything, and tells nobody of steps."""
+        guide = None if self.guide is None else self.guide.fresh()
+        return replace(self, guide=guide, on_step=None)
+
+    @property
+    def closed(self) -> ClosedState | None:
+        """The last closed state."""
+        if self._closed is None or self.guide is None:
+            return self._closed
+        return replace(self._closed, guide=self.guide.closed)
+
+    def restart(self, closed: ClosedState | None) -> None:
+        """Go on from a closed state of this model, or from the open valve, as if it had just begun.
+
+        What the model computes afterwards depends on ``closed`` and on nothing before, to the last
+        bit: also the sparsity pattern and the order of elimination, which follow the contact that
+        was met, begin anew.
+        """
+        self._closed = None if closed is None else replace(closed, guide=None)
+        if self._system is not None:
+            self._system.forget_contact()
+            self._solver = linear_solver(self.settings.solver)
+        if self.guide is not None:
+            self.guide.restart(None if closed is None else closed.guide)
+
+    def _near(self, m: FloatArray) -> bool:
+        """Whether the last closed state is one to continue from to ``m``."""
+        if not self.continuation or self._closed is None:
+            return False
+        if np.isinf(self.reach):
+            return True
+        change = self._change(self._closed.at, m)
+        return change is not None and bool(np.max(np.abs(change)) <= self.reach)
+
+    @cached_property
+    def _units(self) -> FloatArray:
+        """What a coefficient of a field ``(p,)`` changes log E_f by; 0 for positive parameters."""
+        out = np.zeros(len(self.names))
+        for k, name in enumerate(self.names):
+            if not is_positive(name):
+                out[k] = self.settings.fields[Parameter(name, 0.0).region].std_log
+        return out
+
+    def _change(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
+        """Change ``(p,)`` of the parameters' logarithms; None where there is no logarithm."""
+        positive = self._units == 0
+        if np.any(start[positive] <= 0) or np.any(end[positive] <= 0):
+            return None
+        change = self._units * (end - start)
+        change[positive] = np.log(end[positive] / start[positive])
+        return change
+
+    def _way_to(self, m: FloatArray) -> list[FloatArray]:
+        """Parameters between the last closed state and ``m``, where that is continued from."""
+        if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
+            return []
+        start = self._closed.at
+        change = self._change(start, m)
+        if change is None:
+            return []
+        n = int(np.ceil(float(np.abs(change).max()) / self.largest_change))
+        positive = self._units == 0
+        return [
+            np.where(positive, start * np.exp(change * k / n), start + (m - start) * k / n)
+            for k in range(1, n)
+        ]
+
+    def close(
+        self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
+    ) -> ClosureResult:
+        """Run the closure with parameters ``m (p,)``.
+
+        Parameters
+        ----------
+        m : ndarray
+        sensitivities : bool
+            Whether the last frame is differentiated.
+        every_frame : bool
+            Whether all frames are wanted, and not only the last one: they are then solved to the
+            full tolerance, and the closure starts from the open valve.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        if not every_frame:
+            for between in self._way_to(m):
+                result = self.close(between, sensitivities=False)
+                if not result.simulation.converged:
+                    return result
+        system, parameters = self.tuned(m)
+        steps = self.settings.protocol.steps()
+        loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
+
+        def run(
+            steps: Sequence[Step], start: FloatArray | None = None, time: float = 0.0
+        ) -> Simulation:
+            return simulate(
+                system,
+                loading,
+                steps,
+                damping=self.damping(m),
+                newton=self.settings.newton,
+                parameters=parameters if sensitivities else [],
+                final_only=not every_frame,
+                solver=self._solver,
+                initial_positions=start,
+                initial_time=time,
+                on_step=self.on_step,
+            )
+
+        simulation = None
+        if steps[-1].static and not every_frame:
+            end, last = self.settings.protocol.end, steps[-1]
+            if self._closed is not None and self._near(m):
+                simulation = run([last], self._closed.positions, end)
+            if self.guide is not None and (
+                simulation is None or (self.repeat and not simulation.converged)
+            ):
+                start = self._guided(self.guide, m)
+                if start is not None:
+                    rests = [Step(end + t) for t in accumulate(REST)]
+                    simulation = run(
+                        [*rests, replace(last, time=last.time + sum(REST))], start, end
+                    )
+        if simulation is None or (self.repeat and not simulation.converged):
+            simulation = run(steps)
+        if simulation.converged:
+            self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
+        return ClosureResult(system, simulation)
+
+    def _values(self, m: FloatArray) -> dict[str, float]:
+        """All parameters that have a value, those that are not estimated included."""
+        return {**self.fixed, **dict(zip(self.names, map(float, m), strict=True))}
+
+    def damping(self, m: FloatArray) -> Damping:
+        """The damping with parameters ``m (p,)``, of which it may be one."""
+        own = self.settings.damping
+        return replace(own, beta=self._values(m).get("damping", own.beta))
+
+    def tuned(self, m: FloatArray) -> tuple[System, tuple[Parameter, ...]]:
+        """The system, set to parameters ``m (p,)``, and the parameters to differentiate by.
+
+        The system is built once and belongs to the model.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        values = self._values(m)
+        if self._system is None or self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+            self._system = build_system(
+                self.valve, self.contact_valve, self.mesh, self.settings, values, ties=self.ties
+            )
+        system = self._system
+        retune(system, self.settings, values)
+        return system, tuple(Parameter(n, values[n]) for n in self.names)
+
+    @property
+    def solver(self) -> LinearSolver:
+        """The solver that goes with the system, made with it."""
+        if self._solver is None:
+            self._solver = linear_solver(self.settings.solver)
+        return self._solver
+
+    def held(self, m: FloatArray, states: Sequence[HeldState]) -> list[FloatArray | None]:
+        """Observed vertices ``(n, 3)`` mm of the closed valve in equilibria under other loads.
+
+        The valve is closed with parameters ``m (p,)`` first, and goes from one state to the next;
+        None from the first one on for which no equilibrium is found.
+
+        Raises
+        ------
+        InputError
+            If a state's annulus or tips are not those of the valve.
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        closure = self.close(m, sensitivities=False)
+        system, simulation = closure.system, closure.simulation
+        found: list[FloatArray | None] = []
+        for state in states:
+            loading = held_loading(system, self.contact_valve, state)
+            if simulation.converged:
+                simulation = self._rest(system, loading, simulation.frames[-1])
+            converged = simulation.converged
+            found.append(self.observed(simulation.frames[-1]) if converged else None)
+        return found
+
+    def _rest(
+        self, system: System, loading: Callable[[float], Loads], start: FloatArray
+    ) -> Simulation:
+        """Equilibrium under constant loads from nodal positions ``start (n, 3)``."""
+        end = self.settings.protocol.end
+
+        def run(steps: Sequence[Step]) -> Simulation:
+            return simulate(
+                system,
+                loading,
+                steps,
+                damping=self.settings.damping,
+                newton=self.settings.newton,
+                final_only=True,
+                solver=self._solver,
+                initial_positions=start,
+                initial_time=end,
+            )
+
+        simulation = run([Step(end + 1.0, static=True)])
+        if not simulation.converged:
+            # Damping by stiffness helps leaflets to slide over each other to where they are held.
+            rests = [Step(end + t) for t in accumulate(REST)]
+            simulation = run([*rests, Step(end + sum(REST) + 1.0, static=True)])
+        return simulation
+
+    def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
+        """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""
+        simulation = guide.close(m, sensitivities=False).simulation
+        if not simulation.converged:
+            return None
+        if self._in_guide is None:
+            self._in_guide = embed(guide.mesh, self.mesh.nodes)
+        return self._in_guide(simulation.frames[-1])
+
+    @cached_property
+    def observed(self) -> Embedding:
+        """The observed vertices embedded in the mesh."""
+        return embed(self.mesh, self.valve.surface.vertices)
+
+    def __call__(self, m: FloatArray) -> Prediction:
+        """Positions of the observed vertices in the open and the closed frame, and their Jacobian.
+
+        Inadmissible moduli and closures that do not converge are failed predictions, not errors.
+        """
+        try:
+            simulation = self.close(m).simulation
+        except MaterialError as error:
+            return Prediction.failed(str(error))
+        if not simulation.converged:
+            return Prediction.failed(
+                f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
+            )
+        open_, closed = self.observed(self.mesh.nodes), self.observed(simulation.frames[-1])
+        derivative = np.stack([self.observed(dx) for dx in simulation.sensitivities[-1]], axis=-1)
+        y = np.concatenate([open_.ravel(), closed.ravel()])
+        jacobian = np.concatenate(
+            [np.zeros((open_.size, len(self.names))), derivative.reshape(-1, len(self.names))]
+        )
+        return Prediction(y, jacobian)

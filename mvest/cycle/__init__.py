@@ -1,7 +1,0 @@
-"""The whole cycle of a simulated valve: any number of frames, open to closed and back."""
-
-from mvest.cycle.model import CycleModel
-from mvest.cycle.observation import Beats, CycleObservation, SeenFrames
-from mvest.cycle.protocol import CycleProtocol
-
-__all__ = ["Beats", "CycleModel", "CycleObservation", "CycleProtocol", "SeenFrames"]

@@ -1,0 +1,1 @@
+"""What data can tell: identifiability, designs, profiles, consistency, errors of the model."""

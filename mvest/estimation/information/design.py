@@ -1,0 +1,187 @@
+"""Which observation would make a parameter known, from the Jacobians of one run of the model.
+
+Information adds up over independent observations and grows with the inverse square of the noise, so
+that designs of any size are compared without running the model again: each is kept as a p × p
+triangle T with Tᵀ T = (W H D)ᵀ (W H D) for noise of unit standard deviation, D = diag(values)
+(Kay, Fundamentals of Statistical Signal Processing I, 1993, sections 3.7 and 3.8). All standard
+deviations are relative: those of the logarithm of a positive parameter, to first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from mvest.errors import InputError
+from mvest.estimation.information.identifiability import Identifiability, identifiability
+from mvest.estimation.noise import NoiseCovariance, observation_noise
+from mvest.estimation.prediction import require_finite
+from mvest.typing import FloatArray
+
+__all__ = ["Design", "together"]
+
+NOISE_RANGE = (1e-6, 1e6)
+"""Times the unit of the observation, between which a needed noise is looked for."""
+
+KNOWLEDGE_RANGE = (1e-5, 1e2)
+"""Relative standard deviations between which a needed knowledge is looked for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """What an observation says about p parameters, for noise of unit standard deviation.
+
+    Attributes
+    ----------
+    names : tuple of str, (p,)
+    values : (p,) in the units of the parameters
+        Positive; where the Jacobian was computed.
+    triangle : (p, p)
+        T of the module's text.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    triangle: FloatArray
+
+    @classmethod
+    def of(
+        cls, H: FloatArray, R: NoiseCovariance, values: FloatArray, names: Sequence[str]
+    ) -> Design:
+        """The design with Jacobian H (n, p) and noise of covariance R at unit standard deviation.
+
+        Raises
+        ------
+        InputError
+            If shapes disagree or a value is not admissible.
+        """
+        H, values = np.asarray(H, dtype=np.float64), np.asarray(values, dtype=np.float64)
+        if H.ndim != 2 or H.shape[1] != len(names) or values.shape != (len(names),):
+            raise InputError(
+                f"a design of {len(names)} parameters has a Jacobian of shape {H.shape} and values "
+                f"of shape {values.shape}"
+            )
+        require_finite(H, "the Jacobian")
+        if not np.all(np.isfinite(values) & (values > 0.0)):
+            raise InputError(f"values of a design {values}, expected positive ones")
+        return cls(tuple(names), values, _triangle(observation_noise(R, len(H)).whiten(H) * values))
+
+    def at(self, noise: float, knowledge: Mapping[str, float] | None = None) -> Identifiability:
+        """What is known with noise of a standard deviation.
+
+        Parameters
+        ----------
+        noise : float
+            In units of the observation.
+        knowledge : mapping, optional
+            Relative standard deviation of parameters beforehand: 0 of those that are known, which
+            are then left out. Of a parameter that is not named nothing is known.
+
+        Raises
+        ------
+        InputError
+            If the noise or what is known is not admissible.
+        """
+        knowledge = dict(knowledge or {})
+        strange = sorted(set(knowledge) - set(self.names))
+        if strange or not all(std >= 0.0 for std in knowledge.values()):
+            raise InputError(f"knowledge {knowledge}, expected deviations of {self.names}")
+        if not (np.isfinite(noise) and noise > 0.0):
+            raise InputError(f"noise = {noise}, expected > 0")
+        free = [k for k, name in enumerate(self.names) if knowledge.get(name) != 0.0]
+        if not free:
+            raise InputError("nothing is left to be known: every parameter is")
+        before = [1.0 / knowledge.get(self.names[k], np.inf) for k in free]
+        rows = np.concatenate([self.triangle[:, free] / noise, np.diag(before)])
+        names = tuple(self.names[k] for k in free)
+        # In parts of the values: rows are already scaled by them.
+        return identifiability(rows, 1.0, np.ones(len(free)), names=names)
+
+    def std(self, name: str, noise: float, knowledge: Mapping[str, float] | None = None) -> float:
+        """Relative standard deviation of one parameter; infinite if it is not determined."""
+        found = self.at(noise, knowledge)
+        if name not in found.names:
+            raise InputError(f"{name!r} is not to be found out; expected one of {found.names}")
+        return float(found.std[found.names.index(name)])
+
+    def needed_noise(
+        self, name: str, target: float, knowledge: Mapping[str, float] | None = None
+    ) -> float:
+        """Noise with which a parameter is known to a relative standard deviation `target`.
+
+        Zero if it would not be even without noise, infinite if it is so without any data.
+        """
+        if not target > 0.0:
+            raise InputError(f"target = {target}, expected > 0")
+
+        def excess(log_noise: float) -> float:
+            # The logarithm, which goes in straight lines; infinite deviations stay comparable.
+            return min(float(np.log(self.std(name, np.exp(log_noise), knowledge) / target)), 1e3)
+
+        low, high = np.log(NOISE_RANGE)
+        if excess(low) > 0.0:
+            return 0.0
+        if excess(high) < 0.0:
+            return np.inf
+        return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
+
+    def needed_repeats(
+        self, name: str, target: float, noise: float, knowledge: Mapping[str, float] | None = None
+    ) -> float:
+        """How many independent observations, averaged, make a parameter known to `target`.
+
+        The mean of N has noise / √N. Infinite if no number of them does.
+        """
+        needed = self.needed_noise(name, target, knowledge)
+        return np.inf if needed == 0.0 else (noise / needed) ** 2
+
+    def needed_knowledge(
+        self,
+        name: str,
+        target: float,
+        noise: float,
+        about: str,
+        knowledge: Mapping[str, float] | None = None,
+    ) -> float:
+        """How well another parameter must be known beforehand, as a relative standard deviation.
+
+        Zero if knowing it exactly is not enough, infinite if nothing need be known of it.
+        """
+
+        def excess(log_std: float) -> float:
+            told = {**(knowledge or {}), about: float(np.exp(log_std))}
+            return float(np.log(self.std(name, noise, told) / target))
+
+        low, high = np.log(KNOWLEDGE_RANGE)
+        if excess(low) > 0.0:
+            return 0.0
+        if excess(high) < 0.0:
+            return np.inf
+        return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
+
+
+def together(*designs: Design) -> Design:
+    """All of several observations, whose errors are independent of each other.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are not of the same parameters at the same values.
+    """
+    if not designs:
+        raise InputError("no design to put together")
+    first = designs[0]
+    for other in designs[1:]:
+        if other.names != first.names or not np.array_equal(other.values, first.values):
+            raise InputError("designs put together must be of the same parameters and values")
+    stacked = np.concatenate([design.triangle for design in designs])
+    return Design(first.names, first.values, _triangle(stacked))
+
+
+def _triangle(rows: FloatArray) -> FloatArray:
+    p = rows.shape[1]
+    padded = rows if len(rows) >= p else np.concatenate([rows, np.zeros((p - len(rows), p))])
+    return np.asarray(np.linalg.qr(padded, mode="r"))

@@ -1,0 +1,345 @@
+"""Learning the detectors from simulated volumes whose valves are known.
+
+Every volume is simulated, sampled for all stages at once and forgotten: guesses of every stage are
+missed by set amounts (each stage says which), so that no stage waits for the one before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeAlias
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import InputError
+from mvest.imaging.detection.boundary import boundary_samples
+from mvest.imaging.detection.frame import StandardFrame, standard_frame
+from mvest.imaging.detection.landmark_detector import landmark_samples
+from mvest.imaging.detection.model import STAGES, DetectionModel
+from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.pose_search import (
+    REFINED,
+    REFINEMENTS,
+    PoseSearch,
+    coarse_samples,
+    fine_samples,
+    refinement_samples,
+)
+from mvest.imaging.detection.position import PLACES, PositionDetector, position_samples
+from mvest.imaging.detection.rim_detector import rim_samples
+from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
+from mvest.imaging.detection.shape_start import MODES, shape_start_samples
+from mvest.imaging.landmarks import LANDMARKS
+from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
+from mvest.imaging.learning.degrade import degrade
+from mvest.imaging.learning.truth import TrueValve
+from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.simulator import (
+    Acquisition,
+    draw_acquisition,
+    draw_probe,
+    simulate_volume,
+    true_sequence,
+)
+from mvest.imaging.volume import VolumeSequence
+from mvest.typing import FloatArray
+
+__all__ = [
+    "Draft",
+    "RenderedFrame",
+    "SampleCounts",
+    "Samples",
+    "TrainingSettings",
+    "draft_of",
+    "draw_samples",
+    "render_frame",
+    "train_model",
+    "train_stage",
+    "volume_samples",
+]
+
+MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
+"""Stages with ``TrainingSettings.many_trees``."""
+
+Setting: TypeAlias = Literal["training", "shifted"]
+"""Within the ranges that detectors are trained in, or outside of them."""
+
+Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
+"""Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleCounts:
+    """Samples taken of one volume for each stage."""
+
+    position: int = 160
+    pose_rating: int = 120
+    pose_refinement: int = 70
+    shape: int = 60
+    landmark: int = 50
+    rim: int = 240
+    boundary: int = 720
+    mistaken: int = 30
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSettings:
+    """How detectors are trained.
+
+    Attributes
+    ----------
+    modes : int
+        Of the shape model.
+    samples : SampleCounts
+    boosting : BoostSettings
+    many_trees : int
+        For the stages on which most depends, or that have most samples: the ratings of poses and
+        the boundary.
+    volumes : int
+        Simulated: one frame each, of the valves in turn.
+    draft_volumes : int
+        So many of them, the first ones, make a draft of the search for poses; from the others what
+        it mistakes for a valve is learned too.
+    acquisition : Acquisition
+        About which the renderings vary.
+    """
+
+    modes: int = 40
+    samples: SampleCounts = field(default_factory=SampleCounts)
+    boosting: BoostSettings = field(default_factory=BoostSettings)
+    many_trees: int = 130
+    volumes: int = 480
+    draft_volumes: int = 60
+    acquisition: Acquisition = field(default_factory=Acquisition)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draft:
+    """A first search for poses, whose mistakes the final rating learns from."""
+
+    position: PositionDetector
+    poses: PoseSearch
+
+    def taken_for_valves(self, frame: StandardFrame, count: int, rng: np.random.Generator) -> Poses:
+        """Half of ``count`` poses are those rated best, the others some of the rest."""
+        places, _ = self.position(frame, PLACES)
+        poses, _ = self.poses(frame, places, REFINED)
+        best = count // 2
+        others = best + rng.choice(len(poses) - best, count - best, replace=False)
+        return poses[np.concatenate([np.arange(best), others])]
+
+
+def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Draft:
+    """The search that is learned from the first volumes alone."""
+
+    def grown(name: str) -> Boosters:
+        x = np.concatenate([part[name][0] for part in samples])
+        return train_stage(
+            name, x, np.concatenate([part[name][1] for part in samples]), settings, seed
+        )
+
+    refine = tuple(grown(f"pose_refine_{k}") for k in range(len(REFINEMENTS)))
+    return Draft(
+        PositionDetector(grown("position")),
+        PoseSearch(grown("pose_coarse"), grown("pose_fine"), refine),
+    )
+
+
+def draw_samples(
+    frame: StandardFrame,
+    true: TrueValve,
+    model: ShapeModel,
+    counts: SampleCounts,
+    rng: np.random.Generator,
+    draft: Draft | None = None,
+) -> Samples:
+    """Samples of all stages from one frame; a draft's mistakes are among them."""
+    layout = model.layout
+    mistaken = None if draft is None else draft.taken_for_valves(frame, counts.mistaken, rng)
+    found: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
+        "position": position_samples(frame, true, counts.position, rng),
+        "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
+        "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
+        "shape": shape_start_samples(frame, true, model, counts.shape, rng),
+        "annulus": rim_samples(frame, true, model, 0, counts.rim, rng),
+        "free_edge": rim_samples(frame, true, model, -1, counts.rim, rng),
+        "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
+    }
+    for k in range(len(REFINEMENTS)):
+        found[f"pose_refine_{k}"] = refinement_samples(frame, true, k, counts.pose_refinement, rng)
+    for k in range(len(LANDMARKS)):
+        found[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
+    return {name: (x, y.astype(np.float32)) for name, (x, y) in found.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrame:
+    """One simulated volume of one frame, and the valve in it.
+
+    Attributes
+    ----------
+    frame : StandardFrame
+    vertices : (n, 3) mm
+        In world coordinates, as are the tips.
+    tips : (2, 3) mm
+    acquisition : Acquisition
+    volume : VolumeSequence
+        Of this frame alone.
+    """
+
+    frame: StandardFrame
+    vertices: FloatArray
+    tips: FloatArray
+    acquisition: Acquisition
+    volume: VolumeSequence
+
+
+def render_frame(
+    valve: MovingValve,
+    which: int,
+    base: Acquisition,
+    spread: Setting,
+    seed: np.random.SeedSequence,
+    *,
+    degraded: bool = False,
+) -> RenderedFrame:
+    """Simulate the volume of one frame of a valve, probe and rendering drawn at random.
+
+    With ``degraded`` it is made worse besides, see :mod:`mvest.imaging.learning.degrade`.
+    """
+    rng = np.random.default_rng(seed)
+    acquisition = draw_acquisition(rng, base, spread)
+    probe = draw_probe(rng, acquisition)
+    volume = simulate_volume(valve, acquisition, probe, int(rng.integers(2**31)), frames=[which])
+    if degraded:
+        volume = degrade(volume, rng)
+    true = true_sequence(valve, probe, [which])
+    return RenderedFrame(
+        standard_frame(volume, 0), true.vertices[0], true.tips[0], acquisition, volume
+    )
+
+
+def volume_samples(
+    valve: MovingValve,
+    number: int,
+    shape: ShapeModel,
+    settings: TrainingSettings,
+    seed: int,
+    draft: Draft | None = None,
+) -> Samples:
+    """Simulate one training volume and sample it for all stages.
+
+    Parameters
+    ----------
+    valve : MovingValve
+        Of N valves the one with the number ``number % N``.
+    number : int
+        Of the volume, from 0 on. It does not depend on how many others there are.
+    shape : ShapeModel
+    settings : TrainingSettings
+    seed : int
+        Of the training.
+    draft : Draft, optional
+        For all but the first volumes.
+    """
+    render, sample = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
+    which = int(np.random.default_rng(sample).integers(len(valve.times)))
+    seen = render_frame(valve, which, settings.acquisition, "training", render, degraded=True)
+    true = TrueValve.of(seen.vertices, seen.tips, shape)
+    rng = np.random.default_rng(sample.spawn(1)[0])
+    return draw_samples(seen.frame, true, shape, settings.samples, rng, draft)
+
+
+def train_stage(
+    name: str,
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    settings: TrainingSettings,
+    seed: int,
+) -> Boosters:
+    """Trees of one stage from its samples, those of all volumes one after another.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`mvest.imaging.detection.model.STAGES`.
+    x, y : (P, F), (P, outputs)
+    settings : TrainingSettings
+    seed : int
+        Of the training.
+    """
+    boosting, seed = settings.boosting, seed + 1000 * STAGES.index(name)
+    if name in MANY_TREES:
+        boosting = replace(boosting, trees=settings.many_trees)
+    objective = "cross_entropy" if name == "boundary" else "regression"
+    return train_boosters(x, y.astype(np.float64), boosting, seed, objective)
+
+
+def train_model(
+    valves: Sequence[MovingValve],
+    settings: TrainingSettings,
+    seed: int,
+    *,
+    processes: int = 1,
+    trained_on: Mapping[str, Any] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> DetectionModel:
+    """Simulate volumes and learn all stages.
+
+    Parameters
+    ----------
+    valves : sequence of MovingValve
+        Of one layout.
+    settings : TrainingSettings
+    seed : int
+        The result depends on it and on no number of processes.
+    processes : int
+    trained_on : mapping, optional
+        Plain values that are kept with the model.
+    progress : callable, optional
+        Called with what is being done, how much is done and how much there is.
+
+    Raises
+    ------
+    InputError
+        If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
+    """
+    if not valves:
+        raise InputError("training: no valves")
+    if settings.modes < MODES:
+        raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
+    tell = progress or (lambda what, done, all_: None)
+    shape = fit_shape_model(valves, settings.modes)
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
+        samples: list[Samples] = []
+        first = min(settings.draft_volumes, settings.volumes)
+        for numbers in (range(first), range(first, settings.volumes)):
+            draft = draft_of(samples, settings, seed) if samples and len(numbers) else None
+            drawn = parallel(
+                joblib.delayed(volume_samples)(
+                    valves[k % len(valves)], k, shape, settings, seed, draft
+                )
+                for k in numbers
+            )
+            for found in drawn:
+                samples.append(found)
+                tell("volumes", len(samples), settings.volumes)
+        grown = parallel(
+            joblib.delayed(train_stage)(
+                name,
+                np.concatenate([part[name][0] for part in samples]),
+                np.concatenate([part[name][1] for part in samples]),
+                settings,
+                seed,
+            )
+            for name in STAGES
+        )
+        boosters = {}
+        for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
+            boosters[name] = found_boosters
+            tell("stages", k + 1, len(STAGES))
+    return DetectionModel(shape, boosters, dict(trained_on or {}))

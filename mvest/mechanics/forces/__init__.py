@@ -1,0 +1,1 @@
+"""What acts on the tissue from outside: pressure, chordae, the hinge, contact, clips."""

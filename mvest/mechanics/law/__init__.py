@@ -1,0 +1,1 @@
+"""Laws of leaflet tissue: moduli in, energy, stress and tangent out."""

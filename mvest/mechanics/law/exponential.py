@@ -1,0 +1,346 @@
+r"""A fibre-reinforced exponential law of leaflet tissue.
+
+With the stretch of the fibres :math:`\lambda = \sqrt{I_4}`, the first invariant of the isochoric
+deformation :math:`\bar I_1 = J^{-2/3} \mathrm{tr}\, C` and :math:`C = I + 2E`,
+
+.. math::
+    W(E) &= c_0 \left(e^Q - 1\right) + \frac{\mu}{2} (\bar I_1 - 3)
+            + \frac{\kappa}{4} (J^2 - 1 - 2 \ln J), \\
+    Q &= c_1 (\bar I_1 - 3)^2 + c_2 \langle \lambda - 1 \rangle^4, \\
+    S(E) &= W_a\, a' + W_f\, e_1 + \frac{\kappa}{2} (J^2 - 1) C^{-1}, \\
+    D(E) &= W_{aa}\, a' \otimes a' + W_{af} (a' \otimes e_1 + e_1 \otimes a')
+            + W_{ff}\, e_1 \otimes e_1 + W_a\, a'' \\
+         &\quad + \kappa \left(J^2 C^{-1} \otimes C^{-1} - (J^2 - 1) C^{-1} \odot C^{-1}\right),
+
+where :math:`a = \bar I_1 - 3`, a prime is a derivative by E, and f stands for :math:`E_{11}`, of
+which alone :math:`\lambda = \sqrt{1 + 2 E_{11}}` is a function in the fibre frame.
+
+The exponential is that of May-Newman and Yin (1998, J. Biomech. Eng. 120:38) for mitral leaflets.
+Prot, Skallerud and Holzapfel (2007, Int. J. Numer. Meth. Engng 71:987) have :math:`(I_4 - 1)^2` in
+place of :math:`(\lambda - 1)^4`. Three things are added to it:
+
+* fibres bear tension only (:math:`\langle \cdot \rangle` is the positive part). The fourth power
+  keeps W three times continuously differentiable there; the square would make the tangent jump.
+* a neo-Hookean ground of shear modulus mu, because the exponential alone has no stiffness at rest.
+* a penalty kappa on the change of volume instead of exact incompressibility. It acts on J alone and
+  the exponential on the isochoric :math:`\bar I_1`, so that at rest there is no stress; the fibre
+  term is not split, since fibres feel their full stretch.
+
+Every term is polyconvex. Beyond Q = ``LARGEST_EXPONENT`` the exponential goes on as its own
+parabola, so that a Newton iterate far away does not overflow; no tissue gets there.
+
+Kelvin-Voigt damping adds the stress ``rate (E - E_n) V`` with ``rate = beta / dt`` and the constant
+isotropic V = ``viscous`` (MPa; half of it for engineering shear). It acts on the rate of the
+Green-Lagrange strain and so leaves rigid rotation alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, fields
+
+import numba as nb
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.mechanics.parameters import Parameter, known_names
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["EXPONENTIAL_KINDS", "ExponentialLaw", "ExponentialTissue"]
+
+LARGEST_EXPONENT = 12.0
+"""Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
+
+TURNED_OVER = 1e4
+"""MPa, stiffness towards the state at rest of matter that has turned over (see `response`)."""
+
+VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+"""Of unit viscous stiffness: stress by strain, component by component."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExponentialTissue:
+    """Coefficients of one region.
+
+    Attributes
+    ----------
+    c0 : float
+        MPa, scale of the exponential.
+    c1, c2 : float
+        Exponents of the isochoric deformation and of the fibres.
+    mu : float
+        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa that
+        excised leaflets have before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
+    kappa : float
+        MPa, bulk modulus.
+    viscous : float
+        MPa, stiffness that the damping acts with.
+
+    Raises
+    ------
+    MaterialError
+        If a coefficient is not positive (c1, c2 and viscous may be zero).
+    """
+
+    c0: float
+    c1: float
+    c2: float
+    mu: float = 0.02
+    kappa: float = 5.0
+    viscous: float = 2.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = float(getattr(self, field.name))
+            may_be_zero = field.name in ("c1", "c2", "viscous")
+            if not np.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
+                raise MaterialError(
+                    f"{field.name} = {value} of the exponential law, expected "
+                    f"{'>= 0' if may_be_zero else '> 0'}"
+                )
+
+
+EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
+"""Coefficients that may be parameters."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExponentialLaw:
+    """The law of a body: one set of coefficients per region, all quadrature points at once.
+
+    Arrays of points have the axes (element, quadrature point, component).
+
+    Attributes
+    ----------
+    coefficients : ndarray
+        ``(n_regions, 6)`` in the order of :class:`ExponentialTissue`.
+    """
+
+    coefficients: FloatArray
+
+    @classmethod
+    def of(cls, tissues: Sequence[ExponentialTissue]) -> ExponentialLaw:
+        """The law with one tissue per region."""
+        return cls(np.array([astuple(tissue) for tissue in tissues], dtype=np.float64))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The parameters that the law knows (see :mod:`mvest.mechanics.parameters`)."""
+        return EXPONENTIAL_KINDS
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """The Green-Lagrange strain ``(e, q, 6)`` itself is what is damped."""
+        return green
+
+    def energy(self, green: FloatArray, region: IntArray) -> FloatArray:
+        """W ``(e, q)`` MPa of Green-Lagrange strain ``(e, q, 6)``; infinite if turned over."""
+        return _energy(green, region, self.coefficients)
+
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stress S ``(e, q, 6)`` MPa and tangent D = dS/dE ``(e, q, 6, 6)`` MPa.
+
+        A strain of matter that has turned over, where there is no W, can occur during a Newton
+        iteration. The response is then that of very stiff linear matter, which is far from any
+        equilibrium and leads back.
+
+        Parameters
+        ----------
+        green : ndarray
+            ``(e, q, 6)`` Green-Lagrange strain.
+        region : ndarray
+            ``(e,)``.
+        previous : ndarray
+            ``(e, q, 6)`` Green-Lagrange strain at the start of the step.
+        rate : float
+            ``beta / dt``, dimensionless; 0 without damping.
+        """
+        stress, tangent = _response(green, region, self.coefficients)
+        if rate:
+            viscous = rate * self._viscous(region)
+            stress += viscous * (green - previous)
+            tangent[:, :, range(6), range(6)] += viscous
+        return stress, tangent
+
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """Derivative of S ``(e, q, 6)`` by a coefficient of region ``which``, at fixed strain.
+
+        Damping has no part in it. The arguments are those of
+        :meth:`mvest.mechanics.law.biot.BiotLaw.partial_stress`.
+
+        Raises
+        ------
+        InputError
+            If the law does not know the parameter.
+        """
+        if parameter.kind not in self.kinds:
+            raise InputError(
+                f"parameter {parameter.name!r}: the exponential law knows {known_names(self.kinds)}"
+            )
+        kind = EXPONENTIAL_KINDS.index(parameter.kind)
+        return _partial_stress(green, region, self.coefficients, kind, which)
+
+    def history_stress(
+        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Change of S ``(e, q, 6)`` for a change of the previous strain."""
+        return -rate * self._viscous(region) * d_previous
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """Change of the damped strain ``(e, q, 6)``, which is that of the Green-Lagrange strain."""
+        return d_green
+
+    def _viscous(self, region: IntArray) -> FloatArray:
+        """``(e, 1, 6)`` MPa."""
+        return self.coefficients[region, 5][:, None, None] * VISCOUS
+
+
+@nb.njit(cache=True)
+def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
+    """C^-1 in ``h`` (no doubled shear), and det C and tr C, of a strain with engineering shear.
+
+    The determinant is zero, and ``h`` useless, if C is not positive definite.
+    """
+    a, b, c = 1.0 + 2.0 * green[0], 1.0 + 2.0 * green[1], 1.0 + 2.0 * green[2]
+    d, e, f = green[3], green[4], green[5]
+    h[0], h[1], h[2] = b * c - d * d, a * c - e * e, a * b - f * f
+    h[3], h[4], h[5] = e * f - a * d, d * f - b * e, d * e - c * f
+    det = a * h[0] + f * h[5] + e * h[4]
+    if not (a > 0.0 and h[2] > 0.0 and det > 0.0):  # Sylvester's criterion
+        return 0.0, a + b + c
+    for i in range(6):
+        h[i] /= det
+    return det, a + b + c
+
+
+@nb.njit(cache=True)
+def _exponential(q: float) -> tuple[float, float, float]:
+    """exp(q) - 1 and its first two derivatives, a parabola beyond ``LARGEST_EXPONENT``."""
+    if q <= LARGEST_EXPONENT:
+        e = np.exp(q)
+        return np.expm1(q), e, e
+    e, d = np.exp(LARGEST_EXPONENT), q - LARGEST_EXPONENT
+    return e * (1.0 + d + 0.5 * d * d) - 1.0, e * (1.0 + d), e
+
+
+@nb.njit(cache=True)
+def _energy(green: FloatArray, region: IntArray, coefficients: FloatArray) -> FloatArray:
+    n_e, n_q, _ = green.shape
+    out = np.empty((n_e, n_q))
+    h = np.empty(6)
+    for e in range(n_e):
+        c0, c1, c2, mu, kappa, _ = coefficients[region[e]]
+        for p in range(n_q):
+            det, trace = _metric(green[e, p], h)
+            if det == 0.0:
+                out[e, p] = np.inf
+                continue
+            a = trace * det ** (-1.0 / 3.0) - 3.0
+            x = max(np.sqrt(1.0 + 2.0 * green[e, p, 0]) - 1.0, 0.0)
+            g, _, _ = _exponential(c1 * a * a + c2 * x**4)
+            out[e, p] = c0 * g + 0.5 * mu * a + 0.25 * kappa * (det - 1.0 - np.log(det))
+    return out
+
+
+@nb.njit(cache=True)
+def _response(
+    green: FloatArray, region: IntArray, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    n_e, n_q, _ = green.shape
+    stress, tangent = np.empty((n_e, n_q, 6)), np.empty((n_e, n_q, 6, 6))
+    h, da = np.empty(6), np.empty(6)
+    first, second = np.array([0, 1, 2, 1, 0, 0]), np.array([0, 1, 2, 2, 2, 1])
+    place = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
+    for e in range(n_e):
+        c0, c1, c2, mu, kappa, _ = coefficients[region[e]]
+        for p in range(n_q):
+            det, trace = _metric(green[e, p], h)
+            if det == 0.0:
+                for i in range(6):
+                    stress[e, p, i] = TURNED_OVER * green[e, p, i]
+                    for j in range(6):
+                        tangent[e, p, i, j] = TURNED_OVER if i == j else 0.0
+                continue
+            isochoric = det ** (-1.0 / 3.0)
+            a = trace * isochoric - 3.0
+            for i in range(6):
+                da[i] = 2.0 * isochoric * ((1.0 if i < 3 else 0.0) - trace / 3.0 * h[i])
+            length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
+            x = max(length - 1.0, 0.0)
+            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            q_a, q_f = 2.0 * c1 * a, 4.0 * c2 * x**3 / length
+            q_ff = c2 * (12.0 * x * x / length**2 - 4.0 * x**3 / length**3)
+            w_a, w_f = 0.5 * mu + c0 * g1 * q_a, c0 * g1 * q_f
+            w_aa, w_af = c0 * (g2 * q_a * q_a + 2.0 * g1 * c1), c0 * g2 * q_a * q_f
+            for i in range(6):
+                stress[e, p, i] = w_a * da[i] + 0.5 * kappa * (det - 1.0) * h[i]
+                for j in range(i + 1):
+                    k, m, r, s = first[i], second[i], first[j], second[j]
+                    both = 0.5 * (h[place[k, r]] * h[place[m, s]] + h[place[k, s]] * h[place[m, r]])
+                    mixed = (h[j] if i < 3 else 0.0) + (h[i] if j < 3 else 0.0)
+                    dda = (
+                        4.0
+                        * isochoric
+                        * (trace / 3.0 * both + trace / 9.0 * h[i] * h[j] - mixed / 3.0)
+                    )
+                    value = w_aa * da[i] * da[j] + w_a * dda
+                    value += kappa * (det * h[i] * h[j] - (det - 1.0) * both)
+                    tangent[e, p, i, j] = tangent[e, p, j, i] = value
+            stress[e, p, 0] += w_f
+            tangent[e, p, 0, 0] += c0 * (g2 * q_f * q_f + g1 * q_ff)
+            for i in range(6):
+                tangent[e, p, i, 0] += w_af * da[i]
+                tangent[e, p, 0, i] += w_af * da[i]
+    return stress, tangent
+
+
+@nb.njit(cache=True)
+def _partial_stress(
+    green: FloatArray, region: IntArray, coefficients: FloatArray, kind: int, which: int
+) -> FloatArray:
+    n_e, n_q, _ = green.shape
+    out = np.zeros((n_e, n_q, 6))
+    h = np.empty(6)
+    for e in range(n_e):
+        if region[e] != which:
+            continue
+        c0, c1, c2, _, _, _ = coefficients[which]
+        for p in range(n_q):
+            det, trace = _metric(green[e, p], h)
+            if det == 0.0:
+                continue
+            isochoric = det ** (-1.0 / 3.0)
+            a = trace * isochoric - 3.0
+            length = np.sqrt(1.0 + 2.0 * green[e, p, 0])
+            x = max(length - 1.0, 0.0)
+            _, g1, g2 = _exponential(c1 * a * a + c2 * x**4)
+            q_a, fourth = 2.0 * c1 * a, 4.0 * x**3 / length
+            by_a, by_f, by_volume = 0.0, 0.0, 0.0
+            if kind == 0:
+                by_a, by_f = g1 * q_a, g1 * c2 * fourth
+            elif kind == 1:
+                by_a = c0 * (g2 * a * a * q_a + 2.0 * g1 * a)
+                by_f = c0 * g2 * a * a * c2 * fourth
+            elif kind == 2:
+                by_a, by_f = c0 * g2 * x**4 * q_a, c0 * (g2 * x**4 * c2 + g1) * fourth
+            elif kind == 3:
+                by_a = 0.5
+            else:
+                by_volume = 0.5 * (det - 1.0)
+            for i in range(6):
+                unit = 1.0 if i < 3 else 0.0
+                da = 2.0 * isochoric * (unit - trace / 3.0 * h[i])
+                out[e, p, i] = by_a * da + by_volume * h[i]
+            out[e, p, 0] += by_f
+    return out

@@ -1,0 +1,272 @@
+"""Errors of a synthetic observation: what stands between the valve and what is seen of it.
+
+Each error is a frozen value that changes observed positions. Errors are applied one after another,
+with one random generator; a vertex that is not seen has the position NaN from then on. What a
+filter is told about them is configured apart from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from scipy.linalg import LinAlgError, cholesky
+from scipy.spatial.distance import cdist
+
+from mvest.errors import GeometryError, InputError
+from mvest.estimation.noise import ObservationNoise, kronecker_noise
+from mvest.typing import BoolArray, FloatArray
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.proximity import closest_points
+
+__all__ = [
+    "AnnulusOffset",
+    "CoaptationDropout",
+    "CorrelatedNoise",
+    "ObservationError",
+    "SpatialCorrelation",
+    "WhiteNoise",
+    "observe",
+]
+
+NUGGET = 1e-10
+"""Part of the variance that is uncorrelated, so that the correlation can be factorised where
+vertices nearly coincide."""
+
+
+class ObservationError(Protocol):
+    """One way in which what is seen differs from what is there."""
+
+    def __call__(
+        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
+    ) -> FloatArray:
+        """Positions as seen with this error added.
+
+        Parameters
+        ----------
+        seen : (f, n, 3) mm
+            Positions with the errors so far; a new array is returned. The first frame is the one
+            that the model's geometry is taken from, if more than one is observed.
+        true : (f, n, 3) mm
+            Positions without any error.
+        rng : numpy.random.Generator
+        """
+        ...
+
+
+def observe(
+    true: FloatArray, errors: Sequence[ObservationError], rng: np.random.Generator
+) -> FloatArray:
+    """Positions ``(f, n, 3)`` mm as seen with all errors; NaN where a vertex is not seen."""
+    seen = np.array(true, dtype=np.float64)
+    for error in errors:
+        seen = error(seen, true, rng)
+    return seen
+
+
+@dataclass(frozen=True, slots=True)
+class WhiteNoise:
+    """Independent normal noise of each coordinate of each vertex in each frame.
+
+    Attributes
+    ----------
+    std : float
+        mm.
+    """
+
+    std: float
+
+    def __post_init__(self) -> None:
+        _require_noise(self.std)
+
+    def __call__(
+        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
+    ) -> FloatArray:
+        """Add the noise."""
+        return seen + self.std * rng.standard_normal(seen.shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpatialCorrelation:
+    """Matérn correlation, of smoothness 3/2, between points of the leaflets at rest.
+
+    ``C(d) = (1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` with the straight distance d, which is
+    positive definite in space whatever the points (Rasmussen and Williams, Gaussian Processes for
+    Machine Learning, 2006, eq. 4.17); the fields are once differentiable. C(l) = 0.48.
+
+    Attributes
+    ----------
+    points : (n, 3) mm
+        Vertices at rest.
+    length : float
+        Correlation length l, mm.
+    factor : (n, n)
+        Lower triangular L with L Lᵀ = C and rows of length one. Made once: 3248 vertices take a
+        second and 84 MB.
+    """
+
+    points: FloatArray
+    length: float
+    factor: FloatArray = field(init=False, repr=False)
+    _parts: dict[bytes, SpatialCorrelation] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise InputError(f"correlated points: shape {points.shape}, expected finite (n, 3)")
+        if not (np.isfinite(self.length) and self.length > 0.0):
+            raise InputError(f"correlation length of {self.length} mm, expected > 0")
+        object.__setattr__(self, "points", points)
+        try:
+            factor = cholesky(self.matrix(), lower=True, overwrite_a=True, check_finite=False)
+        except LinAlgError as error:
+            raise InputError(
+                f"a correlation length of {self.length} mm is too long for {len(points)} vertices "
+                f"so close together: the correlation cannot be factorised"
+            ) from error
+        factor.setflags(write=False)
+        object.__setattr__(self, "factor", factor)
+
+    def matrix(self) -> FloatArray:
+        """C ``(n, n)``, with ones on the diagonal."""
+        d = cdist(self.points, self.points)
+        d *= np.sqrt(3.0) / self.length
+        C = (1.0 + d) * np.exp(-d)
+        C *= 1.0 - NUGGET
+        np.fill_diagonal(C, 1.0)
+        return C
+
+    def of(self, members: BoolArray) -> SpatialCorrelation:
+        """The correlation among some of the points; ``members (n,)``. Factorised once for each."""
+        if members.all():
+            return self
+        key = members.tobytes()
+        if key not in self._parts:
+            self._parts[key] = SpatialCorrelation(self.points[members], self.length)
+        return self._parts[key]
+
+    def noise(self, variance: float, coordinates: int) -> ObservationNoise:
+        """Noise of this correlation in ``coordinates`` of each point, stacked point by point."""
+        return kronecker_noise(variance, self.factor, coordinates)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrelatedNoise:
+    """Normal noise that is alike at neighbouring vertices, as errors of tracking are.
+
+    Coordinates and frames are independent of each other.
+
+    Attributes
+    ----------
+    std : float
+        mm, of each coordinate at every vertex.
+    correlation : SpatialCorrelation
+    """
+
+    std: float
+    correlation: SpatialCorrelation
+
+    def __post_init__(self) -> None:
+        _require_noise(self.std)
+
+    def __call__(
+        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
+    ) -> FloatArray:
+        """Add the noise."""
+        frames, n, _ = seen.shape
+        if n != len(self.correlation.points):
+            raise InputError(
+                f"{n} vertices are seen, but the noise is of {len(self.correlation.points)}"
+            )
+        white = rng.standard_normal((n, frames, 3))
+        noise = (self.correlation.factor @ white.reshape(n, -1)).reshape(white.shape)
+        return seen + self.std * noise.transpose(1, 0, 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoaptationDropout:
+    """Where leaflets have come together the image does not tell them apart: nothing is seen.
+
+    A vertex is hidden in a frame in which it is nearer than ``distance`` to another leaflet and was
+    not so at rest. So the commissures, where leaflets are joined, stay in sight.
+
+    Attributes
+    ----------
+    distance : float
+        mm, between midsurfaces.
+    surface : LeafletSurface
+        At rest.
+    """
+
+    distance: float
+    surface: LeafletSurface
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.distance) and self.distance >= 0.0):
+            raise InputError(f"drop-out within {self.distance} mm, expected >= 0")
+
+    def __call__(
+        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
+    ) -> FloatArray:
+        """Hide the vertices."""
+        if self.distance == 0.0:
+            return seen
+        joined = self._near(self.surface.vertices)
+        hidden = np.array([self._near(frame) & ~joined for frame in true])
+        if hidden.all(axis=1).any():
+            raise GeometryError(
+                f"drop-out within {self.distance} mm hides every vertex of a frame; "
+                f"expected a smaller distance"
+            )
+        return np.where(hidden[:, :, None], np.nan, seen)
+
+    def _near(self, vertices: FloatArray) -> BoolArray:
+        """Which vertices ``(n,)`` are nearer than the distance to a leaflet not their own."""
+        surface = self.surface
+        near = np.zeros(len(vertices), dtype=np.bool_)
+        own = surface.vertex_region
+        for region in range(len(surface.region_names)):
+            others = np.flatnonzero(own != region)
+            triangles = surface.triangles[surface.region == region]
+            if others.size and len(triangles):
+                found = closest_points(vertices[others], vertices, triangles)
+                near[others[found.distance < self.distance]] = True
+        return near
+
+
+@dataclass(frozen=True, slots=True)
+class AnnulusOffset:
+    """The annulus is seen displaced against the leaflets in every frame but the reference frame.
+
+    The model is bounded by the annulus as it was seen, so that in the model's coordinates the
+    leaflets (and the papillary tips with them, on which the data have no say) are seen displaced by
+    ``offset`` as one. The open frame, from which the model's geometry is taken, agrees with it by
+    construction.
+
+    Attributes
+    ----------
+    offset : (float, float, float)
+        mm, of the leaflets against the annulus; in the template x runs between the commissures, y
+        from posterior to anterior, z along the axis.
+    """
+
+    offset: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if len(self.offset) != 3 or not np.isfinite(self.offset).all():
+            raise InputError(f"annulus offset {self.offset}, expected three finite numbers in mm")
+
+    def __call__(
+        self, seen: FloatArray, true: FloatArray, rng: np.random.Generator, /
+    ) -> FloatArray:
+        """Displace the closed frame, which is observed last."""
+        moved = seen.copy()
+        moved[-1] += self.offset
+        return moved
+
+
+def _require_noise(std: float) -> None:
+    if not (np.isfinite(std) and std >= 0.0):
+        raise InputError(f"noise of {std} mm, expected >= 0")

@@ -1,0 +1,483 @@
+"""What is seen of a valve where no vertex is known again: points and curves without correspondence.
+
+A frame is seen as points somewhere on the leaflets and as curves along the free edge and the
+annulus. They are compared with a predicted surface by their distances to it:
+
+* a point with the signed distance ``d = u . (x - c)`` to the closest point c of its own leaflet.
+  Inside a triangle u is its unit normal. Where c lies on an edge or a vertex, u is along x - c, on
+  the side of the angle-weighted normal there (Baerentzen and Aanaes, IEEE Trans. Vis. Comput.
+  Graph. 11 (2005) 243-253, who show that this side is right on any surface without border);
+* a point of a curve with the two components of x - c across the curve as it was seen. A distance in
+  space has a kink at zero; these have none, and two is what a point across a curve can tell.
+
+Sliding along the surface or the curve changes neither, so only what is seen enters the estimate.
+The derivatives are exact. c is where the distance is smallest, so its own sliding does not change
+the distance to first order (envelope theorem): ``dd/dm = -u . dc/dm`` with c fixed in the tissue.
+
+What to know:
+
+* Where two parts of a surface are equally near (inside a fold, between leaflets for points of
+  unknown leaflet), d has a kink; the derivative is that of one of them.
+* Beyond the border of a leaflet d is the distance to the border, and its sign changes across the
+  border triangle's plane. Independent errors do not see the sign, correlated ones do: leave such
+  points out then (`ObservedSurface.inner`, three standard deviations).
+* Errors that are rougher than they are said to be, as independent ones are, show in a normalised
+  innovation far above one per observation.
+* A point however far counts, at any distance; outliers are to be removed before.
+* Noise of s in every coordinate shifts d by about k s² on average, where k is the mean curvature:
+  0.025 mm for s = 0.5 mm at a bend of radius 5 mm (k = 0.1/mm).
+* Points are to lie on what the model predicts, the midsurface of the leaflets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import ObservationModel, Prediction
+from mvest.estimation.noise import (
+    NoiseCovariance,
+    observation_noise,
+    scaled_noise,
+    stacked_noise,
+)
+from mvest.observation.errors import SpatialCorrelation
+from mvest.observation.vertices import FRAMES
+from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import Valve, lumped_areas
+from mvest.valve.geometry.moving_distance import (
+    across_curve,
+    closest_on_loop,
+    curve_offsets,
+    signed_distances,
+)
+from mvest.valve.geometry.proximity import closest_points
+
+__all__ = [
+    "UNKNOWN",
+    "ObservedSurface",
+    "PredictedSurface",
+    "SurfaceFrames",
+    "SurfaceObservation",
+    "mean_surface_distance",
+    "surface_distance",
+]
+
+UNKNOWN = -1
+"""Region of a point that may be of any leaflet."""
+
+MAX_CORRELATED_POINTS = 2000
+"""Largest number of points of a frame whose correlation is factorised: 32 MB and half a second."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedSurface:
+    """One frame as it was seen, without correspondence.
+
+    Attributes
+    ----------
+    frame : str
+        Name of the frame that the model predicts.
+    points : (q, 3) mm
+        Points seen on the leaflets.
+    region : (q,)
+        Leaflet of each point, ``UNKNOWN`` (-1) where it is not known.
+    free_edge : (j, 3) mm or None
+        Closed curve along the free edge; the last point joins the first.
+    annulus : (k, 3) mm or None
+        Closed curve along the annulus.
+    scale : (q,) or None
+        Standard deviation of each point as a part of that of the observation; None: all alike.
+
+    Raises
+    ------
+    InputError
+        On wrong shapes, values that are not finite, and curves whose points coincide.
+    """
+
+    frame: str
+    points: FloatArray
+    region: IntArray
+    free_edge: FloatArray | None = None
+    annulus: FloatArray | None = None
+    scale: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        points = _points(f"points seen in frame {self.frame}", self.points)
+        region = _numbers(f"regions seen in frame {self.frame}", self.region, UNKNOWN, None)
+        if region.shape != (len(points),):
+            raise InputError(
+                f"frame {self.frame}: regions of shape {region.shape} for {len(points)} points; "
+                f"expected one each, {UNKNOWN} where it is not known"
+            )
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "region", region)
+        for name in ("free_edge", "annulus"):
+            if getattr(self, name) is not None:
+                what = f"{name} seen in frame {self.frame}"
+                object.__setattr__(self, name, _curve(what, getattr(self, name)))
+        if self.scale is not None:
+            scale = np.array(self.scale, dtype=np.float64)
+            if scale.shape != (len(points),) or not np.all(np.isfinite(scale) & (scale > 0)):
+                raise InputError(
+                    f"frame {self.frame}: scale of the errors of shape {scale.shape}, expected a "
+                    f"positive number for each of {len(points)} points"
+                )
+            scale.setflags(write=False)
+            object.__setattr__(self, "scale", scale)
+
+    def inner(self, distance: float | FloatArray) -> ObservedSurface:
+        """The same without the points nearer than ``distance`` mm to a curve that is seen.
+
+        ``distance`` is one number or one for each point ``(q,)``.
+
+        They are the points that noise may put beyond the border; the curves tell where that is.
+        """
+        keep = np.ones(len(self.points), dtype=np.bool_)
+        for curve in (self.free_edge, self.annulus):
+            if curve is not None:
+                offset = closest_on_loop(self.points, curve)[2]
+                keep &= np.linalg.norm(offset, axis=1) >= distance
+        scale = None if self.scale is None else self.scale[keep]
+        return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictedSurface:
+    """How the positions that a model predicts form a surface.
+
+    Attributes
+    ----------
+    n_vertices : int
+        Vertices n that the model predicts in each frame.
+    triangles : (m, 3)
+        Their normals point to one side throughout.
+    region : (m,)
+        Leaflet of each triangle.
+    free_edge, annulus : (e,), (a,) or None
+        Vertices in loop order; None if the curve is not to be compared.
+
+    Raises
+    ------
+    InputError
+        On wrong shapes and numbers out of range.
+    """
+
+    n_vertices: int
+    triangles: IntArray
+    region: IntArray
+    free_edge: IntArray | None = None
+    annulus: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        last = self.n_vertices - 1
+        triangles = _numbers("triangles", self.triangles, 0, last)
+        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
+            raise InputError(f"triangles: shape {triangles.shape}, expected (m, 3)")
+        region = _numbers("region", self.region, 0, None)
+        if region.shape != (len(triangles),):
+            raise InputError(f"region: shape {region.shape}, expected ({len(triangles)},)")
+        object.__setattr__(self, "triangles", triangles)
+        object.__setattr__(self, "region", region)
+        for name in ("free_edge", "annulus"):
+            if getattr(self, name) is not None:
+                loop = _numbers(name, getattr(self, name), 0, last)
+                if loop.ndim != 1 or len(loop) < 3 or len(np.unique(loop)) != len(loop):
+                    raise InputError(f"{name}: expected a loop of three or more different vertices")
+                object.__setattr__(self, name, loop)
+
+    @classmethod
+    def of_valve(cls, valve: Valve) -> PredictedSurface:
+        """The surface of a valve whose vertices a model predicts, with both curves."""
+        surface = valve.surface
+        n = len(surface.vertices)
+        return cls(n, surface.triangles, surface.region, valve.free_edge, valve.annulus)
+
+    def of(self, region: int) -> IntArray:
+        """Triangles of one leaflet, of all if it is ``UNKNOWN``."""
+        return self.triangles if region == UNKNOWN else self.triangles[self.region == region]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceObservation:
+    """What was seen without correspondence, and how well.
+
+    The observation of each frame is the distances of its points, then two components of each point
+    of the free edge and of the annulus. What is predicted are these distances; observed is zero.
+
+    Attributes
+    ----------
+    seen : tuple of ObservedSurface, (f,)
+        One for each observed frame, the closed one last.
+    surface : PredictedSurface
+    std_mm : float
+        Standard deviation of the seen points along the normal.
+    curve_std_mm : float or None
+        Of each component of the points of the curves; None if there are none.
+    correlation_length_mm : float
+        Over which the errors of the distances are alike, see ``SpatialCorrelation``, within a frame
+        and a leaflet; 0: independent. Errors of the curves are independent.
+    R : NoiseCovariance
+        Covariance in mm² of the observation.
+
+    Raises
+    ------
+    InputError
+        On inadmissible standard deviations, frames, or curves and leaflets that the model's surface
+        does not have; and if more than ``MAX_CORRELATED_POINTS`` points are to be correlated.
+    """
+
+    seen: tuple[ObservedSurface, ...]
+    surface: PredictedSurface
+    std_mm: float
+    curve_std_mm: float | None = None
+    correlation_length_mm: float = 0.0
+    R: NoiseCovariance = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "seen", tuple(self.seen))
+        if len(set(self.frames)) != len(self.frames):
+            raise InputError(f"observed frames {list(self.frames)}, expected different ones")
+        if not any(len(seen.points) or _curves(seen, self.surface) for seen in self.seen):
+            raise InputError("nothing is seen: no frame has a point or a curve")
+        _require_std("std_mm", self.std_mm)
+        for seen in self.seen:
+            self._require_counterpart(seen)
+        length = self.correlation_length_mm
+        if not (np.isfinite(length) and length >= 0.0):
+            raise InputError(f"correlation_length_mm = {length}, expected >= 0")
+        object.__setattr__(self, "R", self._noise())
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the observed frames."""
+        return tuple(seen.frame for seen in self.seen)
+
+    @property
+    def y(self) -> FloatArray:
+        """Zeros: the seen points have no distance to the surface that was seen."""
+        return np.zeros(sum(self._size(seen) for seen in self.seen))
+
+    def of(self, model: ObservationModel, all_frames: Sequence[str] = FRAMES, /) -> SurfaceFrames:
+        """What a model predicts of this observation.
+
+        Parameters
+        ----------
+        model : ObservationModel
+            Predicts the stacked positions ``(3 n f,)`` mm of all frames.
+        all_frames : sequence of str, (f,)
+            Names of its frames in the order in which it stacks them.
+
+        Raises
+        ------
+        InputError
+            If the model does not predict a frame that was seen.
+        """
+        unknown = set(self.frames) - set(all_frames)
+        if unknown:
+            raise InputError(f"observed frames {sorted(unknown)}, predicted {list(all_frames)}")
+        return SurfaceFrames(model, self, tuple(all_frames))
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Unsigned distances ``(q,)`` mm of the last frame's points to fitted ``(f, n, 3)``."""
+        seen, distance = self.seen[-1], np.empty(len(self.seen[-1].points))
+        for region, members in _by_region(seen):
+            triangles = self.surface.of(region)
+            distance[members] = surface_distance(seen.points[members], fitted[-1], triangles)
+        return distance
+
+    def _require_counterpart(self, seen: ObservedSurface) -> None:
+        missing = set(seen.region.tolist()) - {UNKNOWN, *self.surface.region.tolist()}
+        if missing:
+            raise InputError(
+                f"frame {seen.frame}: points of region {min(missing)}, of which the model's "
+                f"surface has no triangle"
+            )
+        for name in ("free_edge", "annulus"):
+            if getattr(seen, name) is not None:
+                if getattr(self.surface, name) is None:
+                    raise InputError(
+                        f"frame {seen.frame}: the {name} is seen, but the model's surface has none"
+                    )
+                if self.curve_std_mm is None:
+                    raise InputError(f"the {name} is seen, but curve_std_mm is not given")
+                _require_std("curve_std_mm", self.curve_std_mm)
+        q = len(seen.points)
+        if self.correlation_length_mm and q > MAX_CORRELATED_POINTS:
+            raise InputError(
+                f"frame {seen.frame}: {q} points with correlated errors, expected at most "
+                f"{MAX_CORRELATED_POINTS}; thin them: points nearer to each other than the "
+                f"correlation length of {self.correlation_length_mm:g} mm say little that is new"
+            )
+
+    def _size(self, seen: ObservedSurface) -> int:
+        return len(seen.points) + sum(2 * len(q) for q, _ in _curves(seen, self.surface))
+
+    def _noise(self) -> NoiseCovariance:
+        parts = []
+        for seen in self.seen:
+            q = len(seen.points)
+            if q and self.correlation_length_mm:
+                length = self.correlation_length_mm
+                # Leaflets are independent: they are moved apart to where nothing is correlated.
+                extent = float(np.ptp(seen.points, axis=0).max())
+                apart = seen.region * (extent + 1000.0 * length)
+                points = seen.points + apart[:, None]
+                noise = SpatialCorrelation(points, length).noise(self.std_mm**2, 1)
+            elif q:
+                noise = observation_noise(self.std_mm**2, q)
+            if q:
+                parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
+            if rest := self._size(seen) - q:
+                assert self.curve_std_mm is not None
+                parts.append(observation_noise(self.curve_std_mm**2, rest))
+        return stacked_noise(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFrames:
+    """The distances of what was seen to what a model predicts.
+
+    Parameters that no tissue can have, as a filter may try, give a failed prediction. To a triangle
+    without area a distance is that to its edges; a point on it has no direction and no derivative.
+
+    Attributes
+    ----------
+    model : ObservationModel
+        Predicts the stacked positions of all frames.
+    observation : SurfaceObservation
+    all_frames : tuple of str
+        In the order in which the model stacks them.
+    """
+
+    model: ObservationModel
+    observation: SurfaceObservation
+    all_frames: tuple[str, ...]
+    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
+
+    def whole(self, m: FloatArray) -> FloatArray | None:
+        """Observed frames ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
+        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict the distances for parameters ``m (p,)``."""
+        try:
+            prediction = self.model(m)
+        except MaterialError as error:
+            return Prediction.failed(str(error))
+        if not prediction.converged:
+            return prediction
+        surface = self.observation.surface
+        shape = (len(self.all_frames), surface.n_vertices, 3)
+        if prediction.y.size != np.prod(shape):
+            raise InputError(
+                f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
+                f"{surface.n_vertices} vertices in each of the frames {', '.join(self.all_frames)}"
+            )
+        chosen = [self.all_frames.index(frame) for frame in self.observation.frames]
+        whole = prediction.y.reshape(shape)[chosen]
+        motion = prediction.jacobian.reshape(*shape, -1)[chosen]
+        y, jacobian = [], []
+        for seen, vertices, moved in zip(self.observation.seen, whole, motion, strict=True):
+            for h, H in self._of_frame(seen, vertices, moved):
+                y.append(h)
+                jacobian.append(H)
+        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
+        return Prediction(np.concatenate(y), np.concatenate(jacobian), reason=prediction.reason)
+
+    def _of_frame(
+        self, seen: ObservedSurface, vertices: FloatArray, motion: FloatArray
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        surface = self.observation.surface
+        h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
+        for region, members in _by_region(seen):
+            h[members], H[members] = signed_distances(
+                seen.points[members], vertices, surface.of(region), motion
+            )
+        yield h, H
+        for curve, loop in _curves(seen, surface):
+            assert self.observation.curve_std_mm is not None
+            across = across_curve(curve, self.observation.curve_std_mm)
+            yield curve_offsets(curve, across, vertices[loop], motion[loop])
+
+
+def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    """Unsigned distances ``(q,)`` mm of points ``(q, 3)`` to a surface, for reporting."""
+    return closest_points(points, vertices, triangles).distance
+
+
+def mean_surface_distance(
+    a: FloatArray, triangles_a: IntArray, b: FloatArray, triangles_b: IntArray
+) -> float:
+    """Mean distance (mm) of two surfaces: from each to the other, and the mean of both.
+
+    Vertices ``(n, 3)`` mm count by the area that belongs to them, so that it does not matter where
+    a surface is finely triangulated.
+    """
+    ways = ((a, triangles_a, b, triangles_b), (b, triangles_b, a, triangles_a))
+    return float(
+        np.mean(
+            [
+                np.average(surface_distance(x, y, other), weights=lumped_areas(x, own))
+                for x, own, y, other in ways
+            ]
+        )
+    )
+
+
+def _by_region(seen: ObservedSurface) -> Iterator[tuple[int, BoolArray]]:
+    """Each region that is seen, and which points ``(q,)`` are of it."""
+    for region in np.unique(seen.region):
+        yield int(region), seen.region == region
+
+
+def _curves(seen: ObservedSurface, surface: PredictedSurface) -> list[tuple[FloatArray, IntArray]]:
+    """The curves that are seen and the loops of vertices that they are compared with."""
+    pairs = ((seen.free_edge, surface.free_edge), (seen.annulus, surface.annulus))
+    return [(curve, loop) for curve, loop in pairs if curve is not None and loop is not None]
+
+
+def _points(what: str, values: FloatArray) -> FloatArray:
+    points = np.array(values, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{what}: shape {points.shape}, expected (q, 3) mm")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise InputError(f"{what}: point {bad[0]} is {points[bad[0]]}, expected finite numbers")
+    points.setflags(write=False)
+    return points
+
+
+def _curve(what: str, values: FloatArray) -> FloatArray:
+    curve = _points(what, values)
+    if len(curve) < 3:
+        raise InputError(f"{what}: {len(curve)} points, expected three or more")
+    repeated = np.flatnonzero(np.all(np.roll(curve, -1, axis=0) == curve, axis=1))
+    if repeated.size:
+        raise InputError(
+            f"{what}: point {repeated[0]} is the same as the next one; expected different points, "
+            f"the first not repeated at the end"
+        )
+    return curve
+
+
+def _numbers(what: str, values: IntArray, least: int, most: int | None) -> IntArray:
+    given = np.asarray(values)
+    if given.size and not np.issubdtype(given.dtype, np.integer):
+        raise InputError(f"{what}: {given.dtype}, expected integers")
+    numbers = np.array(given, dtype=np.int64)
+    if numbers.size and (numbers.min() < least or (most is not None and numbers.max() > most)):
+        raise InputError(
+            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {least} to "
+            f"{'any' if most is None else most}"
+        )
+    numbers.setflags(write=False)
+    return numbers
+
+
+def _require_std(name: str, std: float) -> None:
+    if not (np.isfinite(std) and std > 0.0):
+        raise InputError(f"{name} = {std}, expected > 0")

@@ -1,0 +1,187 @@
+"""What is seen of a valve: an observation, and the same of what a model predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import ObservationModel, Prediction
+from mvest.estimation.noise import NoiseCovariance, scaled_noise, stacked_noise
+from mvest.estimation.prediction import require_finite
+from mvest.observation.errors import SpatialCorrelation
+from mvest.typing import BoolArray, FloatArray
+
+__all__ = ["FRAMES", "Observation", "ObservedFrames", "require_frames", "select_frames"]
+
+FRAMES = ("open", "closed")
+"""Frames that a valve model predicts, in the order in which it stacks them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """What was seen, and how well.
+
+    Attributes
+    ----------
+    frames : tuple of str, (f,)
+        Observed frames, the closed one last.
+    positions : (f, n, 3) mm
+        Positions of the vertices in each frame; NaN where a vertex is not seen, so that nobody can
+        read what was not observed.
+    variance : (f,) mm²
+        Variance of each coordinate in each frame that the filter is to assume.
+    scale : (n,) or None
+        Standard deviation of each vertex as a part of that of its frame; None: all alike.
+    correlation : SpatialCorrelation or None
+        Correlation between vertices that the filter is to assume; None for independent errors.
+    """
+
+    frames: tuple[str, ...]
+    positions: FloatArray
+    variance: FloatArray
+    correlation: SpatialCorrelation | None = None
+    scale: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        require_frames(self.frames)
+        positions = np.array(self.positions, dtype=np.float64)
+        if positions.ndim != 3 or positions.shape[0] != len(self.frames) or positions.shape[2] != 3:
+            raise InputError(
+                f"observed positions have shape {positions.shape}, expected "
+                f"({len(self.frames)}, n, 3): one row for each of {', '.join(self.frames)}"
+            )
+        unseen: BoolArray = np.all(np.isnan(positions), axis=2)
+        require_finite(np.where(unseen[..., None], 0.0, positions), "the observed positions")
+        if np.all(unseen):
+            raise InputError("no observed position is finite: no vertex is seen")
+        try:
+            variance = np.broadcast_to(np.asarray(self.variance, float), (len(self.frames),)).copy()
+        except ValueError:
+            raise InputError(
+                f"R has shape {np.shape(self.variance)}; expected one variance, or one for each of "
+                f"the {len(self.frames)} observed frames"
+            ) from None
+        require_finite(variance, "R")
+        if np.any(variance <= 0.0):
+            raise InputError(f"R = {variance.min():g} mm^2, expected > 0")
+        told = self.correlation
+        if told is not None and len(told.points) != positions.shape[1]:
+            raise InputError(
+                f"R is correlated between {len(told.points)} vertices, but {positions.shape[1]} "
+                f"are observed"
+            )
+        for name, values in (("positions", positions), ("variance", variance)):
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        if self.scale is not None:
+            scale = np.array(self.scale, dtype=np.float64)
+            if scale.shape != positions.shape[1:2]:
+                raise InputError(
+                    f"R has a scale of shape {scale.shape}, expected one for each of "
+                    f"{positions.shape[1]} vertices"
+                )
+            require_finite(scale, "the scale of R")
+            if np.any(scale <= 0.0):
+                raise InputError(f"scale of R = {scale.min():g}, expected > 0")
+            scale.setflags(write=False)
+            object.__setattr__(self, "scale", scale)
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which vertices are seen in each frame ``(f, n)``."""
+        return np.isfinite(self.positions[:, :, 0])
+
+    @property
+    def y(self) -> FloatArray:
+        """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
+        return self.positions[self.seen].ravel()
+
+    def of(self, model: ObservationModel, /) -> ObservedFrames:
+        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation."""
+        return ObservedFrames(model, self.frames, self.seen)
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Distance ``(n,)`` mm of each vertex of the last frame from fitted ``(f, n, 3)``.
+
+        NaN where a vertex is not seen.
+        """
+        return np.asarray(np.linalg.norm(fitted[-1] - self.positions[-1], axis=1))
+
+    @property
+    def R(self) -> NoiseCovariance:
+        """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
+        counts = 3 * self.seen.sum(axis=1)
+        told = self.correlation
+        if told is None:
+            variance = np.repeat(self.variance, counts)
+            if self.scale is None:
+                return variance
+            return np.asarray(
+                variance
+                * np.concatenate([np.repeat(self.scale[seen], 3) for seen in self.seen]) ** 2
+            )
+        blocks = []
+        for seen, variance in zip(self.seen, self.variance, strict=True):
+            if not seen.any():
+                continue
+            noise = told.of(seen).noise(float(variance), 3)
+            if self.scale is not None:
+                noise = scaled_noise(noise, np.repeat(self.scale[seen], 3))
+            blocks.append(noise)
+        return stacked_noise(blocks)
+
+
+def require_frames(frames: Sequence[str]) -> None:
+    """Raise InputError unless ``frames`` are different frames that a model predicts."""
+    if not frames or not set(frames) <= set(FRAMES) or len(set(frames)) != len(frames):
+        raise InputError(f"observed frames {list(frames)}, expected some of {list(FRAMES)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedFrames:
+    """The observed frames of a model that predicts all of ``FRAMES``.
+
+    Parameters that no tissue can have, as a filter may try, give a failed prediction.
+
+    Attributes
+    ----------
+    model : ObservationModel
+    frames : tuple of str, (f,)
+    seen : (f, n) or None
+        Vertices that are predicted in each frame; None for all.
+    """
+
+    model: ObservationModel
+    frames: tuple[str, ...]
+    seen: BoolArray | None = None
+    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
+
+    def whole(self, m: FloatArray) -> FloatArray | None:
+        """Positions ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
+        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict the observed frames of parameters ``m (p,)``."""
+        try:
+            prediction = self.model(m)
+        except MaterialError as error:
+            return Prediction.failed(str(error))
+        if not prediction.converged:
+            return prediction
+        y, jacobian = (select_frames(a, self.frames) for a in (prediction.y, prediction.jacobian))
+        whole = y.reshape(len(self.frames), -1, 3)
+        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
+        if self.seen is not None:
+            rows = np.repeat(self.seen, 3)
+            y, jacobian = y[rows], jacobian[rows]
+        return Prediction(y, jacobian, reason=prediction.reason)
+
+
+def select_frames(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:
+    """Rows of the named frames out of all ``FRAMES``."""
+    size = len(stacked) // len(FRAMES)
+    starts = [size * FRAMES.index(frame) for frame in frames]
+    return np.concatenate([stacked[start : start + size] for start in starts])

@@ -1,0 +1,1 @@
+"""The joint of data, model and filter."""

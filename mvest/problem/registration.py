@@ -1,0 +1,138 @@
+"""A rigid displacement between the frame of the model and that of what was seen.
+
+The model is bounded by the annulus and the papillary tips as they were tracked. If the leaflets of
+the later frames were seen displaced against these (by an error of tracking common to all their
+points), every modulus is fitted to that displacement. So it is a parameter: the predicted closed
+frame is turned and shifted before it is compared.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mvest.closure.model import ClosedState, ClosureModel
+from mvest.errors import InputError
+from mvest.estimation.prediction import Prediction
+from mvest.typing import FloatArray
+
+__all__ = ["REGISTRATION", "RegisteredModel", "displace", "registration_of"]
+
+REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
+"""Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
+
+
+def registration_of(names: tuple[str, ...], m: FloatArray) -> FloatArray:
+    """Shift and turn ``(6,)`` out of parameters ``m (p,)``; zero where ``names`` lacks one."""
+    values = dict(zip(names, map(float, m), strict=True))
+    return np.array([values.get(name, 0.0) for name in REGISTRATION])
+
+
+def displace(points: FloatArray, registration: FloatArray, centre: FloatArray) -> FloatArray:
+    """Points ``(..., 3)`` mm turned about ``centre (3,)`` and shifted.
+
+    Parameters
+    ----------
+    points, centre : ndarray
+        mm.
+    registration : ndarray
+        ``(6,)`` shift in mm and rotation vector in degrees (its length is the angle).
+    """
+    turn = Rotation.from_rotvec(registration[3:], degrees=True).as_matrix()
+    return np.asarray((points - centre) @ turn.T + centre + registration[:3])
+
+
+def _turn_derivatives(vector: FloatArray) -> FloatArray:
+    """Derivatives ``(3, 3, 3)`` of the rotation matrix by its rotation vector (rad), k first.
+
+    Gallego and Yezzi 2015, J. Math. Imaging Vis. 51:378, eq. 9:
+    dR/dv_k = [v_k v + v x (I - R) e_k]_x R / |v|^2, and [e_k]_x for no rotation.
+    """
+    R = Rotation.from_rotvec(vector).as_matrix()
+    squared = float(vector @ vector)
+    out = np.empty((3, 3, 3))
+    for k, unit in enumerate(np.eye(3)):
+        if squared < 1e-16:
+            out[k] = _cross(unit)
+        else:
+            axis = vector[k] * vector + np.cross(vector, (np.eye(3) - R)[:, k])
+            out[k] = _cross(axis) @ R / squared
+    return out
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+class RegisteredModel:
+    """A closure whose closed frame is displaced before it is seen.
+
+    Parameters
+    ----------
+    model : ClosureModel
+        Predicts the open and the closed frame.
+    names : tuple of str, (p,)
+        Those of the model, and some of ``REGISTRATION``, in any order.
+
+    Raises
+    ------
+    InputError
+        If a parameter of the model is missing or an unknown one is named.
+    """
+
+    def __init__(self, model: ClosureModel, names: tuple[str, ...]) -> None:
+        own = [k for k, name in enumerate(names) if name not in REGISTRATION]
+        if tuple(names[k] for k in own) != model.names:
+            raise InputError(
+                f"parameters {', '.join(names)}: expected {', '.join(model.names)} in this order, "
+                f"and some of {', '.join(REGISTRATION)}"
+            )
+        self.model = model
+        self.names = names
+        self._own = np.array(own, dtype=np.int64)
+        closed = model.valve.motion.annulus[-1]
+        self.centre: FloatArray = closed.mean(axis=0)
+
+    @property
+    def closed(self) -> ClosedState | None:
+        """Where the next prediction would start from."""
+        return self.model.closed
+
+    def restart(self, closed: ClosedState | None) -> None:
+        """Forget everything but where to start from."""
+        self.model.restart(closed)
+
+    def mechanical(self, m: FloatArray) -> FloatArray:
+        """The parameters of the closure out of all."""
+        return np.asarray(m, dtype=np.float64)[self._own]
+
+    def seen(self, points: FloatArray, m: FloatArray) -> FloatArray:
+        """Positions ``(..., 3)`` mm of the closed valve as parameters ``m`` say they are seen."""
+        return displace(points, registration_of(self.names, m), self.centre)
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Predict, as an ``ObservationModel`` does."""
+        found = self.model(self.mechanical(m))
+        if not found.converged:
+            return found
+        half = len(found.y) // 2
+        closed = found.y[half:].reshape(-1, 3)
+        registration = registration_of(self.names, m)
+        turn = Rotation.from_rotvec(registration[3:], degrees=True).as_matrix()
+        by_own = found.jacobian[half:].reshape(len(closed), 3, -1)
+        jacobian = np.zeros((len(found.y), len(self.names)))
+        jacobian[:half, self._own] = found.jacobian[:half]
+        jacobian[half:, self._own] = np.einsum("ij,njp->nip", turn, by_own).reshape(half, -1)
+        turns = _turn_derivatives(np.deg2rad(registration[3:]))
+        for k, name in enumerate(self.names):
+            kind, _, axis = name.partition(".")
+            i = "xyz".find(axis)
+            if kind == "shift":
+                jacobian[half + i :: 3, k] = 1.0
+            elif kind == "turn":
+                by_radian = (closed - self.centre) @ turns[i].T
+                jacobian[half:, k] = np.deg2rad(by_radian).ravel()
+        seen = displace(closed, registration, self.centre)
+        return Prediction(
+            np.concatenate([found.y[:half], seen.ravel()]), jacobian, reason=found.reason
+        )

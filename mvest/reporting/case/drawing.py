@@ -1,0 +1,236 @@
+"""Valves drawn flat on a page: shaded triangles and lines seen from one side, the farthest first.
+
+A drawing is one collection in ordinary axes in millimetres, so that lines disappear behind leaflets
+and every panel can have the same scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from matplotlib.collections import PolyCollection
+
+from mvest.reporting.case.fields import CaseFields
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import vertex_normals
+
+__all__ = [
+    "ATRIUM",
+    "LEAFLET_COLOURS",
+    "LINE_PIECES",
+    "SIDE",
+    "UNSEEN",
+    "VIEWS",
+    "View",
+    "draw_valve",
+    "leaflet_colours",
+    "name_leaflets",
+    "quartered",
+    "same_scale",
+]
+
+LEAFLET_COLOURS = np.array([[0.87, 0.57, 0.49], [0.50, 0.66, 0.86], [0.58, 0.77, 0.57]])
+"""Of the leaflets in the order of their regions, light enough to be shaded."""
+UNSEEN = np.array([0.75, 0.75, 0.75])
+LINE = np.array([0.10, 0.10, 0.10])
+CHORD = np.array([0.45, 0.42, 0.40])
+TIP = np.array([0.35, 0.22, 0.20])
+TIP_RADIUS_MM = 0.9
+LIFT_MM = 0.7
+"""By which lines are drawn nearer, so that the surface they lie on does not swallow them."""
+LARGEST_EDGE_MM = 1.2
+"""Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
+MOST_SPLITS = 2
+LINE_PIECES = 6
+SCALE_MM = 10.0
+
+Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Triangles ``(k, 3, 2)`` on the page, their depth ``(k,)``, colour ``(k, 3)`` and line width."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A direction to look from: elevation over the annulus plane and azimuth, degrees."""
+
+    name: str
+    elevation: float
+    azimuth: float
+
+    @property
+    def axes(self) -> FloatArray:
+        """``(3, 3)`` columns: to the right, up, and towards the eye."""
+        e, a = np.deg2rad(self.elevation), np.deg2rad(self.azimuth)
+        eye = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right = np.array([-np.sin(a), np.cos(a), 0.0])
+        return np.stack([right, np.cross(eye, right), eye], axis=1)
+
+
+ATRIUM = View("seen from the atrium", 90.0, -90.0)
+SIDE = View("seen from the side", 12.0, -60.0)
+VIEWS = (ATRIUM, SIDE)
+
+
+def leaflet_colours(region: IntArray) -> FloatArray:
+    """Colours ``(m, 3, 3)`` of the corners of triangles by their leaflet."""
+    return np.repeat(LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)][:, None], 3, axis=1)
+
+
+def draw_valve(
+    axes: Any,
+    fields: CaseFields,
+    points: FloatArray,
+    colours: FloatArray,
+    view: View,
+    frame: int,
+    chords: bool = False,
+    strength: float = 0.45,
+) -> None:
+    """Draw one shape of the valve with its annulus and free edge.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    fields : CaseFields
+    points : ndarray
+        ``(n, 3)`` mm; triangles with a vertex that is NaN are left out.
+    colours : ndarray
+        ``(m, 3, 3)`` of the corners of the triangles before shading: triangle, corner, channel.
+    view : View
+    frame : int
+        Whose papillary tips are drawn; 0 is the reference frame.
+    chords : bool
+        Whether chordae and papillary tips are drawn.
+    strength : float
+        How much darker a triangle on edge is than one that faces the light.
+    """
+    known = np.isfinite(points[fields.triangles]).all(axis=(1, 2))
+    parts = [_surface(points, fields.triangles[known], colours[known], view, strength)]
+    for loop, width in ((fields.annulus, 1.8), (fields.free_edge, 0.7)):
+        if len(loop):
+            start, end = points[loop], points[np.roll(loop, -1)]
+            parts.append(_lines(start, end, view, LINE, width))
+    if chords and len(fields.chord_tip):
+        ends = fields.chords(points, frame)
+        parts.append(_lines(ends[:, 0], ends[:, 1], view, CHORD, 0.6))
+    if chords and fields.tips.shape[1]:
+        parts.append(_dots(fields.tips[frame], view, TIP))
+    polygons, depth, colour, widths = (np.concatenate(of) for of in zip(*parts, strict=True))
+    order = np.argsort(depth, kind="stable")
+    axes.add_collection(
+        PolyCollection(
+            list(polygons[order]),
+            facecolors=colour[order],
+            edgecolors=colour[order],
+            linewidths=widths[order],
+            capstyle="round",
+            joinstyle="round",
+            rasterized=True,
+        )
+    )
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _surface(
+    points: FloatArray, triangles: IntArray, colours: FloatArray, view: View, strength: float
+) -> Part:
+    """Shaded triangles, small enough to be told apart in depth where leaflets touch."""
+    # A vertex of no triangle that is drawn has no normal, and none is asked for.
+    with np.errstate(invalid="ignore"):
+        normals = vertex_normals(points, triangles)
+    corner, normal = points[triangles], normals[triangles]
+    edge = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2)
+    for _ in range(MOST_SPLITS):
+        if not len(edge) or np.median(edge) <= LARGEST_EDGE_MM:
+            break
+        corner, normal, colours = (quartered(values) for values in (corner, normal, colours))
+        edge = edge / 2
+    direction = normal.mean(axis=1)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    light = view.axes @ np.array([-0.40, 0.45, 0.80])
+    # Both sides are lit alike.
+    shade = 1.0 - strength * (1.0 - np.abs(direction @ light))
+    seen = corner @ view.axes
+    return (
+        seen[..., :2],
+        seen[..., 2].mean(axis=1),
+        np.clip(colours.mean(axis=1) * shade[:, None], 0, 1),
+        np.full(len(seen), 0.3),
+    )
+
+
+def quartered(values: FloatArray) -> FloatArray:
+    """Values at the corners of four triangles for each: ``(m, 3, 3)`` to ``(4 m, 3, 3)``."""
+    a, b, c = values[:, 0], values[:, 1], values[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(triangle, axis=1) for triangle in corners])
+
+
+def _lines(
+    start: FloatArray, end: FloatArray, view: View, colour: FloatArray, width: float
+) -> Part:
+    """Straight lines in pieces, each a triangle without area; NaN are left out."""
+    known = np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1)
+    share = np.linspace(0, 1, LINE_PIECES + 1)[:, None, None]
+    beads = (start[known] + share * (end[known] - start[known])) @ view.axes
+    a, b = beads[:-1].reshape(-1, 3), beads[1:].reshape(-1, 3)
+    return (
+        np.stack([a, b, a], axis=1)[..., :2],
+        (a[:, 2] + b[:, 2]) / 2 + LIFT_MM,
+        np.tile(colour, (len(a), 1)),
+        np.full(len(a), width),
+    )
+
+
+def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
+    """Discs that face the eye, of triangles around their centres."""
+    angle = np.linspace(0, 2 * np.pi, 25)
+    rim = TIP_RADIUS_MM * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    seen = centres @ view.axes
+    disc = np.stack([0 * rim[:-1], rim[:-1], rim[1:]], axis=1)
+    polygons = (seen[:, None, None, :2] + disc).reshape(-1, 3, 2)
+    count = len(polygons)
+    return (
+        polygons,
+        np.repeat(seen[:, 2], len(disc)),
+        np.tile(colour, (count, 1)),
+        np.full(count, 0.3),
+    )
+
+
+def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str], view: View = ATRIUM) -> None:
+    """Write the names of the leaflets outside the annulus, seen from the atrium."""
+    ring = fields.rest[fields.annulus] @ view.axes
+    middle = ring.mean(axis=0)[:2]
+    region = fields.vertex_region[fields.annulus]
+    for k, name in enumerate(names):
+        part = ring[region == k, :2]
+        if len(part):
+            direction = part.mean(axis=0) - middle
+            direction /= max(float(np.linalg.norm(direction)), 1e-12)
+            reach = float(((part - middle) @ direction).max()) + 2.0
+            x, y = middle + reach * direction
+            angle = {"ha": "center", "va": "bottom" if direction[1] > 0 else "top"}
+            if abs(direction[0]) > 0.7:
+                angle = {"ha": "left" if direction[0] > 0 else "right", "va": "center"}
+            axes.text(x, y, name, fontsize=9, color="0.25", **angle)
+
+
+def same_scale(panels: Sequence[Any], shapes: Sequence[FloatArray], view: View) -> None:
+    """Give panels of one view the same limits in mm, and the first of them a scale bar."""
+    seen = np.concatenate([shape.reshape(-1, 3) @ view.axes for shape in shapes])[:, :2]
+    low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+    margin = 0.09 * float((high - low).max())
+    for axes in panels:
+        axes.set_xlim(low[0] - margin, high[0] + margin)
+        axes.set_ylim(low[1] - 1.8 * margin, high[1] + margin)
+    # Below everything else, where no leaflet's name is written.
+    x, y = low[0] - 0.5 * margin, low[1] - 1.6 * margin
+    panels[0].plot([x, x + SCALE_MM], [y, y], color="black", linewidth=2, solid_capstyle="butt")
+    panels[0].text(
+        x + SCALE_MM / 2, y + 0.15 * margin, f"{SCALE_MM:.0f} mm", fontsize=8, ha="center"
+    )

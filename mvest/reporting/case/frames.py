@@ -1,0 +1,94 @@
+"""The frames of a case as they were given, before anything is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mvest.reporting.case.drawing import (
+    SIDE,
+    VIEWS,
+    draw_valve,
+    leaflet_colours,
+    name_leaflets,
+    same_scale,
+)
+from mvest.reporting.case.fields import CaseFields
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.surface_coordinates import boundary_loops
+
+__all__ = ["frame_fields", "frames_figure"]
+
+
+def frame_fields(
+    vertices: FloatArray,
+    triangles: IntArray,
+    region: IntArray,
+    annulus: FloatArray,
+    tips: FloatArray,
+    chord_tip: IntArray | None = None,
+    chord_insertion: FloatArray | None = None,
+) -> CaseFields:
+    """One frame by itself.
+
+    Parameters
+    ----------
+    vertices, triangles, region : (n, 3) mm, (m, 3), (m,)
+    annulus : (k, 3) mm
+        Tells which border is the annulus.
+    tips : (t, 3) mm
+    chord_tip, chord_insertion : (c,), (c, 3) mm, optional
+    """
+    loops = sorted(boundary_loops(triangles), key=lambda loop: _gap(vertices[loop], annulus))
+    if chord_tip is None or chord_insertion is None:
+        chord_tip, insertion = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    else:
+        gaps = np.linalg.norm(chord_insertion[:, None] - vertices[None], axis=2)
+        insertion = gaps.argmin(axis=1)
+    return CaseFields(
+        triangles,
+        region,
+        vertices,
+        loops[0],
+        loops[-1],
+        ("frame",),
+        np.array([True]),
+        np.stack([tips, tips]),
+        chord_tip,
+        insertion,
+        {},
+    )
+
+
+def _gap(points: FloatArray, curve: FloatArray) -> float:
+    return float(np.linalg.norm(points[:, None] - curve[None], axis=2).min(axis=1).mean())
+
+
+def frames_figure(frames: Mapping[str, CaseFields], names: Sequence[str]) -> Figure:
+    """Every frame from two sides.
+
+    Parameters
+    ----------
+    frames : mapping
+        Title -> frame.
+    names : sequence of str
+        Of the leaflets.
+    """
+    columns = len(frames)
+    figure = Figure(figsize=(3.0 * columns, 5.9), layout="constrained")
+    grid = figure.subplots(2, columns, squeeze=False, height_ratios=[1.0, 1.15])
+    for row, view in enumerate(VIEWS):
+        shapes = []
+        for column, (title, found) in enumerate(frames.items()):
+            axes = grid[row, column]
+            draw_valve(axes, found, found.rest, leaflet_colours(found.region), view, 0, chords=True)
+            shapes.append(found.rest)
+            if view is SIDE:
+                shapes.append(found.tips[0])
+            if row == 0:
+                axes.set_title(title, fontsize=10)
+                name_leaflets(axes, found, names)
+        same_scale(list(grid[row]), shapes, view)
+    return figure

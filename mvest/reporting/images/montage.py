@@ -1,0 +1,284 @@
+"""Quality control of a valve from images: its outlines drawn on slices of the volume."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from mvest.errors import InputError
+from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.volume import VolumeSequence
+from mvest.reporting.images.planes import (
+    COLUMNS,
+    STEP_MM,
+    SlicePlane,
+    leaflet_contours,
+    near,
+    resample,
+    valve_planes,
+)
+from mvest.reporting.style import headline
+from mvest.typing import FloatArray
+
+__all__ = ["LEAFLETS", "LOW_CONFIDENCE", "chosen_frames", "montage_figure"]
+
+LEAFLETS = ("#E69F00", "#56B4E9")
+"""Of the anterior and the posterior leaflet: Okabe and Ito's orange and sky blue."""
+TIP, ANNULUS = "#F0E442", "white"
+LOW_CONFIDENCE = 0.5
+"""Below this a frame is marked."""
+REACH_MM = 3.0
+"""Up to which distance from a plane annulus points and papillary tips are drawn in it."""
+SCALE_MM = 10.0
+MARGIN_MM = 7.0
+ROW_INCHES = 2.35
+OUTSIDE = "#3a3f4a"
+
+HOW = dict(
+    zip(
+        COLUMNS,
+        (
+            "through the tips' middle, atrium up",
+            "atrium up, anterior right",
+            "from the atrium, anterior up",
+            "1 mm above the higher one, anterior up",
+        ),
+        strict=True,
+    )
+)
+
+Extent = tuple[float, float, float, float]
+
+
+def chosen_frames(count: int, closed: int | None = None, most: int = 6) -> list[int]:
+    """At most ``most`` of ``count`` frames, evenly spaced from the first to the last.
+
+    The closed one, if given, takes the place of the nearest that is not the first.
+
+    Raises
+    ------
+    InputError
+        No frames, or a closed frame that is none of them.
+    """
+    if count < 1 or most < 2 or not (closed is None or 0 <= closed < count):
+        raise InputError(
+            f"montage of {count} frames, at most {most}, closed frame {closed}: expected at least "
+            f"one frame, two at most or more, and a closed one from 0 to {count - 1}"
+        )
+    frames = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+    if closed is not None and closed not in frames:
+        later = frames[1:]
+        later[np.argmin(np.abs(later - closed))] = closed
+    return sorted(int(frame) for frame in frames)
+
+
+def montage_figure(
+    volume: VolumeSequence,
+    valve: ValveSequence,
+    *,
+    title: str,
+    closed: int | None = None,
+    most: int = 6,
+    low_confidence: float = LOW_CONFIDENCE,
+) -> Figure:
+    """Frames in rows, the planes of `valve_planes` in columns, with what the valve cuts drawn on.
+
+    Every row has the planes of its own frame; all panels have one scale. Leaflets are drawn where
+    the plane cuts them, annulus points and papillary tips where they lie within 3 mm of it.
+
+    Parameters
+    ----------
+    volume, valve
+        Frame k of one is frame k of the other.
+    title : str
+        What is shown, such as the name of the sequence.
+    closed : int, optional
+        A frame that must be among those shown.
+    most : int
+        Rows.
+    low_confidence : float
+        Frames below this are marked in words.
+
+    Raises
+    ------
+    InputError
+        The two have other numbers of frames or other times.
+    """
+    if len(volume.times) != len(valve.times) or not np.allclose(
+        volume.times - volume.times[0], valve.times - valve.times[0], atol=1e-6
+    ):
+        raise InputError(
+            f"montage {title}: volume of {len(volume.times)} frames and valve of "
+            f"{len(valve.times)}, expected the same frames at the same times"
+        )
+    frames = chosen_frames(len(valve.times), closed, most)
+    usable = [frame for frame in frames if _finite(valve, frame)]
+    planes = {frame: valve_planes(valve, frame) for frame in usable}
+    extents = _extents(valve, planes)
+    slices = {
+        (frame, name): resample(volume, frame, planes[frame][name], extents[name])
+        for frame in usable
+        for name in COLUMNS
+    }
+    low, high = _window(list(slices.values()))
+    sizes = [extents[name] for name in COLUMNS]
+    widths = [right - left for left, right, _, _ in sizes]
+    tallest = max(top - bottom for _, _, bottom, top in sizes)
+    inches = ROW_INCHES / tallest
+    figure = Figure(
+        figsize=(inches * sum(widths) + 1.3, (ROW_INCHES + 0.18) * len(frames) + 1.15),
+        layout="constrained",
+    )
+    grid = figure.subplots(
+        len(frames), len(COLUMNS), squeeze=False, gridspec_kw={"width_ratios": widths}
+    )
+    for row, frame in enumerate(frames):
+        grid[row, 0].set_ylabel(_words(valve, frame, low_confidence, frame == closed), fontsize=8.5)
+        for column, name in enumerate(COLUMNS):
+            axes = grid[row, column]
+            _bare(axes, extents[name])
+            if row == 0:
+                axes.set_title(_heading(name), fontsize=9)
+            if frame in planes:
+                _draw(axes, slices[frame, name], (low, high), extents[name])
+                _draw_valve(axes, valve, frame, planes[frame][name])
+            else:
+                axes.text(0.5, 0.5, "no valve", transform=axes.transAxes, ha="center", color="w")
+            if row == 0:
+                _scale_bar(axes, extents[name])
+            _mark(axes, valve, frame, low_confidence)
+    headline(figure, title, _note(valve, low_confidence))
+    figure.legend(
+        handles=_keys(valve), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False
+    )
+    return figure
+
+
+def _note(valve: ValveSequence, low_confidence: float) -> str:
+    """Which of all frames are not trusted, shown or not."""
+    low = np.flatnonzero(~(valve.frame_confidence >= low_confidence))
+    count = len(valve.times)
+    if not len(low):
+        return f"All {count} frames have a confidence of {low_confidence:g} or more."
+    named = ", ".join(str(frame) for frame in low[:12]) + (", ..." if len(low) > 12 else "")
+    return f"Confidence below {low_confidence:g} in {len(low)} of {count} frames: {named}."
+
+
+def _finite(valve: ValveSequence, frame: int) -> bool:
+    return bool(np.isfinite(valve.vertices[frame]).all() and np.isfinite(valve.tips[frame]).all())
+
+
+def _extents(
+    valve: ValveSequence, planes: Mapping[int, Mapping[str, SlicePlane]]
+) -> dict[str, Extent]:
+    """For each column the smallest box around the valve in all rows, and a margin; mm."""
+    found: dict[str, Extent] = {}
+    for name in COLUMNS:
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for frame, named in planes.items():
+            points = [valve.vertices[frame]]
+            if name in COLUMNS[:2]:
+                points.append(valve.tips[frame])
+            places = named[name].coordinates(np.concatenate(points))[:, :2]
+            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+        if not planes:
+            low, high = np.full(2, -20.0), np.full(2, 20.0)
+        low = np.floor((low - MARGIN_MM) / STEP_MM) * STEP_MM
+        high = np.ceil((high + MARGIN_MM) / STEP_MM) * STEP_MM
+        found[name] = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    return found
+
+
+def _window(slices: list[FloatArray]) -> tuple[float, float]:
+    """Grey values drawn black and white: all but the darkest and brightest 0.5 %."""
+    values = np.concatenate([one[np.isfinite(one)] for one in slices]) if slices else np.zeros(0)
+    if not len(values):
+        return 0.0, 1.0
+    low, high = np.quantile(values, [0.005, 0.995])
+    return float(low), float(max(high, low + 1e-6))
+
+
+def _words(valve: ValveSequence, frame: int, low_confidence: float, closed: bool) -> str:
+    confidence = float(valve.frame_confidence[frame])
+    state = ", closed" if closed else ""
+    words = f"frame {frame}, {1e3 * valve.times[frame]:.0f} ms{state}"
+    words += f"\nconfidence {confidence:.2f}"
+    return words + ("\nLOW CONFIDENCE" if not confidence >= low_confidence else "")
+
+
+def _heading(name: str) -> str:
+    return f"{name}\n({HOW[name]})"
+
+
+def _bare(axes: Any, extent: Extent) -> None:
+    axes.set_xlim(extent[0], extent[1])
+    axes.set_ylim(extent[2], extent[3])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_facecolor(OUTSIDE)
+    axes.set_anchor("N")
+
+
+def _draw(axes: Any, image: FloatArray, window: tuple[float, float], extent: Extent) -> None:
+    grey = colormaps["gray"].with_extremes(bad=OUTSIDE)
+    axes.imshow(
+        np.ma.masked_invalid(image), origin="lower", extent=extent, cmap=grey, vmin=window[0],
+        vmax=window[1], interpolation="nearest", rasterized=True,
+    )  # fmt: skip
+
+
+def _draw_valve(axes: Any, valve: ValveSequence, frame: int, plane: SlicePlane) -> None:
+    for name, colour, segments in zip(
+        valve.layout.region_names, LEAFLETS, leaflet_contours(valve, frame, plane), strict=True
+    ):
+        axes.add_collection(
+            LineCollection(list(segments), colors=colour, linewidths=1.3, label=name)
+        )
+    for points, kind in ((valve.annulus[frame], "annulus"), (valve.tips[frame], "tips")):
+        places, close = near(plane, points, REACH_MM)
+        axes.plot(*places[close].T, label=kind, **_STYLE[kind])
+
+
+_STYLE: dict[str, dict[str, Any]] = {
+    "annulus": {
+        "ls": "none", "marker": "o", "ms": 2.4, "mfc": ANNULUS, "mec": "black", "mew": 0.4,
+    },
+    "tips": {"ls": "none", "marker": "^", "ms": 7, "mfc": TIP, "mec": "black", "mew": 0.8},
+}  # fmt: skip
+
+
+def _keys(valve: ValveSequence) -> list[Line2D]:
+    leaflets = [
+        Line2D([], [], color=colour, lw=2, label=f"{name} leaflet")
+        for name, colour in zip(valve.layout.region_names, LEAFLETS, strict=True)
+    ]
+    words = {"annulus": "annulus, within 3 mm", "tips": "papillary tip, within 3 mm"}
+    return [*leaflets, *(Line2D([], [], label=words[k], **s) for k, s in _STYLE.items())]
+
+
+def _scale_bar(axes: Any, extent: Extent) -> None:
+    left, bottom = extent[0] + 2.0, extent[2] + 2.5
+    edge = [withStroke(linewidth=4, foreground="black")]
+    axes.plot(
+        [left, left + SCALE_MM], [bottom, bottom], color="white", lw=2.2, label="scale",
+        path_effects=edge, solid_capstyle="butt",
+    )  # fmt: skip
+    axes.text(
+        left + 0.5 * SCALE_MM, bottom + 1.0, f"{SCALE_MM:.0f} mm", color="white", fontsize=7.5,
+        ha="center", va="bottom", path_effects=[withStroke(linewidth=2, foreground="black")],
+    )  # fmt: skip
+
+
+def _mark(axes: Any, valve: ValveSequence, frame: int, low_confidence: float) -> None:
+    """A dashed frame about the panels of a frame that is not trusted."""
+    if not valve.frame_confidence[frame] >= low_confidence:
+        for spine in axes.spines.values():
+            spine.set(color="#D55E00", linewidth=2.2, linestyle="--")

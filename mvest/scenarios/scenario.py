@@ -1,0 +1,264 @@
+"""What a prediction changes of the closed valve: pressure, annulus, and a clip between the edges.
+
+Scenarios are hypothetical and simulated; none of them is a recommendation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import brentq
+
+from mvest.closure.model import ClosureModel
+from mvest.errors import GeometryError, InputError
+from mvest.mechanics.forces.ties import TiedPoints
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.valve import Motion, Valve
+from mvest.valve.geometry.proximity import plane_section
+from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
+
+__all__ = ["Annuloplasty", "Clip", "Scenario", "clip_points", "model_under", "narrowed", "plane_of"]
+
+NARROWEST = 0.3
+"""Share of the anteroposterior diameter below which nothing is narrowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Annuloplasty:
+    """A ring that narrows the annulus of the closed valve from anterior to posterior.
+
+    Every annulus point is moved along the anterior direction towards the commissural line (through
+    the centre of the annulus, along the commissures), in proportion to its distance from it:
+    ``y -> s y``. Points on that line stay where they are; the commissural diameter and the heights
+    along the normal stay, and the circumference and area become smaller with the diameter.
+
+    Attributes
+    ----------
+    percent, mm : float
+        By how much the anteroposterior diameter becomes smaller; one of the two is 0.
+    """
+
+    percent: float = 0.0
+    mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.percent) and np.isfinite(self.mm)):
+            raise InputError(f"annuloplasty of {self.percent} % and {self.mm} mm, expected numbers")
+        if min(self.percent, self.mm) < 0 or (self.percent > 0) == (self.mm > 0):
+            raise InputError(
+                f"annuloplasty of {self.percent} % and {self.mm} mm, expected one of them > 0 and "
+                "the other 0"
+            )
+        if self.percent >= 100 * (1 - NARROWEST):
+            raise InputError(
+                f"annuloplasty of {self.percent} %, expected less than {100 * (1 - NARROWEST):g} %"
+            )
+
+    def diameter(self, before: float) -> float:
+        """Anteroposterior diameter (mm) that is asked for where it was ``before``."""
+        after = before * (1 - self.percent / 100) - self.mm
+        if not after > NARROWEST * before:
+            raise InputError(
+                f"annuloplasty by {self.mm} mm of an annulus of {before:.1f} mm, expected to "
+                f"leave more than {100 * NARROWEST:g} %"
+            )
+        return after
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """An edge-to-edge clip: pairs of points of the two leaflets that are tied together.
+
+    Attributes
+    ----------
+    position_mm : float
+        Of its middle along the commissures from the middle of the annulus (0: A2 to P2), in the
+        reference frame.
+    width_mm : float
+        Along the free edges.
+    grasp_mm : float
+        How far from the free edges the leaflets are held.
+    distance_mm : float or None
+        Between the midsurfaces that are held; None: the distance at which the contact carries its
+        reference pressure.
+    stiffness : float
+        N/mm of each pair.
+    """
+
+    position_mm: float = 0.0
+    width_mm: float = 5.0
+    grasp_mm: float = 4.0
+    distance_mm: float | None = None
+    stiffness: float = 100.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.position_mm):
+            raise InputError(f"clip at {self.position_mm} mm, expected a finite number")
+        for name in ("width_mm", "grasp_mm", "stiffness"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"clip {name} = {value}, expected a finite number > 0")
+        if self.distance_mm is not None and not self.distance_mm > 0:
+            raise InputError(f"clip distance_mm = {self.distance_mm}, expected > 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What is changed; nothing is the valve as it was observed. All of it can be combined.
+
+    Attributes
+    ----------
+    title : str
+        What a table calls it.
+    pressure_mmHg : float or None
+        Peak transmitral pressure; None: that of the observed valve.
+    annuloplasty : Annuloplasty or None
+    clip : Clip or None
+    """
+
+    title: str
+    pressure_mmHg: float | None = None
+    annuloplasty: Annuloplasty | None = None
+    clip: Clip | None = None
+
+    def __post_init__(self) -> None:
+        if not self.title.strip():
+            raise InputError("a scenario needs a title")
+        if self.pressure_mmHg is not None and not (
+            np.isfinite(self.pressure_mmHg) and self.pressure_mmHg > 0
+        ):
+            raise InputError(f"pressure {self.pressure_mmHg} mmHg of a scenario, expected > 0")
+
+
+def model_under(model: ClosureModel, scenario: Scenario) -> ClosureModel:
+    """A fresh model of the same valve under a scenario; its guides are changed alike.
+
+    Raises
+    ------
+    InputError, GeometryError
+        If the scenario does not fit the valve.
+    """
+    changed = model.fresh()
+    if changed.guide is not None:
+        changed.guide = model_under(changed.guide, scenario)
+    if scenario.pressure_mmHg is not None:
+        protocol = replace(model.settings.protocol, pressure_mmHg=scenario.pressure_mmHg)
+        changed.settings = replace(model.settings, protocol=protocol)
+    if scenario.annuloplasty is not None:
+        contact_valve = model.contact_valve
+        plane = plane_of(contact_valve, contact_valve.motion.annulus[-1])
+        share = _share(contact_valve, plane, scenario.annuloplasty)
+        changed.contact_valve = _with_ring(contact_valve, plane, share)
+        changed.valve = _with_ring(model.valve, plane, share)
+    if scenario.clip is not None:
+        changed.ties = _tied(model, scenario.clip)
+    return changed
+
+
+# -- annulus --------------------------------------------------------------------------------------
+def plane_of(valve: Valve, annulus: FloatArray) -> AnnulusPlane:
+    """Plane of a valve's annulus ``(k, 3)`` mm; the first region is the anterior leaflet."""
+    own = valve.surface.vertex_region[valve.annulus] == 0
+    return annulus_plane(annulus, valve.papillary_tips.mean(axis=0), annulus[own].mean(axis=0))
+
+
+def narrowed(annulus: FloatArray, plane: AnnulusPlane, share: float) -> FloatArray:
+    """Annulus ``(k, 3)`` mm whose distances from the commissural line are ``share`` of before."""
+    along = (annulus - plane.origin) @ plane.anterior
+    return np.asarray(annulus + ((share - 1) * along)[:, None] * plane.anterior)
+
+
+def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
+    """Share that gives the annulus, measured in its own new plane, the diameter asked for.
+
+    Nearly the ratio of the diameters; the centre of the curve moves a little as it is narrowed.
+    """
+    annulus = valve.motion.annulus[-1]
+    wanted = ring.diameter(measure_annulus(annulus, plane).anteroposterior_diameter)
+
+    def excess(share: float) -> float:
+        new = narrowed(annulus, plane, share)
+        return measure_annulus(new, plane_of(valve, new)).anteroposterior_diameter - wanted
+
+    return float(brentq(excess, 0.5 * NARROWEST, 1.0, xtol=1e-12))
+
+
+def _with_ring(valve: Valve, plane: AnnulusPlane, share: float) -> Valve:
+    """The valve with the ring: its displacement grows with the phase of the closure."""
+    motion = valve.motion
+    ringed = np.stack(
+        [
+            annulus + phase * (narrowed(annulus, plane, share) - annulus)
+            for phase, annulus in zip(motion.phase, motion.annulus, strict=True)
+        ]
+    )
+    return replace(valve, motion=Motion(motion.phase, ringed, motion.papillary_tips))
+
+
+# -- clip -----------------------------------------------------------------------------------------
+def _tied(model: ClosureModel, clip: Clip) -> TiedPoints:
+    surface = model.contact_valve.surface
+    distance = clip.distance_mm
+    if distance is None:
+        edge = float(surface.thickness[model.contact_valve.free_edge].mean())
+        distance = model.settings.contact.reference_distance * edge
+    return TiedPoints(*clip_points(model.contact_valve, clip), distance, clip.stiffness)
+
+
+SPACING_MM = 2.5
+"""Largest distance of tied pairs along the free edge."""
+
+
+def clip_points(valve: Valve, clip: Clip) -> tuple[FloatArray, FloatArray]:
+    """Tied points of the first and the second leaflet, ``(k, 3)`` mm in the reference frame.
+
+    Two rows on each leaflet, at half and at the whole grasp from its free edge, in planes across
+    the commissural direction over the width of the clip.
+
+    Raises
+    ------
+    GeometryError
+        If the clip lies where the free edges do not face each other, or grasps more leaflet than
+        there is.
+    """
+    surface = valve.surface
+    plane = plane_of(valve, surface.vertices[valve.annulus])
+    count = max(2, int(np.ceil(clip.width_mm / SPACING_MM)) + 1)
+    sides: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    for offset in np.linspace(-0.5, 0.5, count) * clip.width_mm + clip.position_mm:
+        origin = plane.origin + offset * plane.lateral
+        for region, edge in enumerate(_edge_points(valve, plane, origin)):
+            own = surface.triangles[surface.region == region]
+            segments, _ = plane_section(surface.vertices, own, origin, plane.lateral)
+            for depth in (0.5 * clip.grasp_mm, clip.grasp_mm):
+                sides[region].append(_at_distance(segments, edge, depth))
+    return np.array(sides[0]), np.array(sides[1])
+
+
+def _edge_points(valve: Valve, plane: AnnulusPlane, origin: FloatArray) -> list[FloatArray]:
+    """Where the free edge crosses a plane across the commissures: first the anterior leaflet."""
+    edge = valve.surface.vertices[valve.free_edge]
+    x = (edge - origin) @ plane.lateral
+    after = np.roll(x, -1)
+    crossed = np.flatnonzero((x >= 0) != (after >= 0))
+    if len(crossed) != 2:
+        raise GeometryError(
+            f"clip {float((origin - plane.origin) @ plane.lateral):+.1f} mm from the middle: the "
+            f"free edge lies there {len(crossed)} times, expected once on each leaflet"
+        )
+    share = (x[crossed] / (x[crossed] - after[crossed]))[:, None]
+    points = edge[crossed] + share * (np.roll(edge, -1, axis=0)[crossed] - edge[crossed])
+    anterior = (points - plane.origin) @ plane.anterior
+    return [points[int(np.argmax(anterior))], points[int(np.argmin(anterior))]]
+
+
+def _at_distance(segments: FloatArray, edge: FloatArray, distance: float) -> FloatArray:
+    """Point ``(3,)`` of a section ``(k, 2, 3)`` at a straight distance (mm) from its free edge."""
+    d = np.linalg.norm(segments - edge, axis=2) - distance
+    across = np.flatnonzero((d[:, 0] < 0) != (d[:, 1] < 0))
+    if len(across) == 0:
+        raise GeometryError(f"clip: the leaflet ends less than {distance:g} mm from its free edge")
+    k = int(across[0])
+    share = d[k, 0] / (d[k, 0] - d[k, 1])
+    return np.asarray(segments[k, 0] + share * (segments[k, 1] - segments[k, 0]))

@@ -1,0 +1,1 @@
+"""Simulated valves: virtual patients, and valves in motion for the image step."""

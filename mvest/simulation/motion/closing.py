@@ -1,0 +1,286 @@
+"""One simulated valve over a systole: closed step by step, then held under falling pressure.
+
+The closure is that of :mod:`mvest.closure.model` on a coarse mesh, with the steps of the pressure's
+rise as frames. A valve snaps shut within a small share of this rise, so that frames are chosen
+evenly along the way of the free edge and shown evenly over time: they look like a systole, and say
+nothing about how fast a valve closes. After the closed frame, the valve is held at lower pressures
+while annulus and papillary tips return part of their way, each in equilibrium.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.valve_system import HeldState
+from mvest.simulation.motion.refusal import MotionLimits, Refusal, RefusedError, check_motion
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.structured import structured_mesh
+
+__all__ = [
+    "ClosingFrames",
+    "MotionSettings",
+    "close_in_motion",
+    "closing_frames",
+    "frames_along",
+    "moving_valve",
+    "with_tip_motion",
+]
+
+GIVE_UP: dict[str, Any] = {"max_iterations": 40, "max_halvings": 3, "largest_move": 2.0}
+"""Newton's method gives a step up sooner than elsewhere: another valve is drawn in less time than
+it takes to follow one whose leaflets have run away."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSettings:
+    """How a valve's motion is simulated and shown.
+
+    Attributes
+    ----------
+    columns, rows : int
+        Of the layout in which it is returned.
+    element : str
+    mesh_columns, mesh_rows : int
+        Cells of the mesh that is closed.
+    contact_columns, contact_rows : int
+        Points at which contact is sampled.
+    steps : int
+        Time steps over the ramp of the pressure.
+    tolerance : float
+        Of Newton's method, relative.
+    frames : int
+        From the open to the closed one, both included; at most ``steps + 2``.
+    held_pressure : tuple of float
+        Shares of the closed frame's pressure in the frames after it.
+    held_relaxation : tuple of float
+        Share of its way back to the open shape that the annulus has gone in each; the tips too.
+    duration : float
+        s from the first to the last frame.
+    limits : MotionLimits
+    """
+
+    columns: int = 64
+    rows: int = 15
+    element: str = "hex18"
+    mesh_columns: int = 24
+    mesh_rows: int = 3
+    contact_columns: int = 72
+    contact_rows: int = 16
+    steps: int = 24
+    tolerance: float = 1e-2
+    frames: int = 8
+    held_pressure: tuple[float, ...] = (0.8, 0.55, 0.35)
+    held_relaxation: tuple[float, ...] = (0.15, 0.35, 0.55)
+    duration: float = 0.35
+    limits: MotionLimits = field(default_factory=MotionLimits)
+
+    def __post_init__(self) -> None:
+        if len(self.held_pressure) != len(self.held_relaxation):
+            raise InputError(
+                f"held_pressure has {len(self.held_pressure)} frames, held_relaxation "
+                f"{len(self.held_relaxation)}; expected as many"
+            )
+        if not 2 <= self.frames <= self.steps + 2:
+            raise InputError(
+                f"frames = {self.frames} to the closed one, expected 2 to {self.steps + 2} of "
+                f"{self.steps} steps"
+            )
+        if not (np.isfinite(self.duration) and self.duration > 0):
+            raise InputError(f"duration of a motion = {self.duration} s, expected > 0")
+        if not self.tolerance > 0:
+            raise InputError(f"tolerance of a motion = {self.tolerance}, expected > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosingFrames:
+    """The frames of a closure, the open and the closed one among them.
+
+    Attributes
+    ----------
+    vertices : (f, n, 3) mm
+        Of the layout.
+    tips : (f, 2, 3) mm
+    model : ClosureModel
+        Which has been closed with ``at``.
+    at : (p,)
+        Its parameters.
+    """
+
+    vertices: FloatArray
+    tips: FloatArray
+    model: ClosureModel
+    at: FloatArray
+
+
+def close_in_motion(
+    name: str,
+    template: Template,
+    values: Mapping[str, float],
+    settings: MotionSettings,
+    mechanics: MechanicsSettings,
+    tip_motion: FloatArray | None = None,
+) -> MovingValve:
+    """Close a template and return its frames.
+
+    Parameters
+    ----------
+    name : str
+        Of the valve.
+    template : Template
+    values : mapping
+        Parameter -> value: the moduli ``E_f.REGION`` in MPa, and any of the factors
+        ``pressure_scale``, ``chord_stiffness`` and ``chord_rest_length``.
+    settings : MotionSettings
+    mechanics : MechanicsSettings
+        Of its protocol, pressure and ramp; the steps are those of ``settings``.
+    tip_motion : ndarray, optional
+        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
+
+    Raises
+    ------
+    RefusedError
+        If the valve does not close, or not as a valve does (see :class:`MotionLimits`).
+    InputError, MaterialError
+        If a value is inadmissible.
+    """
+    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
+    closing = closing_frames(name, template, values, settings, mechanics, shift)
+    model = closing.model
+    states = _held(settings, model.contact_valve, mechanics.protocol.pressure_mmHg)
+    held = []
+    for state, found in zip(states, model.held(closing.at, states), strict=True):
+        if found is None:
+            raise RefusedError(
+                name, Refusal.NOT_HELD, f"no equilibrium under {state.pressure_mmHg:.0f} mmHg"
+            )
+        held.append(found)
+    valve = moving_valve(
+        name,
+        template,
+        model.valve.surface.thickness,
+        settings,
+        np.stack([*closing.vertices, *held]),
+        np.stack([*closing.tips, *(state.papillary_tips for state in states)]),
+    )
+    check_motion(valve, settings.frames - 1, settings.limits)
+    return valve
+
+
+def closing_frames(
+    name: str,
+    template: Template,
+    values: Mapping[str, float],
+    settings: MotionSettings,
+    mechanics: MechanicsSettings,
+    tip_motion: FloatArray,
+) -> ClosingFrames:
+    """Close a template: as :func:`close_in_motion`, but up to the closed frame and unchecked."""
+    seen, contact = (
+        with_tip_motion(template.valve(columns, rows), tip_motion)
+        for columns, rows in (
+            (settings.columns, settings.rows),
+            (settings.contact_columns, settings.contact_rows),
+        )
+    )
+    mesh = structured_mesh(template, settings.element, settings.mesh_columns, settings.mesh_rows)
+    ramp = mechanics.protocol.ramp
+    protocol = replace(
+        mechanics.protocol,
+        dt=ramp / settings.steps,
+        growth=3.0,
+        end=1.4 * ramp,
+        equilibrium=True,
+    )
+    newton = replace(mechanics.newton, tolerance=settings.tolerance, **GIVE_UP)
+    own = replace(mechanics, protocol=protocol, newton=newton)
+    model = ClosureModel(seen, contact, mesh, own, tuple(values), continuation=True)
+    at = np.array([values[parameter] for parameter in model.names])
+    simulation = model.close(at, sensitivities=False, every_frame=True).simulation
+    if not simulation.converged:
+        raise RefusedError(name, Refusal.NOT_CLOSED, simulation.reason.value)
+    positions = np.stack([model.observed(frame) for frame in simulation.frames])
+    chosen = frames_along(positions[:, seen.free_edge], settings.frames)
+    phase = np.array([protocol.phase(time) for time in simulation.times[chosen]])
+    start, end = seen.motion.papillary_tips
+    return ClosingFrames(positions[chosen], start + phase[:, None, None] * (end - start), model, at)
+
+
+def moving_valve(
+    name: str,
+    template: Template,
+    thickness: FloatArray,
+    settings: MotionSettings,
+    vertices: FloatArray,
+    tips: FloatArray,
+) -> MovingValve:
+    """A template's valve with frames ``vertices (T, n, 3)`` and ``tips (T, 2, 3)``, T > 1."""
+    count = len(vertices)
+    phi, s, _, tip = template.chord_places()
+    return MovingValve(
+        name,
+        ValveLayout(settings.columns, settings.rows),
+        settings.duration * np.arange(count) / (count - 1),
+        vertices,
+        tips,
+        thickness,
+        np.mod(phi, 360.0),
+        s,
+        tip,
+    )
+
+
+def with_tip_motion(valve: Valve, shift: FloatArray) -> Valve:
+    """The valve with papillary tips that begin ``shift (t, 3)`` mm from where they end."""
+    motion = valve.motion
+    end = motion.papillary_tips[-1]
+    if np.shape(shift) != end.shape:
+        raise InputError(f"motion of the tips: shape {np.shape(shift)}, expected {end.shape}")
+    way = (1.0 - motion.phase)[:, None, None] * shift
+    moved = replace(motion, papillary_tips=end + way)
+    return replace(valve, papillary_tips=end + shift, motion=moved)
+
+
+def frames_along(points: FloatArray, count: int) -> IntArray:
+    """Choose ``count`` frames, the first and the last among them, evenly along a way.
+
+    Parameters
+    ----------
+    points : (f, k, 3) mm
+        What goes the way; it is as long as its points' mean displacements.
+    count : int
+        2 to f.
+    """
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1)
+    way = np.concatenate([[0.0], np.cumsum(steps)])
+    total, last = len(way), 0
+    chosen = [0]
+    for k in range(1, count - 1):
+        # No frame twice, and enough of them left.
+        allowed = np.arange(last + 1, total - (count - 1 - k))
+        last = int(allowed[np.argmin(np.abs(way[allowed] - way[-1] * k / (count - 1)))])
+        chosen.append(last)
+    return np.array([*chosen, total - 1], dtype=np.int64)
+
+
+def _held(settings: MotionSettings, valve: Valve, pressure: float) -> list[HeldState]:
+    """The frames after the closed one, on the annulus of the valve where contact is sampled."""
+    annulus, tips = valve.motion.annulus, valve.motion.papillary_tips
+    return [
+        HeldState(
+            share * pressure,
+            annulus[-1] + back * (annulus[0] - annulus[-1]),
+            tips[-1] + back * (tips[0] - tips[-1]),
+        )
+        for share, back in zip(settings.held_pressure, settings.held_relaxation, strict=True)
+    ]

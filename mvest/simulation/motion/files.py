@@ -1,0 +1,165 @@
+"""The file of a population of simulated valves: one ``.npz`` without pickled objects."""
+
+from __future__ import annotations
+
+import uuid
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.errors import InputError, cannot_write
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.simulation.motion.population import Population
+
+__all__ = ["VERSION", "load_population", "save_population"]
+
+VERSION = 1
+"""Of the format."""
+
+ARRAYS = {
+    "version": "i", "settings_hash": "U", "refused_reasons": "U", "refused_counts": "i",
+    "names": "U", "layout": "i", "frames": "i", "chordae": "i", "times": "f", "vertices": "f",
+    "tips": "f", "thickness": "f", "chord_phi": "f", "chord_s": "f", "chord_tip": "i",
+}  # fmt: skip
+"""Array -> kind of its numbers. What differs in length from valve to valve is in one piece, with
+the number of ``frames`` or ``chordae`` of each."""
+
+
+def save_population(path: Path, population: Population) -> None:
+    """Write a population, whole or not at all, positions and times in single precision.
+
+    Raises
+    ------
+    InputError
+        If there is no valve, the valves' layouts differ, or the file cannot be written.
+    """
+    valves = population.valves
+    layouts = {v.layout for v in valves}
+    if len(layouts) != 1:
+        raise InputError(f"{path}: valves of {len(layouts)} layouts, expected one layout")
+    layout = valves[0].layout
+    if layout != ValveLayout(layout.columns, layout.rows):
+        raise InputError(
+            f"{path}: valves of the regions {', '.join(layout.region_names)}, expected "
+            f"{', '.join(ValveLayout().region_names)}"
+        )
+
+    def joined(name: str, kind: type = np.float32) -> Any:
+        return np.concatenate([np.asarray(getattr(v, name), dtype=kind) for v in valves])
+
+    arrays: dict[str, Any] = {
+        "version": np.array(VERSION),
+        "settings_hash": np.array(population.settings_hash),
+        "refused_reasons": np.array(list(population.refused), dtype=np.str_),
+        "refused_counts": np.array(list(population.refused.values()), dtype=np.int32),
+        "names": np.array([v.name for v in valves]),
+        "layout": np.array([layout.columns, layout.rows], dtype=np.int32),
+        "frames": np.array([len(v.times) for v in valves], dtype=np.int32),
+        "chordae": np.array([len(v.chord_phi) for v in valves], dtype=np.int32),
+        "chord_tip": joined("chord_tip", np.int32),
+        **{
+            name: joined(name)
+            for name in ("times", "vertices", "tips", "thickness", "chord_phi", "chord_s")
+        },
+    }
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        try:
+            with temporary.open("xb") as stream:
+                np.savez_compressed(stream, **arrays)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def load_population(path: Path) -> Population:
+    """Read what :func:`save_population` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is of another version, or anything in it is not as it must be.
+    """
+    arrays = _read(path)
+    if int(arrays["version"]) != VERSION:
+        raise InputError(f"{path}, version: {arrays['version']}, expected {VERSION}")
+    names, layout_size = arrays["names"], arrays["layout"]
+    count = len(names)
+    if count == 0 or len(set(names.tolist())) != count:
+        raise InputError(f"{path}, names: {count} names, expected different ones, at least one")
+    if layout_size.shape != (2,):
+        raise InputError(f"{path}, layout: shape {layout_size.shape}, expected (2,)")
+    layout = ValveLayout(int(layout_size[0]), int(layout_size[1]))
+    for name in ("frames", "chordae"):
+        if arrays[name].shape != (count,) or np.any(arrays[name] < 0):
+            raise InputError(f"{path}, {name}: expected a number for each of {count} valves")
+    frames, chordae = int(arrays["frames"].sum()), int(arrays["chordae"].sum())
+    reasons, refused = arrays["refused_reasons"], arrays["refused_counts"]
+    for name, shape in (
+        ("settings_hash", ()),
+        ("refused_counts", reasons.shape),
+        ("times", (frames,)),
+        ("vertices", (frames, layout.size, 3)),
+        ("tips", (frames, 2, 3)),
+        ("thickness", (count * layout.size,)),
+        ("chord_phi", (chordae,)),
+        ("chord_s", (chordae,)),
+        ("chord_tip", (chordae,)),
+    ):
+        if arrays[name].shape != shape:
+            raise InputError(f"{path}, {name}: shape {arrays[name].shape}, expected {shape}")
+    if not np.isin(arrays["chord_tip"], (0, 1)).all():
+        raise InputError(f"{path}, chord_tip: expected 0 and 1 only")
+    at_frame = np.cumsum(arrays["frames"])[:-1]
+    at_chord = np.cumsum(arrays["chordae"])[:-1]
+    pieces = zip(
+        names.tolist(),
+        *(np.split(arrays[name], at_frame) for name in ("times", "vertices", "tips")),
+        arrays["thickness"].reshape(count, -1),
+        *(np.split(arrays[name], at_chord) for name in ("chord_phi", "chord_s", "chord_tip")),
+        strict=True,
+    )
+    try:
+        valves = tuple(MovingValve(name, layout, *parts) for name, *parts in pieces)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    counted = dict(zip(reasons.tolist(), refused.tolist(), strict=True))
+    return Population(valves, counted, str(arrays["settings_hash"]))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """All arrays of the file, of the right kinds, numbers in double precision and finite."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, expected a population of simulated valves")
+    arrays: dict[str, Any] = {}
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            found = set(file.files)
+            if found != set(ARRAYS):
+                raise InputError(
+                    f"{path}: holds {', '.join(sorted(found))}; expected "
+                    f"{', '.join(sorted(ARRAYS))}"
+                )
+            for name, kind in ARRAYS.items():
+                arrays[name] = file[name]
+                if arrays[name].dtype.kind != kind:
+                    raise InputError(
+                        f"{path}, {name}: numbers of kind {arrays[name].dtype}, expected {kind}"
+                    )
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise InputError(f"{path}: not a readable .npz file ({error})") from error
+    for name, kind in ARRAYS.items():
+        if kind == "f":
+            arrays[name] = arrays[name].astype(np.float64)
+            if not np.isfinite(arrays[name]).all():
+                raise InputError(f"{path}, {name}: not finite, expected finite numbers")
+        elif kind == "i":
+            arrays[name] = arrays[name].astype(np.int64)
+    return arrays

@@ -1,0 +1,146 @@
+"""A virtual patient who is to be imaged: a valve in motion, and what its images do not say.
+
+Open, closed and held frames are those of a virtual patient
+(:mod:`mvest.simulation.virtual_patient`): closed on a fine mesh, in exact equilibrium under the
+patient's own pressure, with chordae that differ from what is stated. The frames in between come
+from a coarse mesh, as for a population. Nothing is displaced: leaflets, annulus and tips are in the
+same images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.problem.registration import REGISTRATION
+from mvest.simulation.motion.closing import (
+    MotionSettings,
+    closing_frames,
+    moving_valve,
+    with_tip_motion,
+)
+from mvest.simulation.motion.refusal import check_motion
+from mvest.simulation.virtual_patient import (
+    CLOSED,
+    REFERENCE,
+    Hidden,
+    Simulation,
+    close_patient,
+    held_states,
+    patient_model,
+)
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Valve
+
+__all__ = ["IMAGED", "ImagedPatient", "simulate_imaged_patient"]
+
+IMAGED = Simulation(
+    columns=54,
+    rows=6,
+    held_pressure_mmHg=(100.0, 80.0),
+    held_relaxation=(0.15, 0.3),
+    held_tips=(0.0, 0.0, 0.0),
+)
+"""How patients are made who are imaged; what is seen of them is not up to it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImagedPatient:
+    """A virtual patient in motion.
+
+    Attributes
+    ----------
+    valve : MovingValve
+        Its positions are true.
+    frames : tuple of str
+        Name of each of its frames, as keys of ``hidden.positions``.
+    pressure_mmHg : (T,)
+        What would be stated of the pressure; NaN in the frames of closing, for which nothing is.
+    closed : int
+        Number of the closed frame.
+    stated : Valve
+        In the layout, with the chordae as they would be stated.
+    hidden : Hidden
+    """
+
+    valve: MovingValve
+    frames: tuple[str, ...]
+    pressure_mmHg: FloatArray
+    closed: int
+    stated: Valve
+    hidden: Hidden
+
+
+def simulate_imaged_patient(
+    name: str,
+    template: Template,
+    values: Mapping[str, float],
+    simulation: Simulation,
+    settings: MotionSettings,
+    mechanics: MechanicsSettings,
+    tip_motion: FloatArray | None = None,
+) -> ImagedPatient:
+    """Close a template as a patient's valve.
+
+    Parameters
+    ----------
+    name : str
+    template : Template
+    values : mapping
+        As from :func:`mvest.simulation.virtual_patient.draw_hidden`; its displacement is left out.
+    simulation : Simulation
+        Of the open, closed and held frames. What is seen, and its errors, are left out.
+    settings : MotionSettings
+        Layout, duration and limits; mesh and number of the frames of closing. Its held frames are
+        left out for those of ``simulation``.
+    mechanics : MechanicsSettings
+        Its pressure is what is stated.
+    tip_motion : ndarray, optional
+        ``(2, 3)`` mm, where the papillary tips are in the open valve relative to the closed one.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or not as a valve does.
+    """
+    own = {parameter: v for parameter, v in values.items() if parameter not in REGISTRATION}
+    shift = np.zeros((2, 3)) if tip_motion is None else np.asarray(tip_motion, dtype=np.float64)
+    layout = ValveLayout(settings.columns, settings.rows)
+    if not mechanics.protocol.equilibrium:
+        raise InputError(
+            "mechanics protocol equilibrium = False, expected True for a patient who is imaged"
+        )
+    # The coarse closure first: it is soon refused.
+    closing = closing_frames(name, template, own, settings, mechanics, shift)
+    seen = with_tip_motion(template.valve(layout.columns, layout.rows), shift)
+    contact = with_tip_motion(
+        template.valve(simulation.contact_columns, simulation.contact_rows), shift
+    )
+    model = patient_model(template, seen, contact, own, simulation, mechanics)
+    later = close_patient(name, model, own, simulation)
+    tips = [state.papillary_tips for state in held_states(simulation, contact).values()]
+    between = {f"closing_{k}": x for k, x in enumerate(closing.vertices[1:-1], start=1)}
+    positions = {REFERENCE: seen.surface.vertices, **between, **later}
+    frames = tuple(positions)
+    closed = frames.index(CLOSED)
+    pressures = [
+        0.0, *[np.nan] * len(between), mechanics.protocol.pressure_mmHg,
+        *simulation.held_pressure_mmHg,
+    ]  # fmt: skip
+    valve = moving_valve(
+        name,
+        template,
+        seen.surface.thickness,
+        settings,
+        np.stack(list(positions.values())),
+        np.stack([*closing.tips, *tips]),
+    )
+    check_motion(valve, closed, settings.limits)
+    return ImagedPatient(valve, frames, np.array(pressures), closed, seen, Hidden(own, positions))

@@ -1,0 +1,231 @@
+"""Populations of simulated valves in motion: anatomies, moduli, pressures and timing drawn.
+
+Every valve has a random stream of its own, spawned from the seed, so that it does not depend on
+how many processes work or on how often another valve was drawn again.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import joblib
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
+from mvest.imaging.moving_valve import MovingValve
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.provenance import config_hash
+from mvest.simulation.motion.closing import MotionSettings, close_in_motion
+from mvest.simulation.motion.refusal import RefusedError
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.variation import vary
+
+__all__ = [
+    "Population",
+    "PopulationSettings",
+    "draw_population",
+    "draw_tip_motion",
+    "population_hash",
+]
+
+MOST_DRAWS = 20
+"""Valves drawn in a row until one closes."""
+
+
+@dataclass(frozen=True, slots=True)
+class PopulationSettings:
+    """What is drawn. Spreads are standard deviations of logarithms.
+
+    Attributes
+    ----------
+    motion : MotionSettings
+        ``duration`` is the median one.
+    scale : (float, float)
+        Range of the factor on the anatomical variation (:mod:`mvest.valve.anatomy.variation`).
+    moduli : mapping
+        Parameter -> median in MPa, the paper's for a normal valve.
+    moduli_spread : float
+    pressure_spread : float
+    chord_rest_length_spread : float
+    duration_spread : float
+    tip_motion : (float, float)
+        mm, range of the distance that each papillary tip goes during closure.
+    """
+
+    motion: MotionSettings = field(default_factory=MotionSettings)
+    scale: tuple[float, float] = (1.0, 1.5)
+    moduli: Mapping[str, float] = field(
+        default_factory=lambda: {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
+    )
+    moduli_spread: float = 0.35
+    pressure_spread: float = 0.12
+    chord_rest_length_spread: float = 0.015
+    duration_spread: float = 0.15
+    tip_motion: tuple[float, float] = (1.0, 3.0)
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "tip_motion"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high:
+                raise InputError(f"population {name} = ({low}, {high}), expected 0 <= low <= high")
+        for name in (
+            "moduli_spread", "pressure_spread", "chord_rest_length_spread", "duration_spread"
+        ):  # fmt: skip
+            if not getattr(self, name) >= 0:
+                raise InputError(f"population {name} = {getattr(self, name)}, expected >= 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Population:
+    """Simulated valves.
+
+    Attributes
+    ----------
+    valves : tuple of MovingValve
+    refused : mapping
+        Reason -> how many valves were drawn again for it.
+    settings_hash : str
+        Of everything that they were made from (:func:`population_hash`).
+    """
+
+    valves: tuple[MovingValve, ...]
+    refused: Mapping[str, int]
+    settings_hash: str
+
+
+def draw_population(
+    count: int,
+    seed: int,
+    bases: Mapping[str, TemplateParameters],
+    settings: PopulationSettings,
+    mechanics: MechanicsSettings,
+    *,
+    processes: int = 1,
+    progress: Callable[[int, MovingValve], None] | None = None,
+) -> Population:
+    """Draw and close valves.
+
+    Parameters
+    ----------
+    count, seed : int
+    bases : mapping
+        Name -> median anatomy; they take turns, in a random order.
+    settings : PopulationSettings
+    mechanics : MechanicsSettings
+    processes : int
+        1 computes here, without further processes.
+    progress : callable, optional
+        Called with the number of each valve and the valve, in their order.
+
+    Raises
+    ------
+    InputError
+        If nothing is asked for or known, or a valve is refused 20 times in a row.
+    """
+    if count < 1 or processes < 1 or not bases:
+        raise InputError(
+            f"a population of {count} valves in {processes} processes from {len(bases)} anatomies, "
+            "expected at least one of each"
+        )
+    known = population_hash(count, seed, bases, settings, mechanics)
+    root = np.random.SeedSequence(seed)
+    names = list(bases)
+    order = np.random.default_rng(root.spawn(1)[0]).permuted(
+        np.resize(np.arange(len(names)), count)
+    )
+    jobs = [
+        (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence)
+        for k, (which, sequence) in enumerate(zip(order, root.spawn(count), strict=True))
+    ]
+    made: Iterable[tuple[MovingValve, list[str]]]
+    if processes == 1:
+        made = (_draw(*job, settings, mechanics) for job in jobs)
+    else:
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            made = joblib.Parallel(n_jobs=processes, return_as="generator")(
+                joblib.delayed(_draw)(*job, settings, mechanics) for job in jobs
+            )
+    valves, refused = [], Counter[str]()
+    for k, (valve, reasons) in enumerate(made):
+        valves.append(valve)
+        refused.update(reasons)
+        if progress is not None:
+            progress(k, valve)
+    return Population(tuple(valves), dict(refused), known)
+
+
+def population_hash(
+    count: int,
+    seed: int,
+    bases: Mapping[str, TemplateParameters],
+    settings: PopulationSettings,
+    mechanics: MechanicsSettings,
+) -> str:
+    """SHA-256 of what a population is drawn from; the code is not part of it."""
+    described: dict[str, Any] = {
+        "count": count,
+        "seed": seed,
+        "bases": [[name, asdict(parameters)] for name, parameters in bases.items()],
+        "settings": asdict(settings),
+        "mechanics": asdict(mechanics),
+    }
+    return config_hash(described)
+
+
+def _draw(
+    name: str,
+    base: TemplateParameters,
+    sequence: np.random.SeedSequence,
+    settings: PopulationSettings,
+    mechanics: MechanicsSettings,
+) -> tuple[MovingValve, list[str]]:
+    """A valve, and why others were refused before it."""
+    rng = np.random.default_rng(sequence)
+    reasons: list[str] = []
+    while len(reasons) < MOST_DRAWS:
+        template = Template(vary(base, rng, rng.uniform(*settings.scale)))
+        values = {
+            parameter: median * _factor(settings.moduli_spread, rng)
+            for parameter, median in settings.moduli.items()
+        }
+        values["pressure_scale"] = _factor(settings.pressure_spread, rng)
+        values["chord_rest_length"] = _factor(settings.chord_rest_length_spread, rng)
+        duration = settings.motion.duration * _factor(settings.duration_spread, rng)
+        tip_motion = draw_tip_motion(template, settings.tip_motion, rng)
+        motion = replace(settings.motion, duration=duration)
+        try:
+            return close_in_motion(name, template, values, motion, mechanics, tip_motion), reasons
+        except RefusedError as error:
+            reasons.append(error.reason.value)
+    raise GeometryError(f"simulated valve {name}: refused {MOST_DRAWS} times: {'; '.join(reasons)}")
+
+
+def _factor(spread: float, rng: np.random.Generator) -> float:
+    return float(np.exp(spread * rng.standard_normal()))
+
+
+def draw_tip_motion(
+    template: Template, reach: tuple[float, float], rng: np.random.Generator
+) -> FloatArray:
+    """Where open tips are relative to closed ones ``(2, 3)`` mm: nearer to their insertions.
+
+    Farther away, chordae would be taut in the open valve, which is to be free of stress.
+
+    Parameters
+    ----------
+    template : Template
+    reach : (float, float)
+        mm, range of the distance.
+    rng : numpy.random.Generator
+    """
+    direction = rng.standard_normal((2, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    chordae, tips = template.chordae(), template.papillary_tips
+    for k in range(2):
+        towards = (chordae.insertion[chordae.tip == k] - tips[k]).mean(axis=0)
+        direction[k] *= 1.0 if direction[k] @ towards > 0 else -1.0
+    return np.asarray(direction * rng.uniform(*reach, size=(2, 1)))

@@ -1,0 +1,360 @@
+"""Virtual patients: cases that a simulation wrote, with everything that an estimator is not told.
+
+A virtual patient is closed on another mesh than any estimator's, under a pressure, with chordae and
+seen with errors that its case does not state. What was hidden is returned beside the case and
+belongs in another place than it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.closure.model import ClosureModel
+from mvest.errors import GeometryError, InputError
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.valve_system import HeldState
+from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation
+from mvest.problem.registration import REGISTRATION, displace
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.structured import structured_mesh
+
+__all__ = [
+    "Deviations",
+    "Hidden",
+    "Simulation",
+    "VirtualPatient",
+    "close_patient",
+    "draw_hidden",
+    "held_states",
+    "patient_model",
+    "simulate_patient",
+]
+
+REFERENCE, CLOSED = "open", "closed"
+"""Names of the frames of a virtual patient that are shown; the others are held out."""
+
+GUIDES = (("hex18", 24, 3), ("hex18", 36, 4))
+"""Element, columns and rows of the coarser meshes on which a closure is followed."""
+
+FRAME_INTERVAL = 0.05
+"""s between the closed frame and those that are held out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """How far what is hidden may lie from what a case states: standard deviations.
+
+    Attributes
+    ----------
+    pressure, chord_rest_length, chord_stiffness : float
+        Relative.
+    shift_mm, turn_degrees : float
+        Of each component.
+    """
+
+    pressure: float = 0.10
+    chord_rest_length: float = 0.02
+    chord_stiffness: float = 0.20
+    shift_mm: float = 1.0
+    turn_degrees: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hidden:
+    """What the case of a virtual patient does not say.
+
+    Attributes
+    ----------
+    values : mapping
+        Parameter -> true value: the moduli in MPa, factors on what the case states, and the
+        displacement of the leaflets as they were seen.
+    positions : mapping
+        Frame -> ``(n, 3)`` mm, where the vertices of the case would have been seen without errors,
+        the displacement included.
+    """
+
+    values: Mapping[str, float]
+    positions: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualPatient:
+    """A simulated case, and what it hides."""
+
+    case: ValveCase
+    hidden: Hidden
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """How virtual patients are made.
+
+    Attributes
+    ----------
+    element : str
+    columns, rows : int
+        Cells of the mesh that is closed.
+    dt_factor : float
+        On the time step of the mechanics.
+    contact_columns, contact_rows : int
+    seen_columns, seen_rows : int
+        Vertices of the surface that is seen.
+    std_mm, correlation_length_mm : float
+        Error of each coordinate of each vertex in each frame but the first, and over which distance
+        it is alike. Frames are independent.
+    rest_std_mm : float
+        Error of the open shape from which an estimator takes its model; 0: it is seen exactly.
+    held_pressure_mmHg : tuple of float
+        In the frames that are held out, one after another.
+    held_relaxation : tuple of float
+        Share of its way back to the open shape that the annulus has gone in each.
+    held_tips : (float, float, float)
+        mm, displacement of the papillary tips per unit of relaxation.
+    """
+
+    element: str = "hex18"
+    columns: int = 72
+    rows: int = 8
+    dt_factor: float = 0.5
+    contact_columns: int = 168
+    contact_rows: int = 38
+    seen_columns: int = 80
+    seen_rows: int = 21
+    std_mm: float = 0.6
+    correlation_length_mm: float = 10.0
+    rest_std_mm: float = 0.0
+    held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
+    held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
+    held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
+
+    def __post_init__(self) -> None:
+        if len(self.held_pressure_mmHg) != len(self.held_relaxation):
+            raise InputError(
+                f"held_pressure_mmHg has {len(self.held_pressure_mmHg)} frames, held_relaxation "
+                f"{len(self.held_relaxation)}; expected as many"
+            )
+        if len(set(self.held_pressure_mmHg)) != len(self.held_pressure_mmHg):
+            raise InputError(
+                f"held_pressure_mmHg = {self.held_pressure_mmHg}, expected different ones: they "
+                "name the frames"
+            )
+
+
+def draw_hidden(
+    moduli: Mapping[str, float], deviations: Deviations, rng: np.random.Generator
+) -> dict[str, float]:
+    """True values of all parameters: the moduli as given, everything else drawn.
+
+    Factors are log-normal, so that they are positive; displacements are normal.
+    """
+    factors = {
+        "pressure_scale": deviations.pressure,
+        "chord_stiffness": deviations.chord_stiffness,
+        "chord_rest_length": deviations.chord_rest_length,
+    }
+    drawn = {name: float(np.exp(std * rng.standard_normal())) for name, std in factors.items()}
+    for name in REGISTRATION:
+        std = deviations.shift_mm if name.startswith("shift") else deviations.turn_degrees
+        drawn[name] = float(std * rng.standard_normal())
+    return {**{name: float(value) for name, value in moduli.items()}, **drawn}
+
+
+def simulate_patient(
+    name: str,
+    description: str,
+    template: Template,
+    values: Mapping[str, float],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+    rng: np.random.Generator,
+) -> VirtualPatient:
+    """Close a template and see it.
+
+    Parameters
+    ----------
+    name, description : str
+        Of the case.
+    template : Template
+    values : mapping
+        As from :func:`draw_hidden`.
+    simulation : Simulation
+    mechanics : MechanicsSettings
+        Its pressure is what the case states.
+    rng : numpy.random.Generator
+        For the errors.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or has no equilibrium in a frame that is held out.
+    """
+    seen = template.valve(simulation.seen_columns, simulation.seen_rows)
+    contact = template.valve(simulation.contact_columns, simulation.contact_rows)
+    model = patient_model(template, seen, contact, values, simulation, mechanics)
+    centre = seen.motion.annulus[-1].mean(axis=0)
+    registration = np.array([values[parameter] for parameter in REGISTRATION])
+    true = {
+        frame: displace(found, registration, centre)
+        for frame, found in close_patient(name, model, values, simulation).items()
+    }
+    case = _case(name, description, seen, true, simulation, mechanics, rng)
+    return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
+
+
+def patient_model(
+    template: Template,
+    seen: Valve,
+    contact: Valve,
+    values: Mapping[str, float],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+) -> ClosureModel:
+    """The model that closes a virtual patient, with the guides that it follows.
+
+    Parameters
+    ----------
+    template : Template
+    seen, contact : Valve
+        Of that template, where it is seen and where contact is sampled.
+    values : mapping
+        The parameters are its names, without those of a displacement.
+    simulation : Simulation
+    mechanics : MechanicsSettings
+    """
+    names = tuple(name for name in values if name not in REGISTRATION)
+    protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
+    guide = None
+    own = (simulation.element, simulation.columns, simulation.rows)
+    # Closures are followed on coarser meshes only.
+    guides = [cells for cells in GUIDES if cells[1] * cells[2] < own[1] * own[2]]
+    for element, columns, rows in (*guides, own):
+        guide = ClosureModel(
+            seen,
+            contact,
+            structured_mesh(template, element, columns, rows),
+            replace(mechanics, protocol=protocol),
+            names,
+            continuation=True,
+            guide=guide,
+            # A valve that does not follow its guide has more than one way to close.
+            repeat=False,
+        )
+    assert guide is not None
+    return guide
+
+
+def close_patient(
+    name: str, model: ClosureModel, values: Mapping[str, float], simulation: Simulation
+) -> dict[str, FloatArray]:
+    """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
+
+    The first frame is the closed one; those that are held out follow.
+
+    Raises
+    ------
+    GeometryError
+        If the valve does not close, or has no equilibrium in a frame that is held out.
+    """
+    at = np.array([values[parameter] for parameter in model.names])
+    prediction = model(at)
+    if not prediction.converged:
+        raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
+    true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
+    held = held_states(simulation, model.contact_valve)
+    for frame, found in zip(held, model.held(at, tuple(held.values())), strict=True):
+        if found is None:
+            raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
+        true[frame] = found
+    return true
+
+
+def held_states(simulation: Simulation, valve: Valve) -> dict[str, HeldState]:
+    """The frames that are held out, on the annulus of a valve.
+
+    Tips that move while the valve closes return with the annulus.
+    """
+    start, end = valve.motion.annulus[0], valve.motion.annulus[-1]
+    tips = valve.motion.papillary_tips[-1]
+    back = valve.motion.papillary_tips[0] - tips
+    return {
+        f"held_{pressure:g}_mmHg": HeldState(
+            pressure,
+            end + relaxation * (start - end),
+            tips + relaxation * (np.array(simulation.held_tips) + back),
+        )
+        for pressure, relaxation in zip(
+            simulation.held_pressure_mmHg, simulation.held_relaxation, strict=True
+        )
+    }
+
+
+def _case(
+    name: str,
+    description: str,
+    seen: Valve,
+    true: Mapping[str, FloatArray],
+    simulation: Simulation,
+    mechanics: MechanicsSettings,
+    rng: np.random.Generator,
+) -> ValveCase:
+    surface = seen.surface
+    correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
+    error = CorrelatedNoise(simulation.std_mm, correlation)
+    moved = np.stack(list(true.values()))
+    seen_later = error(moved, moved, rng)
+    if simulation.rest_std_mm:
+        rest_error = CorrelatedNoise(simulation.rest_std_mm, correlation)
+        exact = surface.vertices[None]
+        surface = replace(surface, vertices=rest_error(exact, exact, rng)[0])
+    motion = seen.motion
+    closed = HeldState(
+        mechanics.protocol.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1]
+    )
+    states = {CLOSED: closed, **held_states(simulation, seen)}
+
+    def frame(name: str, time: float, role: Role, state: HeldState, vertices: FloatArray) -> Frame:
+        return Frame(
+            name,
+            time,
+            role,
+            state.pressure_mmHg,
+            vertices,
+            surface.triangles,
+            surface.region,
+            state.annulus,
+            vertices[seen.free_edge],
+            state.papillary_tips,
+            True,
+        )
+
+    rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips)
+    end = mechanics.protocol.ramp
+    later = [
+        frame(
+            which,
+            end + k * FRAME_INTERVAL,
+            Role.CLOSED if which == CLOSED else Role.HELD_OUT,
+            states[which],
+            vertices,
+        )
+        for k, (which, vertices) in enumerate(zip(true, seen_later, strict=True))
+    ]
+    return ValveCase(
+        name=name,
+        description=description,
+        source="simulated with mvest",
+        licence="MIT",
+        simulated=True,
+        surface=surface,
+        annulus=seen.annulus,
+        free_edge=seen.free_edge,
+        frames=(frame(REFERENCE, 0.0, Role.REFERENCE, rest, surface.vertices), *later),
+        chordae=seen.chordae,
+        uncertainty=Uncertainty(simulation.std_mm, simulation.correlation_length_mm),
+    )

@@ -1,0 +1,1 @@
+"""The anatomy as value objects: leaflets, chordae, motion, and the parametric template."""

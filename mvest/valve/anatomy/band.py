@@ -1,0 +1,265 @@
+"""A triangulated two-leaflet valve in material coordinates, as the template is by construction.
+
+A surface from outside has no columns and rows. Its harmonic coordinates give it both: ``s`` runs
+from the annulus (0) to the free edge (1), and ``phi`` in degrees once around the valve, 0 and 180
+on the lines between the leaflets (whatever course they take), the first leaflet in (0, 180). So
+everything that is laid out on the template (layered meshes, samples of contact, chordae) can be
+laid out on any valve.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve
+from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.geometry.surfaces import smooth_vertex_normals
+
+__all__ = ["Band"]
+
+INSIDE = 2.0
+"""Degrees from the line between two leaflets at which the fibre of either is read."""
+
+NORMAL_SMOOTHING_MM = 2.0
+"""mm, over which normals are averaged, as the template averages its own: at the commissures the
+leaflets bend with a radius of about the thickness."""
+
+
+class Band:
+    """Material coordinates of a valve with two leaflets.
+
+    Parameters
+    ----------
+    valve : Valve
+        Its surface is one band between annulus and free edge, normals to the ventricle.
+
+    Raises
+    ------
+    InputError
+        If it has not two leaflets.
+    GeometryError
+        If it is no band, or the leaflets do not meet along two lines from annulus to free edge.
+    """
+
+    def __init__(self, valve: Valve) -> None:
+        surface = valve.surface
+        if len(surface.region_names) != 2:
+            raise InputError(
+                f"material coordinates of {len(surface.region_names)} leaflets "
+                f"({', '.join(surface.region_names)}); expected 2"
+            )
+        self.valve = valve
+        self.region_names = surface.region_names
+        found = surface_coordinates(
+            surface.vertices, surface.triangles, valve.annulus, valve.free_edge
+        )
+        # phi runs so that (along the leaflet) x (along phi) points to the ventricle: triangles,
+        # whose normals do, are then run through clockwise in the plane of (phi, s).
+        corner = found.strip_triangles()
+        a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        self._sign = -1.0 if np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0 else 1.0
+        self._coordinates: SurfaceCoordinates = found
+        self._lines = self._leaflet_lines(surface)
+        self._normals = smooth_vertex_normals(
+            surface.vertices, surface.triangles, _rounds(surface, NORMAL_SMOOTHING_MM)
+        )
+
+    def _leaflet_lines(self, surface: LeafletSurface) -> tuple[FloatArray, FloatArray]:
+        """The two lines between the leaflets as ``(k, 2)`` of s and theta, that to phi = 0 first.
+
+        theta runs as phi does, and is unwrapped about each line's beginning.
+        """
+        ends = np.vstack(
+            [
+                surface.triangles[:, [0, 1]],
+                surface.triangles[:, [1, 2]],
+                surface.triangles[:, [2, 0]],
+            ]
+        )
+        edges, number = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+        region = np.tile(surface.region, 3)
+        low = np.full(len(edges), 2)
+        high = np.full(len(edges), -1)
+        np.minimum.at(low, number.ravel(), region)
+        np.maximum.at(high, number.ravel(), region)
+        between = np.unique(edges[low != high])
+        self._between = np.isin(np.arange(len(surface.vertices)), between)
+        if not between.size:
+            raise GeometryError("the two leaflets do not touch: no line between them")
+        theta = np.mod(self._sign * self._coordinates.theta[between], 2 * np.pi)
+        s = self._coordinates.s[between]
+        # Two clusters round the valve: cut at the widest gaps.
+        order = np.argsort(theta)
+        gaps = np.diff(np.concatenate([theta[order], theta[order[:1]] + 2 * np.pi]))
+        cuts = np.sort(np.argsort(gaps)[-2:])
+        first = order[cuts[0] + 1 : cuts[1] + 1]
+        second = np.setdiff1d(order, first)
+        lines = []
+        for members in (first, second):
+            along = members[np.argsort(s[members])]
+            if len(along) < 2 or s[along[0]] > 1e-6 or s[along[-1]] < 1 - 1e-6:
+                raise GeometryError(
+                    "the leaflets do not meet along two lines from the annulus to the free edge"
+                )
+            angle = np.unwrap(theta[along])
+            _, once = np.unique(s[along], return_index=True)
+            lines.append(np.column_stack([s[along][once], angle[once]]))
+        return self._ordered(surface, lines[0], lines[1])
+
+    def _ordered(
+        self, surface: LeafletSurface, one: FloatArray, other: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The lines such that the first leaflet follows the first line in the direction of phi."""
+        middle = one[0, 1] + 0.5 * np.mod(other[0, 1] - one[0, 1], 2 * np.pi)
+        triangle, _ = self._coordinates.locate(
+            np.mod(self._sign * np.array([middle]), 2 * np.pi), np.array([0.5])
+        )
+        return (one, other) if surface.region[triangle[0]] == 0 else (other, one)
+
+    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangles ``(k,)`` and barycentric weights ``(k, 3)`` of material points."""
+        phi = np.mod(np.asarray(phi, dtype=np.float64), 360.0)
+        s = np.clip(np.asarray(s, dtype=np.float64), 0.0, 1.0)
+        zero, half = (np.interp(s, line[:, 0], line[:, 1]) for line in self._lines)
+        first = np.mod(half - zero, 2 * np.pi)
+        theta = np.where(
+            phi <= 180.0,
+            zero + phi / 180.0 * first,
+            zero + first + (phi / 180.0 - 1.0) * (2 * np.pi - first),
+        )
+        return self._coordinates.locate(np.mod(self._sign * theta, 2 * np.pi), s)
+
+    def coordinates(self) -> tuple[FloatArray, FloatArray]:
+        """``phi`` (degrees) and ``s`` of the surface's vertices, ``(n,)`` each."""
+        s = self._coordinates.s
+        theta = self._sign * self._coordinates.theta
+        zero, half = (np.interp(s, line[:, 0], line[:, 1]) for line in self._lines)
+        first = np.mod(half - zero, 2 * np.pi)
+        from_zero = np.mod(theta - zero, 2 * np.pi)
+        phi = np.where(
+            from_zero <= first,
+            180.0 * from_zero / first,
+            180.0 + 180.0 * (from_zero - first) / (2 * np.pi - first),
+        )
+        return np.mod(phi, 360.0), s
+
+    def position(
+        self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """Reference positions ``(k, 3)`` mm of material points; zeta is -1 on the atrial face."""
+        surface = self.valve.surface
+        at = self._at(phi, s)
+        middle = _mean(at, surface, surface.vertices)
+        zeta = np.broadcast_to(np.asarray(zeta, float), np.shape(phi))
+        if not np.any(zeta):
+            return middle
+        normal = _mean(at, surface, self._normals)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        half = 0.5 * zeta * _mean(at, surface, surface.thickness)
+        return np.asarray(middle + half[..., None] * normal)
+
+    def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
+        """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""
+        low = np.where(region == 0, INSIDE, 180.0 + INSIDE)
+        high = np.where(region == 0, 180.0 - INSIDE, 360.0 - INSIDE)
+        # The end of the second leaflet is 360 and not 0.
+        turned = np.where((np.asarray(region) == 1) & (np.mod(phi, 360.0) < 90.0), 360.0, phi)
+        inside = np.clip(np.where(turned == 360.0, 360.0, np.mod(turned, 360.0)), low, high)
+        surface = self.valve.surface
+        triangle, weights = self._at(inside, s)
+        corners = surface.fibre[surface.triangles[triangle]]
+        # A vertex between the leaflets has the fibre of one of them, and it is not known of which.
+        own = np.where(self._between[surface.triangles[triangle]], 0.0, weights)
+        total = own.sum(axis=-1, keepdims=True)
+        weights = np.where(total > 1e-9, own / np.maximum(total, 1e-9), weights)
+        lead = np.take_along_axis(corners, weights.argmax(axis=-1)[..., None, None], axis=-2)
+        # A fibre has no sign: its corners are turned to agree before they are averaged.
+        sign = np.where(np.sum(corners * lead, axis=-1) < 0, -1.0, 1.0)
+        fibre = np.einsum("...c,...ci->...i", weights * sign, corners)
+        return np.asarray(fibre / np.linalg.norm(fibre, axis=-1, keepdims=True))
+
+    def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
+        """Thickness ``(k,)`` mm."""
+        return _mean(self._at(phi, s), self.valve.surface, self.valve.surface.thickness)
+
+    def displaced(self, phi: FloatArray, s: FloatArray, vertices: FloatArray) -> FloatArray:
+        """Positions ``(k, 3)`` of material points where the surface's vertices are elsewhere."""
+        return _mean(self._at(phi, s), self.valve.surface, vertices)
+
+    def annulus_positions(self, phi: FloatArray, annulus: FloatArray) -> FloatArray:
+        """Positions ``(k, 3)`` of annulus points, given those of the valve's annulus vertices.
+
+        Parameters
+        ----------
+        phi : ndarray
+            ``(k,)`` degrees.
+        annulus : ndarray
+            ``(a, 3)`` mm, of the vertices ``valve.annulus``.
+        """
+        vertices = np.array(self.valve.surface.vertices)
+        displacement = np.zeros_like(vertices)
+        displacement[self.valve.annulus] = annulus - vertices[self.valve.annulus]
+        at = self._at(phi, np.zeros(len(phi)))
+        return _mean(at, self.valve.surface, vertices + displacement)
+
+    def sampled(self, columns: int, rows: int) -> Valve:
+        """The same valve on a grid of ``columns x rows`` vertices, chordae and motion with it."""
+        if columns < 8 or columns % 2 or rows < 3:
+            raise InputError(
+                f"valve of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
+            )
+        i, j = np.meshgrid(np.arange(columns), np.arange(rows))
+        phi, s = (360.0 * i / columns).ravel(), (j / (rows - 1)).ravel()
+        cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
+        a = cell_j * columns + cell_i
+        b = cell_j * columns + (cell_i + 1) % columns
+        c, d = b + columns, a + columns
+        vertex_region = np.where((phi > 0) & (phi < 180), 0, 1)
+        surface = LeafletSurface(
+            self.position(phi, s),
+            np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]),
+            np.tile(np.where(2 * cell_i < columns, 0, 1), 2),
+            self.region_names,
+            self.fibre(phi, s, vertex_region),
+            self.thickness(phi, s),
+        )
+        motion = self.valve.motion
+        along = phi[:columns]
+        annulus = np.stack([self.annulus_positions(along, frame) for frame in motion.annulus])
+        return Valve(
+            surface,
+            np.arange(columns),
+            np.arange(columns) + (rows - 1) * columns,
+            self.valve.papillary_tips,
+            self.valve.chordae,
+            Motion(motion.phase, annulus, motion.papillary_tips),
+        )
+
+    def _at(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangles and weights of points in arrays of any shape."""
+        phi, s = np.broadcast_arrays(np.asarray(phi, float), np.asarray(s, float))
+        triangle, weights = self.locate(phi.ravel(), s.ravel())
+        return triangle.reshape(phi.shape), weights.reshape(*phi.shape, 3)
+
+
+def _mean(
+    at: tuple[IntArray, FloatArray], surface: LeafletSurface, values: FloatArray
+) -> FloatArray:
+    """Values given at the vertices, at material points."""
+    triangle, weights = at
+    corners = values[surface.triangles[triangle]]
+    if values.ndim == 1:
+        return np.asarray(np.sum(weights * corners, axis=-1))
+    return np.asarray(np.einsum("...c,...ci->...i", weights, corners))
+
+
+def _rounds(surface: LeafletSurface, length: float) -> int:
+    """Rounds of averaging over neighbours that spread over about ``length`` mm.
+
+    The spread of a random walk grows with the root of its steps.
+    """
+    corner = surface.vertices[surface.triangles]
+    edge = float(np.median(np.linalg.norm(corner[:, 1] - corner[:, 0], axis=1)))
+    return max(1, round((length / edge) ** 2))

@@ -1,0 +1,135 @@
+"""Random anatomies around a given one, for a population of simulated valves.
+
+A size common to the whole valve, and what differs from valve to valve beyond it, are drawn as
+normal deviates z, none beyond two standard deviations. In the logarithms of the parameters:
+
+* the annulus, and the free edge that hangs from it, take the size and a share of their own along
+  each direction, so that a valve that is wide is wide at its edge too;
+* leaflets take half of both and a share of their own: they vary less than annuli do;
+* papillary tips take the size and a shift of their own;
+* thickness (both leaflets alike), saddle and contraction go their own ways.
+
+Sources. Annulus diameters of normal valves have standard deviations of 12 to 14 % (24 ± 3 mm and
+30.8 ± 4.4 mm antero-posterior, 35 ± 5 mm commissural), which include errors of measurement; at a
+scale of 1 they are about half of that here (6 %), at 2 all of it. Anterior leaflets are 20 to 25 mm
+long, 11 % to both sides of their middle, which is the farthest that a leaflet's length gets at a
+scale of 1; tips lie 13 to 19 mm aside. The other spreads are choices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import truncnorm
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template, TemplateParameters
+
+__all__ = ["Variation", "draw_variation", "vary"]
+
+LIMIT = 2.0
+"""Standard deviations beyond which nothing is drawn."""
+
+MOST_REFUSED = 100
+"""Shapes refused in a row before the scale is held to be too large."""
+
+SIZE, AP, COMMISSURAL = 0.05, 0.035, 0.03
+LEAFLET, EDGE, SADDLE, THICKNESS, CONTRACTION = 0.01, 0.04, 0.10, 0.07, 0.15
+"""Standard deviations of logarithms."""
+
+TIP = 0.7
+"""mm, standard deviation of each coordinate of a papillary tip beyond the size."""
+
+SAMPLING = (112, 29)
+"""Vertices at which a shape is tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """A random anatomy.
+
+    Attributes
+    ----------
+    parameters : TemplateParameters
+    refused : int
+        Shapes drawn before it that are no valve.
+    """
+
+    parameters: TemplateParameters
+    refused: int
+
+
+def vary(
+    parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
+) -> TemplateParameters:
+    """A random anatomy around a given one; see :func:`draw_variation`."""
+    return draw_variation(parameters, rng, scale).parameters
+
+
+def draw_variation(
+    parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
+) -> Variation:
+    """Draw until the template takes the shape.
+
+    Parameters
+    ----------
+    parameters : TemplateParameters
+        The median anatomy. Its chordae keep their places; their rest lengths follow the shape.
+    rng : numpy.random.Generator
+    scale : float
+        Factor on all standard deviations.
+
+    Raises
+    ------
+    InputError
+        If the scale is negative or not finite, or so large that hardly any shape is a valve.
+    """
+    if not (np.isfinite(scale) and scale >= 0):
+        raise InputError(f"scale of a variation = {scale}, expected a number >= 0")
+    for refused in range(MOST_REFUSED):
+        z = scale * truncnorm.rvs(-LIMIT, LIMIT, size=13, random_state=rng)
+        try:
+            varied = _changed(parameters, z)
+            Template(varied).valve(*SAMPLING)
+        except GeometryError:
+            continue
+        return Variation(varied, refused)
+    raise InputError(
+        f"scale of a variation = {scale}: {MOST_REFUSED} shapes in a row are no valve; take a "
+        "smaller one"
+    )
+
+
+def _changed(p: TemplateParameters, z: FloatArray) -> TemplateParameters:
+    """The anatomy with the deviates ``z (13,)``."""
+    size, ap, commissural = SIZE * z[0], AP * z[1], COMMISSURAL * z[2]
+    along_y, along_x = np.exp(size + ap), np.exp(size + commissural)
+    half = 0.5 * (size + ap)
+    thickness = np.exp(THICKNESS * z[8])
+    tips = np.exp(size) * np.array(p.tips) + TIP * z[10:13]
+    factors = {
+        "half_commissural": along_x,
+        "half_ap": along_y,
+        "saddle": np.exp(size + SADDLE * z[7]),
+        "length_anterior": np.exp(half + LEAFLET * z[3]),
+        "length_posterior": np.exp(half + LEAFLET * z[4]),
+        "length_commissure": np.exp(half),
+        "edge_half_width": along_x,
+        "edge_y": along_y,
+        "edge_anterior": along_y * np.exp(EDGE * z[5]),
+        "edge_posterior": along_y * np.exp(EDGE * z[6]),
+        "thickness_anterior": thickness,
+        "thickness_posterior": thickness,
+        "ap_contraction": np.exp(CONTRACTION * z[9]),
+        "closed_sag": along_y,
+        "closed_half_width": along_x,
+        "closed_z": np.exp(size),
+        "closed_drop": np.exp(size),
+    }
+    values: dict[str, Any] = {
+        name: float(getattr(p, name) * factor) for name, factor in factors.items()
+    }
+    return replace(p, tips=tuple(tips.tolist()), **values)

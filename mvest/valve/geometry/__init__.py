@@ -1,0 +1,1 @@
+"""Geometry of triangulated surfaces: distances, intersections, thickening, material coordinates."""

@@ -1,0 +1,296 @@
+"""Closest points and intersections between points and triangulated surfaces.
+
+Everything here is exact geometry on plain arrays: vertices ``(n, 3)`` in mm and triangles
+``(m, 3)`` of vertex numbers. The closest point of a triangle follows Ericson, *Real-Time
+Collision Detection* (2005), section 5.1.5 (Voronoi regions of the triangle's features).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ipctk
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+
+
+@njit(cache=True)
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    # Faster on three numbers than the BLAS call behind `@`, and indifferent to memory layout.
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def closest_on_triangle(
+    p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray
+) -> tuple[float, float, float]:
+    """Barycentric coordinates ``(u, v, w)`` of the point of triangle ``abc`` closest to `p`."""
+    ab = b - a
+    ac = c - a
+    ap = p - a
+    d1 = _dot(ab, ap)
+    d2 = _dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        return 1.0, 0.0, 0.0
+    bp = p - b
+    d3 = _dot(ab, bp)
+    d4 = _dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        return 0.0, 1.0, 0.0
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        v = d1 / (d1 - d3)
+        return 1.0 - v, v, 0.0
+    cp = p - c
+    d5 = _dot(ab, cp)
+    d6 = _dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        return 0.0, 0.0, 1.0
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w = d2 / (d2 - d6)
+        return 1.0 - w, 0.0, w
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 >= d3 and d5 >= d6:
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return 0.0, 1.0 - w, w
+    total = va + vb + vc
+    v = vb / total
+    w = vc / total
+    return 1.0 - v - w, v, w
+
+
+@njit(cache=True)
+def distance_to_triangle(
+    p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray
+) -> tuple[float, float, float, float]:
+    """Distance (mm) of `p` to triangle ``abc``, and the barycentric coordinates of the foot."""
+    u, v, w = closest_on_triangle(p, a, b, c)
+    squared = 0.0
+    for i in range(3):
+        difference = p[i] - (u * a[i] + v * b[i] + w * c[i])
+        squared += difference * difference
+    return np.sqrt(squared), u, v, w
+
+
+@njit(cache=True)
+def paired_distances(
+    points: FloatArray, vertices: FloatArray, triangles: IntArray, triangle: IntArray
+) -> FloatArray:
+    """Distance (mm) of ``points[i]`` to the triangle numbered ``triangle[i]``, shape ``(n,)``."""
+    distance = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        t = triangles[triangle[i]]
+        distance[i] = distance_to_triangle(
+            points[i], vertices[t[0]], vertices[t[1]], vertices[t[2]]
+        )[0]
+    return distance
+
+
+@njit(cache=True)
+def _closest_of_candidates(
+    points: FloatArray,
+    vertices: FloatArray,
+    triangles: IntArray,
+    offsets: IntArray,
+    candidates: IntArray,
+    distance: FloatArray,
+    triangle: IntArray,
+    barycentric: FloatArray,
+) -> None:
+    for i in range(points.shape[0]):
+        for k in range(offsets[i], offsets[i + 1]):
+            t = triangles[candidates[k]]
+            d, u, v, w = distance_to_triangle(
+                points[i], vertices[t[0]], vertices[t[1]], vertices[t[2]]
+            )
+            if d < distance[i]:
+                distance[i] = d
+                triangle[i] = candidates[k]
+                barycentric[i, 0] = u
+                barycentric[i, 1] = v
+                barycentric[i, 2] = w
+
+
+@dataclass(frozen=True, slots=True)
+class ClosestPoints:
+    """Closest points of a triangulated surface to some points.
+
+    Attributes
+    ----------
+    distance
+        ``(n,)`` mm, unsigned.
+    triangle
+        ``(n,)`` number of the triangle holding the closest point.
+    barycentric
+        ``(n, 3)`` coordinates of the closest point in that triangle.
+    """
+
+    distance: FloatArray
+    triangle: IntArray
+    barycentric: FloatArray
+
+    def interpolate(self, values: FloatArray, triangles: IntArray) -> FloatArray:
+        """Interpolate vertex `values` ``(n_vertices, ...)`` at the closest points."""
+        corners = values[triangles[self.triangle]]
+        return np.einsum("ij,ij...->i...", self.barycentric, corners)
+
+
+def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> ClosestPoints:
+    """Find the exact closest point of a surface to every one of `points`.
+
+    A tree of triangle centroids bounds the search: with the distance ``d`` of one candidate and
+    the largest centroid-to-corner distance ``R``, the closest triangle has its centroid within
+    ``d + R``, so nothing nearer can be missed.
+
+    Parameters
+    ----------
+    points
+        ``(n, 3)`` mm.
+    vertices, triangles
+        The surface, ``(n_vertices, 3)`` mm and ``(m, 3)``.
+
+    Raises
+    ------
+    GeometryError
+        The surface has no triangles.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+    triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+    if len(triangles) == 0:
+        raise GeometryError("closest points: the surface has no triangles; give at least one")
+    corners = vertices[triangles]
+    centroids = corners.mean(axis=1)
+    reach = float(np.linalg.norm(corners - centroids[:, None], axis=2).max())
+    tree = cKDTree(centroids)
+    n = len(points)
+    distance = np.full(n, np.inf)
+    triangle = np.zeros(n, dtype=np.int64)
+    barycentric = np.zeros((n, 3))
+    k = min(4, len(triangles))
+    first = tree.query(points, k=k)[1].reshape(n, k)
+    _closest_of_candidates(
+        points, vertices, triangles, np.arange(n + 1) * k, first.ravel(),
+        distance, triangle, barycentric,
+    )  # fmt: skip
+    block = 20_000
+    for start in range(0, n, block):
+        part = slice(start, start + block)
+        lists = tree.query_ball_point(points[part], distance[part] + reach * (1 + 1e-12))
+        counts = np.array([len(entry) for entry in lists], dtype=np.int64)
+        offsets = np.concatenate(([0], np.cumsum(counts)))
+        candidates = (
+            np.concatenate([np.asarray(entry, dtype=np.int64) for entry in lists])
+            if offsets[-1]
+            else np.zeros(0, dtype=np.int64)
+        )
+        _closest_of_candidates(
+            points[part], vertices, triangles, offsets, candidates,
+            distance[part], triangle[part], barycentric[part],
+        )  # fmt: skip
+    return ClosestPoints(distance, triangle, barycentric)
+
+
+def surface_edges(triangles: IntArray) -> IntArray:
+    """Undirected edges ``(n_edges, 2)`` of a triangulation, each once, lower number first."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    return np.unique(np.sort(edges, axis=1), axis=0)
+
+
+def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
+    """Say whether any triangle edge passes through another triangle (IPC toolkit's check).
+
+    Triangles that share a vertex are not tested against each other's common edges, and two
+    overlapping triangles in one plane are not seen; duplicates are found by
+    `mvest.valve.geometry.surfaces.check_surface`.
+
+    Parameters
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    """
+    if len(triangles) == 0:
+        return False
+    vertices = np.asfortranarray(vertices, dtype=np.float64)
+    faces = np.asfortranarray(triangles, dtype=np.int32)
+    edges = np.asfortranarray(surface_edges(triangles), dtype=np.int32)
+    mesh = ipctk.CollisionMesh(vertices, edges, faces)
+    return bool(ipctk.has_intersections(mesh, vertices))
+
+
+def intersecting_triangles(vertices: FloatArray, triangles: IntArray) -> IntArray:
+    """Pairs of intersecting triangles ``(k, 2)``, lower number first, each pair once.
+
+    A pair is listed when an edge of one passes through the other; see `has_intersections` for
+    what is not tested.
+    """
+    if not has_intersections(vertices, triangles):
+        return np.zeros((0, 2), dtype=np.int64)
+    edges = surface_edges(triangles)
+    phase = ipctk.LBVH()
+    phase.build(
+        np.asfortranarray(vertices, dtype=np.float64),
+        np.asfortranarray(edges, dtype=np.int32),
+        np.asfortranarray(triangles, dtype=np.int32),
+        1e-9,
+    )
+    hits = [
+        (candidate.edge_id, candidate.face_id)
+        for candidate in phase.detect_edge_face_candidates()
+        if not np.isin(edges[candidate.edge_id], triangles[candidate.face_id]).any()
+        and ipctk.is_edge_intersecting_triangle(
+            *vertices[edges[candidate.edge_id]], *vertices[triangles[candidate.face_id]]
+        )
+    ]
+    if not hits:
+        return np.zeros((0, 2), dtype=np.int64)
+    owners: dict[tuple[int, int], list[int]] = {}
+    for number, triangle in enumerate(triangles):
+        for i in range(3):
+            edge = sorted((int(triangle[i]), int(triangle[(i + 1) % 3])))
+            owners.setdefault((edge[0], edge[1]), []).append(number)
+    pairs = {
+        (min(owner, int(face)), max(owner, int(face)))
+        for edge, face in hits
+        for owner in owners[int(edges[edge][0]), int(edges[edge][1])]
+    }
+    return np.array(sorted(pairs), dtype=np.int64)
+
+
+def plane_section(
+    vertices: FloatArray, triangles: IntArray, origin: FloatArray, normal: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Cut a triangulated surface with a plane.
+
+    Returns
+    -------
+    segments
+        ``(k, 2, 3)`` mm, one for every triangle cut.
+    triangle
+        ``(k,)`` numbers of those triangles.
+    """
+    height = (np.asarray(vertices, dtype=np.float64) - origin) @ normal
+    # A vertex exactly on the plane counts as above it, so that no segment is cut twice.
+    above = height >= 0
+    corner_above = above[triangles]
+    cut = np.flatnonzero(corner_above.any(axis=1) & ~corner_above.all(axis=1))
+    segments = np.empty((len(cut), 2, 3))
+    filled = np.zeros(len(cut), dtype=np.int64)
+    for i in range(3):
+        a, b = triangles[cut, i], triangles[cut, (i + 1) % 3]
+        crosses = above[a] != above[b]
+        fraction = height[a[crosses]] / (height[a[crosses]] - height[b[crosses]])
+        points = vertices[a[crosses]] + fraction[:, None] * (
+            vertices[b[crosses]] - vertices[a[crosses]]
+        )
+        rows = np.flatnonzero(crosses)
+        segments[rows, filled[rows]] = points
+        filled[rows] += 1
+    return segments, cut

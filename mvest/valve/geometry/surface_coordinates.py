@@ -1,0 +1,393 @@
+"""Smooth material coordinates of a leaflet surface that runs round from an annulus to a free edge.
+
+The surface of an atrioventricular valve at rest is a band: a triangulation with exactly two
+boundary loops. It carries two natural coordinates,
+
+* ``s``: 0 on the annulus, 1 on the free edge, harmonic in between (the temperature of a plate with
+  those two edge temperatures), and
+* ``theta``: the angle round the valve, harmonic with no flux through either edge, period 2 pi.
+
+Both solve Laplace's equation with the cotangent weights of linear triangles (Pinkall and Polthier
+1993, Exp. Math. 2:15). Together they map the band to a flat strip almost conformally once ``s`` is
+scaled by ``modulus``; ``exp`` of that strip is a plane annulus, in which a Delaunay triangulation
+recovers both edge loops because the points of a loop lie on one circle.
+
+Across an edge between obtuse triangles a cotangent weight is negative, and the map may fold over.
+Positive weights never let it (Gortler, Gotsman and Thurston 2006, Comput. Aided Geom. Des. 23:83);
+so round the triangles that fold over, small and negative weights are raised until none does, and
+the coordinates are harmonic but for those few edges.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from scipy.spatial import cKDTree
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import vertex_normals
+
+__all__ = [
+    "SurfaceCoordinates",
+    "boundary_loops",
+    "cotangent_laplacian",
+    "surface_coordinates",
+]
+
+SMALLEST_WEIGHT = 0.05
+"""To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
+0.58."""
+MOST_ROUNDS = 10
+"""How often they are raised, each time round the triangles that still fold over."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceCoordinates:
+    """Harmonic coordinates of a band and the directions that belong to them.
+
+    Attributes
+    ----------
+    triangles : ndarray
+        ``(m, 3)`` vertex indices.
+    theta : ndarray
+        ``(n,)`` rad in [0, 2 pi), angle round the valve.
+    s : ndarray
+        ``(n,)`` from 0 (annulus) to 1 (free edge).
+    modulus : float
+        Length of the strip for a width of 2 pi: ``(theta, modulus * s)`` is near conformal.
+    circumferential : ndarray
+        ``(n, 3)`` unit tangents parallel to the annulus (perpendicular to the gradient of ``s``).
+    """
+
+    triangles: IntArray
+    theta: FloatArray
+    s: FloatArray
+    modulus: float
+    circumferential: FloatArray
+
+    def strip_triangles(self) -> FloatArray:
+        """Corners ``(m, 3, 2)`` of all triangles in the strip, unwrapped about the first corner."""
+        theta = self.theta[self.triangles]
+        first = theta[:, :1]
+        theta = first + _wrap(theta - first)
+        return np.stack([theta, self.modulus * self.s[self.triangles]], axis=-1)
+
+    def folded(self) -> IntArray:
+        """Triangles ``(k,)`` that lie in the strip the other way round than most."""
+        area = _signed_area(self.strip_triangles())
+        return np.flatnonzero(area * np.sign(np.median(area)) <= 0)
+
+    def locate(self, theta: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangle and barycentric weights of points given by their coordinates.
+
+        Parameters
+        ----------
+        theta, s : ndarray
+            ``(k,)`` rad and 0..1.
+
+        Returns
+        -------
+        triangle : ndarray
+            ``(k,)``.
+        weights : ndarray
+            ``(k, 3)``, non-negative, each row sums to 1. A point outside the polygonal edge by
+            rounding or by its curvature is moved to the nearest triangle's boundary.
+        """
+        corners = self.strip_triangles()
+        points = np.column_stack([theta, self.modulus * np.asarray(s, dtype=float)])
+        return _locate_in_plane(corners, points, period=2 * np.pi)
+
+
+def boundary_loops(triangles: IntArray) -> list[IntArray]:
+    """Boundary loops of a triangulation, each in the direction of its triangles.
+
+    Raises
+    ------
+    GeometryError
+        If an edge has more than two triangles, or neighbours disagree in orientation, or a boundary
+        vertex has more than two boundary edges.
+    """
+    triangles = np.asarray(triangles)
+    directed = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    undirected = np.sort(directed, axis=1)
+    _, inverse, count = np.unique(undirected, axis=0, return_inverse=True, return_counts=True)
+    inverse = inverse.ravel()
+    if count.max() > 2:
+        bad = undirected[np.argmax(count[inverse])]
+        raise GeometryError(
+            f"surface is not a manifold: edge {bad.tolist()} belongs to {count.max()} triangles "
+            "(at most 2 expected)"
+        )
+    unique_directed = np.unique(directed, axis=0)
+    if len(unique_directed) < len(directed):
+        raise GeometryError(
+            f"{len(directed) - len(unique_directed)} edges are run through in the same direction "
+            "by both their triangles: orient all triangles alike"
+        )
+    boundary = directed[count[inverse] == 1]
+    following = dict(boundary.tolist())
+    if len(following) < len(boundary):
+        raise GeometryError("a boundary vertex has more than two boundary edges (two loops touch)")
+    loops = []
+    while following:
+        start = min(following)
+        loop = [start]
+        vertex = following.pop(start)
+        while vertex != start:
+            loop.append(vertex)
+            vertex = following.pop(vertex)
+        loops.append(np.array(loop, dtype=np.int64))
+    return loops
+
+
+def cotangent_laplacian(vertices: FloatArray, triangles: IntArray) -> sp.csr_matrix:
+    """Stiffness ``(n, n)`` of Laplace's equation for linear triangles (positive semidefinite)."""
+    corner = vertices[triangles]
+    rows, columns, values = [], [], []
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        a, b = corner[:, j] - corner[:, i], corner[:, k] - corner[:, i]
+        cot = np.einsum("ij,ij->i", a, b) / np.linalg.norm(np.cross(a, b), axis=1)
+        weight = 0.5 * cot
+        tj, tk = triangles[:, j], triangles[:, k]
+        rows += [tj, tk, tj, tk]
+        columns += [tk, tj, tj, tk]
+        values += [-weight, -weight, weight, weight]
+    n = len(vertices)
+    return sp.coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)
+    ).tocsr()
+
+
+def surface_coordinates(
+    vertices: FloatArray, triangles: IntArray, annulus: IntArray, free_edge: IntArray
+) -> SurfaceCoordinates:
+    """Solve for ``theta`` and ``s`` on a band.
+
+    Parameters
+    ----------
+    vertices : ndarray
+        ``(n, 3)`` mm.
+    triangles : ndarray
+        ``(m, 3)``.
+    annulus, free_edge : ndarray
+        Vertex indices of the two boundary loops, the annulus in loop order.
+
+    Raises
+    ------
+    GeometryError
+        If the two sets are not the two boundary loops, if the surface does not run once round the
+        annulus axis, or if the coordinates fold over.
+    """
+    vertices = np.asarray(vertices, dtype=float)
+    loops = boundary_loops(triangles)
+    sets = sorted(tuple(sorted(loop.tolist())) for loop in loops)
+    if sets != sorted([tuple(sorted(annulus.tolist())), tuple(sorted(free_edge.tolist()))]):
+        raise GeometryError(
+            f"annulus ({len(annulus)} vertices) and free edge ({len(free_edge)} vertices) must be "
+            f"the two boundary loops of the surface; it has loops of {[len(x) for x in loops]}"
+        )
+    flat = np.isin(triangles, annulus).all(axis=1) | np.isin(triangles, free_edge).all(axis=1)
+    if flat.any():
+        raise GeometryError(
+            f"triangle {int(np.argmax(flat))} has all three corners on one edge loop, so that no "
+            "coordinate varies in it: flip its inner edge"
+        )
+    laplacian = cotangent_laplacian(vertices, triangles)
+    coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
+    near = np.zeros(len(vertices), dtype=np.bool_)
+    for _ in range(MOST_ROUNDS):
+        folded = coordinates.folded()
+        if not folded.size:
+            return coordinates
+        near[triangles[folded]] = True
+        laplacian = _raised(laplacian, near)
+        coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
+    folded = coordinates.folded()
+    if folded.size:
+        raise GeometryError(
+            f"material coordinates fold over at {folded.size} triangles (first: "
+            f"{folded[:5].tolist()}): the surface is too distorted or its triangles too obtuse"
+        )
+    return coordinates
+
+
+def _solve(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: IntArray,
+    free_edge: IntArray,
+    laplacian: sp.csr_matrix,
+) -> SurfaceCoordinates:
+    s = _dirichlet(laplacian, annulus, free_edge)
+    return SurfaceCoordinates(
+        triangles=np.asarray(triangles, dtype=np.int64),
+        theta=_conjugate_angle(vertices, triangles, laplacian, annulus, free_edge),
+        s=s,
+        # s^T L s is the flux of s through the band, so 2 pi over it is the strip's length.
+        modulus=2 * np.pi / float(s @ (laplacian @ s)),
+        circumferential=_perpendicular_to_gradient(vertices, triangles, s),
+    )
+
+
+def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
+    """The same with no weight below the smallest one at the vertices ``near (n,)``."""
+    edges = sp.triu(laplacian, k=1).tocoo()
+    here = near[edges.row] | near[edges.col]
+    weight = np.where(here, np.maximum(-edges.data, SMALLEST_WEIGHT), -edges.data)
+    off = sp.coo_matrix((-weight, (edges.row, edges.col)), shape=laplacian.shape)
+    off = off + off.T
+    return (off - sp.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()
+
+
+def _dirichlet(laplacian: sp.csr_matrix, zero: IntArray, one: IntArray) -> FloatArray:
+    n = laplacian.shape[0]
+    value = np.zeros(n)
+    value[one] = 1.0
+    free = np.setdiff1d(np.arange(n), np.concatenate([zero, one]))
+    if free.size:
+        rhs = -(laplacian @ value)[free]
+        value[free] = spla.spsolve(laplacian[free][:, free].tocsc(), rhs)
+    return value
+
+
+def _conjugate_angle(
+    vertices: FloatArray,
+    triangles: IntArray,
+    laplacian: sp.csr_matrix,
+    annulus: IntArray,
+    free_edge: IntArray,
+) -> FloatArray:
+    """Harmonic angle with natural boundaries, that of vertex 0 being its angle about the axis.
+
+    A jump of 2 pi across a cut from edge to edge is a closed form of that period; subtracting the
+    gradient that makes it divergence-free leaves the harmonic one. The cut is one of the surface
+    and not of space: leaflets that have closed may lie across the axis.
+    """
+    row, column = _cut(triangles, annulus, free_edge).T
+    jump = 2 * np.pi * -np.asarray(laplacian[row, column]).ravel()
+    divergence = np.zeros(len(vertices))
+    np.add.at(divergence, row, jump)
+    np.add.at(divergence, column, -jump)
+    correction = np.zeros(len(vertices))
+    correction[1:] = spla.spsolve(laplacian[1:][:, 1:].tocsc(), divergence[1:])
+    return np.mod(_angle_of_first(vertices, annulus) + correction, 2 * np.pi)
+
+
+def _angle_of_first(vertices: FloatArray, annulus: IntArray) -> float:
+    """Angle of vertex 0 about the axis of the annulus, from the annulus' first vertex."""
+    loop = vertices[annulus]
+    centre = loop.mean(axis=0)
+    axis = np.cross(loop - centre, np.roll(loop, -1, axis=0) - centre).sum(axis=0)
+    axis /= np.linalg.norm(axis)
+    first = loop[0] - centre
+    first = first - axis * (first @ axis)
+    first /= np.linalg.norm(first)
+    relative = vertices[0] - centre
+    return float(np.arctan2(relative @ np.cross(axis, first), relative @ first))
+
+
+def _cut(triangles: IntArray, annulus: IntArray, free_edge: IntArray) -> IntArray:
+    """Edges ``(k, 2)`` across which a chain of triangles leads from the annulus to the free edge.
+
+    Each runs the way that the annulus runs.
+    """
+    corners = triangles.tolist()
+    owner = {(t[i - 1], t[i]): n for n, t in enumerate(corners) for i in range(3)}
+    rim = set(free_edge.tolist())
+    start = (int(annulus[0]), int(annulus[1]))
+    along = start in owner
+    start = start if along else start[::-1]
+    # Triangle -> the edge through which it was entered, as it runs in it.
+    entered = {owner[start]: start}
+    queue = deque(entered)
+    crossed: list[tuple[int, int]] = []
+    while queue and not crossed:
+        triangle = queue.popleft()
+        for i in range(3):
+            a, b = corners[triangle][i - 1], corners[triangle][i]
+            neighbour = owner.get((b, a))
+            if neighbour is None and a in rim and b in rim:
+                crossed = [(b, a), entered[triangle]]
+                break
+            if neighbour is not None and neighbour not in entered:
+                entered[neighbour] = (b, a)
+                queue.append(neighbour)
+    while crossed[-1] != start:
+        crossed.append(entered[owner[crossed[-1][::-1]]])
+    return np.array(crossed if along else [edge[::-1] for edge in crossed])
+
+
+def _perpendicular_to_gradient(
+    vertices: FloatArray, triangles: IntArray, s: FloatArray
+) -> FloatArray:
+    corner = vertices[triangles]
+    # Sum of s_i times the opposite edge is 2 A n x grad(s): already parallel to the level lines.
+    value = s[triangles]
+    along = sum(
+        value[:, i, None] * (corner[:, (i + 2) % 3] - corner[:, (i + 1) % 3]) for i in range(3)
+    )
+    direction = np.zeros_like(vertices)
+    for i in range(3):
+        np.add.at(direction, triangles[:, i], along)
+    n = vertex_normals(vertices, triangles)
+    direction -= n * np.einsum("ij,ij->i", direction, n)[:, None]
+    return _unit(direction)
+
+
+def _locate_in_plane(
+    corners: FloatArray, points: FloatArray, period: float
+) -> tuple[IntArray, FloatArray]:
+    centre = corners.mean(axis=1)
+    shift = np.array([period, 0.0])
+    tree = cKDTree(np.vstack([centre - shift, centre, centre + shift]))
+    m = len(centre)
+    triangle = np.zeros(len(points), dtype=np.int64)
+    weights = np.zeros((len(points), 3))
+    best = np.full(len(points), -np.inf)
+    for k in (12, min(60, 3 * m)):
+        todo = np.flatnonzero(best < -1e-9)
+        if not todo.size:
+            break
+        _, candidates = tree.query(points[todo], k=min(k, 3 * m))
+        for column in np.atleast_2d(candidates).T:
+            index = column % m
+            offset = (column // m - 1)[:, None] * shift
+            w = _barycentric(corners[index] + offset[:, None, :], points[todo])
+            worst = w.min(axis=1)
+            better = worst > best[todo]
+            rows = todo[better]
+            best[rows], triangle[rows], weights[rows] = worst[better], index[better], w[better]
+    if np.any(best < -0.5):
+        raise InputError(
+            f"{np.sum(best < -0.5)} points lie outside the surface (coordinate s must be in [0, 1])"
+        )
+    weights = np.maximum(weights, 0.0)
+    return triangle, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    r = point - corner[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    u = (r[:, 0] * b[:, 1] - r[:, 1] * b[:, 0]) / area
+    v = (a[:, 0] * r[:, 1] - a[:, 1] * r[:, 0]) / area
+    return np.column_stack([1 - u - v, u, v])
+
+
+def _signed_area(corner: FloatArray) -> FloatArray:
+    a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _wrap(angle: FloatArray) -> FloatArray:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

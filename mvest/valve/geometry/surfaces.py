@@ -1,0 +1,334 @@
+"""Triangulated surfaces: checks, normals, volume, and thickening a midsurface to a closed surface.
+
+Every fault of a surface is one `GeometryError` that begins with the fault's name and gives the
+numbers of the triangles, edges or vertices concerned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
+from mvest.valve.geometry.proximity import intersecting_triangles, surface_edges
+
+__all__ = [
+    "FACE_KINDS",
+    "ClosedSurface",
+    "check_surface",
+    "enclosed_volume",
+    "smooth_vertex_normals",
+    "thicken",
+]
+
+FACE_KINDS = ("ventricular", "atrial", "rim")
+"""What a triangle of a thickened leaflet bounds."""
+
+
+def _listed(numbers: IntArray, most: int = 8) -> str:
+    shown = ", ".join(str(int(i)) for i in numbers[:most])
+    return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > most else "")
+
+
+def check_surface(
+    vertices: FloatArray,
+    triangles: IntArray,
+    *,
+    closed: bool = False,
+    self_intersections: bool = True,
+    name: str = "surface",
+) -> None:
+    """Raise unless a triangulation is an orientable manifold surface in good order.
+
+    Parameters
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)`` vertex numbers.
+    closed
+        Also demand that it has no boundary and that its normals point outwards.
+    self_intersections
+        Also demand that no triangle passes through another.
+    name
+        What to call the surface in the message.
+
+    Raises
+    ------
+    GeometryError
+        wrong shape, not finite, no triangles, index out of range, degenerate triangle, duplicate
+        triangle, non-manifold edge, inconsistent orientation, non-manifold vertex, open surface,
+        inward normals, self-intersection: the first of these that is found.
+    """
+    points = np.asarray(vertices, dtype=np.float64)
+    faces = np.asarray(triangles)
+    _check_arrays(points, faces, name)
+    _check_triangles(points, faces, name)
+    _check_edges(faces, closed, name)
+    _check_vertex_fans(faces, name)
+    if closed and enclosed_volume(points, faces) <= 0:
+        raise GeometryError(
+            f"{name}: inward normals: the enclosed volume is {enclosed_volume(points, faces):.4g} "
+            f"mm^3, expected positive; reverse every triangle"
+        )
+    if self_intersections:
+        pairs = intersecting_triangles(points, faces)
+        if len(pairs):
+            raise GeometryError(
+                f"{name}: self-intersection: {len(pairs)} pairs of triangles pass through each "
+                f"other, among them {pairs[:5].tolist()}"
+            )
+
+
+def _check_arrays(points: FloatArray, faces: IntArray, name: str) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise GeometryError(f"{name}: wrong shape: vertices {points.shape}, expected (n, 3)")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise GeometryError(
+            f"{name}: wrong shape: triangles {faces.shape} of {faces.dtype}, expected (m, 3) "
+            f"integers"
+        )
+    if len(faces) == 0:
+        raise GeometryError(f"{name}: no triangles; expected at least one")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise GeometryError(f"{name}: not finite: vertices {_listed(bad)}; expected numbers in mm")
+    bad = np.flatnonzero(((faces < 0) | (faces >= len(points))).any(axis=1))
+    if len(bad):
+        raise GeometryError(
+            f"{name}: index out of range: triangles {_listed(bad)} name vertices outside 0 to "
+            f"{len(points) - 1}"
+        )
+
+
+def _check_triangles(points: FloatArray, faces: IntArray, name: str) -> None:
+    corners = points[faces]
+    sides = corners - np.roll(corners, 1, axis=1)
+    longest = np.linalg.norm(sides, axis=2).max(axis=1)
+    doubled_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    # Flat to a part in a million: its normal is then round-off.
+    bad = np.flatnonzero(doubled_area <= 1e-6 * longest**2)
+    if len(bad):
+        raise GeometryError(
+            f"{name}: degenerate triangle: triangles {_listed(bad)} have no area or repeat a "
+            f"vertex; remove them"
+        )
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    if (count > 1).any():
+        raise GeometryError(
+            f"{name}: duplicate triangle: triangles {_listed(first[count > 1])} occur again with "
+            f"the same three vertices; keep one of each"
+        )
+
+
+def _edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
+
+    Half-edge ``3 t + i`` runs from corner i of triangle t to the next.
+    """
+    half = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges, inverse, count = np.unique(
+        np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return half, edges, inverse.ravel(), count
+
+
+def _check_edges(faces: IntArray, closed: bool, name: str) -> None:
+    half, edges, inverse, count = _edge_table(faces)
+    if (count > 2).any():
+        bad = np.flatnonzero(count > 2)
+        owners = np.flatnonzero(np.isin(inverse, bad)) // 3
+        raise GeometryError(
+            f"{name}: non-manifold edge: {len(bad)} edges belong to more than two triangles, "
+            f"among them {edges[bad[:3]].tolist()} (triangles {_listed(np.unique(owners))})"
+        )
+    forward = np.bincount(inverse, half[:, 0] < half[:, 1], minlength=len(edges))
+    bad = np.flatnonzero((count == 2) & (forward != 1))
+    if len(bad):
+        owners = np.flatnonzero(np.isin(inverse, bad)) // 3
+        raise GeometryError(
+            f"{name}: inconsistent orientation: neighbours run the same way along {len(bad)} "
+            f"edges (triangles {_listed(np.unique(owners))}); orient all triangles alike"
+        )
+    if closed and (count == 1).any():
+        bad = np.flatnonzero(count == 1)
+        owners = np.flatnonzero(np.isin(inverse, bad)) // 3
+        raise GeometryError(
+            f"{name}: open surface: {len(bad)} boundary edges, at triangles "
+            f"{_listed(np.unique(owners))}; expected none"
+        )
+
+
+def _check_vertex_fans(faces: IntArray, name: str) -> None:
+    """Raise where the triangles round a vertex do not form one fan (two sheets meet in a point)."""
+    _, _, inverse, count = _edge_table(faces)
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(count)
+    second = order[ends[count == 2] - 1]
+    first = order[ends[count == 2] - 2]
+    # Corner 3 t + i is where half-edge 3 t + i starts; neighbours run along their edge oppositely.
+    after_first, after_second = _next_corner(first), _next_corner(second)
+    rows = np.concatenate([first, after_first])
+    columns = np.concatenate([after_second, second])
+    n = 3 * len(faces)
+    graph = sp.coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    fans = np.unique(np.column_stack([faces.ravel(), label]), axis=0)
+    vertex, number = np.unique(fans[:, 0], return_counts=True)
+    if (number > 1).any():
+        raise GeometryError(
+            f"{name}: non-manifold vertex: sheets touch only in vertices "
+            f"{_listed(vertex[number > 1])}; split or remove them"
+        )
+
+
+def _next_corner(corner: IntArray) -> IntArray:
+    return corner - corner % 3 + (corner + 1) % 3
+
+
+def enclosed_volume(vertices: FloatArray, triangles: IntArray) -> float:
+    """Volume (mm³) inside a closed surface, positive when its normals point outwards.
+
+    Divergence theorem over the tetrahedra of the triangles with the centre of the vertices.
+    """
+    points = np.asarray(vertices, dtype=np.float64)
+    a, b, c = np.moveaxis((points - points.mean(axis=0))[triangles], 1, 0)
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def smooth_vertex_normals(
+    vertices: FloatArray, triangles: IntArray, iterations: int = 10
+) -> FloatArray:
+    """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
+
+    Each iteration replaces a normal by the normalised mean of itself and the mean of its
+    neighbours. Thickening along raw normals makes triangles cross where a leaflet bends sharply,
+    at the commissures above all.
+
+    Raises
+    ------
+    GeometryError
+        A vertex without triangles, or where opposite normals cancel.
+    """
+    if iterations < 0:
+        raise GeometryError(f"normal smoothing: {iterations} iterations; expected 0 or more")
+    n = len(vertices)
+    unused = np.setdiff1d(np.arange(n), triangles)
+    if len(unused):
+        raise GeometryError(f"normals: vertices {_listed(unused)} belong to no triangle")
+    edges = surface_edges(np.asarray(triangles))
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacency = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    normals = vertex_normals(np.asarray(vertices, dtype=np.float64), np.asarray(triangles))
+    for _ in range(iterations):
+        mean = 0.5 * (normals + (adjacency @ normals) / degree[:, None])
+        length = np.linalg.norm(mean, axis=1)
+        bad = np.flatnonzero(~(length > 1e-6))
+        if len(bad):
+            raise GeometryError(f"normals: those round vertices {_listed(bad)} cancel each other")
+        normals = mean / length[:, None]
+    return normals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedSurface:
+    """Outer surface of thickened leaflets, outward normals.
+
+    Attributes
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    region
+        ``(m,)`` index into `region_names`.
+    region_names
+        Names of the leaflets.
+    kind
+        ``(m,)`` index into `FACE_KINDS`.
+
+    Raises
+    ------
+    GeometryError
+        The surface is not closed, manifold, outward and free of self-intersections, or labels are
+        missing or unknown.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray
+    region_names: tuple[str, ...]
+    kind: IntArray
+
+    def __post_init__(self) -> None:
+        check_surface(self.vertices, self.triangles, closed=True, name="closed surface")
+        for what, labels, known in (
+            ("region", self.region, self.region_names),
+            ("kind", self.kind, FACE_KINDS),
+        ):
+            labels = np.asarray(labels)
+            if labels.shape != (len(self.triangles),):
+                raise GeometryError(
+                    f"closed surface: {what} has shape {labels.shape}, expected "
+                    f"({len(self.triangles)},)"
+                )
+            bad = np.flatnonzero((labels < 0) | (labels >= len(known)))
+            if len(bad):
+                raise GeometryError(
+                    f"closed surface: unknown {what} at triangles {_listed(bad)}; known are "
+                    f"0 to {len(known) - 1} ({', '.join(known)})"
+                )
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume, mm³."""
+        return enclosed_volume(self.vertices, self.triangles)
+
+
+def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> ClosedSurface:
+    """Close a midsurface: offset both sides by half the thickness and stitch the rim.
+
+    Vertex ``i`` of the midsurface becomes vertices ``i`` (ventricular side, along the normal) and
+    ``i + n`` (atrial side). Every boundary edge, annulus and free edge alike, gives two rim
+    triangles.
+
+    Parameters
+    ----------
+    surface
+        Midsurface with thickness; normals towards the ventricle.
+    normals
+        ``(n, 3)`` unit offset directions; default `smooth_vertex_normals`.
+
+    Raises
+    ------
+    GeometryError
+        The midsurface is faulty, or the thickened one passes through itself (thickness larger than
+        the radius of curvature).
+    """
+    check_surface(surface.vertices, surface.triangles, name="midsurface")
+    if normals is None:
+        normals = smooth_vertex_normals(surface.vertices, surface.triangles)
+    n = len(surface.vertices)
+    offset = 0.5 * surface.thickness[:, None] * normals
+    half, _, inverse, count = _edge_table(surface.triangles)
+    boundary = np.flatnonzero(count[inverse] == 1)
+    a, b = half[boundary].T
+    rim = np.concatenate([np.column_stack([b, a, a + n]), np.column_stack([b, a + n, b + n])])
+    m = len(surface.triangles)
+    return ClosedSurface(
+        vertices=np.concatenate([surface.vertices + offset, surface.vertices - offset]),
+        triangles=np.concatenate([surface.triangles, surface.triangles[:, ::-1] + n, rim]),
+        region=np.concatenate(
+            [surface.region, surface.region, np.tile(surface.region[boundary // 3], 2)]
+        ),
+        region_names=surface.region_names,
+        kind=np.repeat(np.arange(3), [m, m, len(rim)]),
+    )

@@ -1,0 +1,395 @@
+"""Reading and writing surfaces and solid meshes: VTU, VTP, STL, OBJ, PLY, time series for ParaView.
+
+VTU, STL, OBJ and PLY go through meshio, VTP through `mvest.valve.io.vtp`. Coordinates are mm. A
+file appears under its name only once it is complete.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from mvest.errors import GeometryError, InputError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.io.vtp import PolyData, read_vtp, write_vtp
+
+__all__ = [
+    "SurfaceFile",
+    "cell_arrays",
+    "read_leaflets",
+    "read_mesh",
+    "read_surface",
+    "write_cells",
+    "write_leaflets",
+    "write_series",
+    "write_surface",
+]
+
+Data = Mapping[str, NDArray[np.generic]]
+"""Named arrays with one row per point or cell."""
+
+SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
+
+
+def _read_ply(name: str) -> meshio.Mesh:
+    """Read PLY with meshio, which would wait forever for the end of a header that is cut off."""
+    if not re.search(rb"^[ \t]*end_header[ \t\r]*$", Path(name).read_bytes(), re.MULTILINE):
+        raise ValueError("no end_header")
+    return meshio.ply.read(name)
+
+
+_READERS = {
+    ".vtu": meshio.vtu.read,
+    ".stl": meshio.stl.read,
+    ".obj": meshio.obj.read,
+    ".ply": _read_ply,
+}
+_WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
+"""Formats that are written without data."""
+REGION_PREFIX = "region."
+BINARY_PLY = " (properties of faces are read from text files only: write an ascii PLY, or VTP)"
+"""What meshio's reader of binary PLY files does not do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFile:
+    """A triangulated surface as it stands in a file.
+
+    Attributes
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    point_data, cell_data
+        Named arrays with n or m rows; empty for STL and OBJ.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    point_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+    cell_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+
+
+def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
+    result = Path(path)
+    _check_suffix(result, suffixes)
+    if not result.is_file():
+        raise InputError(f"{result}: no such file")
+    return result
+
+
+def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
+
+
+def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then give it that name.
+
+    Raises
+    ------
+    InputError
+        The folder does not exist or cannot be written.
+    """
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            write(temporary)
+            temporary.chmod(0o644)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be written: {fault.strerror or fault}") from fault
+
+
+def read_mesh(path: Path | str) -> meshio.Mesh:
+    """Read a VTU, STL, OBJ or PLY file with meshio; a fault of the file is an `InputError`."""
+    source = _input_path(path, tuple(_READERS))
+    try:
+        # meshio takes a text STL for a binary one first, and may overflow on its supposed size.
+        with np.errstate(over="ignore"):
+            mesh = _READERS[source.suffix.lower()](str(source))
+    except Exception as fault:  # meshio's readers fail in many ways on a damaged file
+        known = "" if source.suffix.lower() != ".ply" else BINARY_PLY
+        raise InputError(
+            f"{source}: damaged or no {source.suffix[1:].upper()} file: {fault}{known}"
+        ) from fault
+    if mesh.points.ndim != 2 or mesh.points.shape[1] != 3:
+        raise GeometryError(f"{source}: points of shape {mesh.points.shape}, expected (n, 3)")
+    bad = np.flatnonzero(~np.isfinite(mesh.points).all(axis=1))
+    if len(bad):
+        raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
+    return mesh
+
+
+def read_surface(path: Path | str) -> SurfaceFile:
+    """Read a triangulated surface with its data.
+
+    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surfaces`.
+
+    Raises
+    ------
+    InputError
+        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.stl``, ``.obj``,
+        ``.ply``.
+    GeometryError
+        No triangles, other cells, or points that are not finite.
+    """
+    source = _input_path(path, SURFACE_SUFFIXES)
+    if source.suffix.lower() == ".vtp":
+        found = read_vtp(source)
+        surface = SurfaceFile(found.points, found.triangles, found.point_data, found.cell_data)
+        bad = np.flatnonzero(~np.isfinite(surface.vertices).all(axis=1))
+        if len(bad):
+            raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
+    else:
+        mesh = read_mesh(source)
+        others = sorted({block.type for block in mesh.cells} - {"triangle"})
+        if others:
+            raise GeometryError(
+                f"{source}: holds cells of type {', '.join(others)}; expected triangles only"
+            )
+        blocks = [block.data for block in mesh.cells]
+        surface = SurfaceFile(
+            np.asarray(mesh.points, dtype=np.float64),
+            np.concatenate(blocks).astype(np.int64) if blocks else np.zeros((0, 3), np.int64),
+            dict(mesh.point_data),
+            {name: np.concatenate(v) for name, v in mesh.cell_data.items() if blocks},
+        )
+    if len(surface.triangles) == 0:
+        raise GeometryError(f"{source}: no triangles; expected a triangulated surface")
+    if surface.triangles.min() < 0 or surface.triangles.max() >= len(surface.vertices):
+        raise GeometryError(f"{source}: triangles name points that do not exist")
+    return surface
+
+
+def _checked_data(data: Data | None, rows: int, what: str) -> dict[str, NDArray[np.generic]]:
+    """Copy of `data` in types that the files can hold, after a check of the number of rows."""
+    result = {}
+    for name, values in (data or {}).items():
+        array = np.asarray(values)
+        if array.ndim not in (1, 2) or len(array) != rows:
+            raise InputError(
+                f"{what} data {name!r}: shape {array.shape}, expected ({rows},) or ({rows}, c)"
+            )
+        if array.dtype == bool:
+            array = array.astype(np.int8)
+        if array.dtype.kind not in "iuf":
+            raise InputError(f"{what} data {name!r}: type {array.dtype}, expected numbers")
+        result[name] = np.ascontiguousarray(array)
+    return result
+
+
+def write_surface(
+    path: Path | str,
+    vertices: FloatArray,
+    triangles: IntArray,
+    point_data: Data | None = None,
+    cell_data: Data | None = None,
+) -> Path:
+    """Write a triangulated surface; the extension chooses the format.
+
+    Raises
+    ------
+    InputError
+        Unknown extension, wrong shapes, data for a format that holds none here (STL, OBJ, PLY), or
+        a file that cannot be written.
+    """
+    target = Path(path)
+    _check_suffix(target, SURFACE_SUFFIXES)
+    points = np.ascontiguousarray(vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(triangles, dtype=np.int64)
+    _check_cells(points, faces, 3, str(target))
+    at_points = _checked_data(point_data, len(points), "point")
+    at_cells = _checked_data(cell_data, len(faces), "cell")
+    suffix = target.suffix.lower()
+    if suffix in _WRITERS:
+        if at_points or at_cells:
+            raise InputError(f"{target}: {suffix[1:].upper()} holds no data; write .vtu or .vtp")
+        # PLY knows no 64-bit integers.
+        mesh = meshio.Mesh(points, [("triangle", faces.astype(np.int32))])
+        write_whole(target, lambda file: _WRITERS[suffix](str(file), mesh))
+    elif suffix == ".vtp":
+        content = PolyData(points, faces, at_points, at_cells)
+        write_whole(target, lambda file: write_vtp(file, content))
+    else:
+        write_cells(target, points, [("triangle", faces)], at_points, cell_arrays([at_cells]))
+    return target
+
+
+def _check_cells(points: FloatArray, cells: IntArray, width: int, name: str) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name}: points of shape {points.shape}, expected (n, 3)")
+    if not np.isfinite(points).all():
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        raise GeometryError(f"{name}: points {bad[:5].tolist()} are not finite numbers")
+    if cells.ndim != 2 or cells.shape[1] != width or len(cells) == 0:
+        raise InputError(f"{name}: cells of shape {cells.shape}, expected (m, {width}) with m > 0")
+    if cells.min() < 0 or cells.max() >= len(points):
+        raise InputError(f"{name}: cells name points outside 0 to {len(points) - 1}")
+
+
+def cell_arrays(blocks: list[dict[str, NDArray[np.generic]]]) -> dict[str, list[Any]]:
+    """Cell data of several blocks, each with the same names, as meshio wants them."""
+    return {name: [block[name] for block in blocks] for name in blocks[0]}
+
+
+def write_cells(
+    path: Path,
+    points: FloatArray,
+    cells: list[tuple[str, IntArray]],
+    point_data: Data,
+    cell_data: Mapping[str, list[Any]],
+) -> None:
+    """Write blocks of cells (in VTK's node order) as compressed VTU."""
+    mesh = meshio.Mesh(points, cells, point_data=dict(point_data), cell_data=dict(cell_data))
+    write_whole(
+        path, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
+    )
+
+
+def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
+    """Cell data that carry the labels and, as one indicator per region, their names in order."""
+    result: dict[str, NDArray[np.generic]] = {"region": region}
+    for number, name in enumerate(names):
+        result[REGION_PREFIX + name] = (region == number).astype(np.int8)
+    return result
+
+
+def region_names(cell_data: Mapping[str, Any], path: Path) -> tuple[str, ...]:
+    """Names of the regions, in order, from the indicators that `region_arrays` wrote."""
+    names = tuple(
+        name.removeprefix(REGION_PREFIX) for name in cell_data if name.startswith(REGION_PREFIX)
+    )
+    if not names:
+        raise InputError(
+            f"{path}: no cell data {REGION_PREFIX}NAME; expected one indicator for every region"
+        )
+    return names
+
+
+def write_leaflets(
+    path: Path | str, surface: LeafletSurface, point_data: Data | None = None
+) -> Path:
+    """Write a midsurface with regions, fibres and thickness as ``.vtu`` or ``.vtp``."""
+    _check_suffix(Path(path), (".vtu", ".vtp"))
+    return write_surface(
+        path,
+        surface.vertices,
+        surface.triangles,
+        {"fibre": surface.fibre, "thickness": surface.thickness, **(point_data or {})},
+        region_arrays(surface.region, surface.region_names),
+    )
+
+
+def read_leaflets(path: Path | str) -> LeafletSurface:
+    """Read what `write_leaflets` wrote, or any file with the same data.
+
+    Expected are the point data ``fibre`` (three components) and ``thickness`` (mm), and the cell
+    data ``region`` with an indicator ``region.NAME`` for every region, in the order of the labels.
+
+    Raises
+    ------
+    InputError, GeometryError
+        As `read_surface`, data that are missing, or an inadmissible midsurface.
+    """
+    source = _input_path(path, (".vtu", ".vtp"))
+    found = read_surface(source)
+    for name, data in (
+        ("fibre", found.point_data),
+        ("thickness", found.point_data),
+        ("region", found.cell_data),
+    ):
+        if name not in data:
+            kind = "cell" if name == "region" else "point"
+            raise InputError(
+                f"{source}: no {kind} data {name!r}; found {', '.join(data) or 'none'}"
+            )
+    try:
+        return LeafletSurface(
+            vertices=found.vertices,
+            triangles=found.triangles,
+            region=found.cell_data["region"].astype(np.int64),
+            region_names=region_names(found.cell_data, source),
+            fibre=found.point_data["fibre"].astype(np.float64),
+            thickness=found.point_data["thickness"].astype(np.float64),
+        )
+    except InputError as fault:
+        raise type(fault)(f"{source}: {fault}") from fault
+
+
+def write_series(
+    path: Path | str,
+    times: FloatArray,
+    positions: FloatArray,
+    cells: list[tuple[str, IntArray]],
+    point_data: Data | None = None,
+    cell_data: Mapping[str, list[Any]] | None = None,
+) -> Path:
+    """Write deformed states for ParaView: one VTU per state, and an index of their times.
+
+    The states ``NAME_0000.vtu``, ``NAME_0001.vtu``, ... lie beside the index ``NAME.pvd``, which
+    is written last. Each carries its ``displacement`` (mm) from the first state.
+
+    Parameters
+    ----------
+    path
+        The index, ``.pvd``.
+    times
+        ``(f,)`` s, increasing.
+    positions
+        ``(f, n, 3)`` mm.
+    cells
+        Blocks of cells in VTK's node order, such as ``[("triangle", triangles)]``; for a solid
+        mesh those of `mvest.valve.io.solid_files.vtk_cells`.
+    point_data
+        Named arrays ``(f, n)`` or ``(f, n, c)``.
+    cell_data
+        As in `write_cells`, the same for all states.
+    """
+    index = Path(path)
+    _check_suffix(index, (".pvd",))
+    times = np.asarray(times, dtype=np.float64)
+    frames = np.asarray(positions, dtype=np.float64)
+    if frames.ndim != 3 or frames.shape[2] != 3 or times.shape != frames.shape[:1]:
+        raise InputError(
+            f"{index}: positions {frames.shape} and times {times.shape}, expected (f, n, 3) and "
+            f"(f,)"
+        )
+    if len(times) == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(f"{index}: times must be finite, increasing, at least one")
+    for name, values in (point_data or {}).items():
+        if np.shape(values)[:2] != frames.shape[:2]:
+            raise InputError(
+                f"{index}: point data {name!r} has shape {np.shape(values)}, expected "
+                f"{frames.shape[:2]} first"
+            )
+    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ET.SubElement(root, "Collection")
+    for number, time in enumerate(times):
+        state = index.with_name(f"{index.stem}_{number:04d}.vtu")
+        for _, block in cells:
+            _check_cells(frames[number], np.asarray(block), np.shape(block)[1], str(state))
+        data = {name: values[number] for name, values in (point_data or {}).items()}
+        data["displacement"] = frames[number] - frames[0]
+        checked = _checked_data(data, frames.shape[1], "point")
+        write_cells(state, frames[number], cells, checked, cell_data or {})
+        ET.SubElement(collection, "DataSet", timestep=repr(float(time)), file=state.name)
+    tree = ET.ElementTree(root)
+    write_whole(index, lambda file: tree.write(file, xml_declaration=True, encoding="utf-8"))
+    return index

@@ -1,0 +1,1 @@
+"""Measures of a valve: annulus, orifice, coaptation, tenting, gaps and leaks."""

@@ -1,0 +1,288 @@
+"""How far a valve is closed: orifice in the line of sight, coaptation length and area.
+
+Surfaces are leaflet midsurfaces in their current shape; a distance between two midsurfaces that
+touch equals the mean leaflet thickness, so give contact distances that include it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.proximity import closest_points, plane_section
+from mvest.valve.measure.annulus import AnnulusPlane
+
+BoolArray: TypeAlias = NDArray[np.bool_]
+MAX_PIXELS = 50_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LeafletProjection:
+    """Leaflets seen from the atrium along the annulus normal, as an image.
+
+    Attributes
+    ----------
+    anterior, lateral
+        ``(rows,)`` and ``(columns,)`` mm, pixel centres along those two directions.
+    inside
+        ``(rows, columns)`` pixels inside the projected annulus.
+    depth
+        ``(rows, columns)`` mm below the annulus plane of the first leaflet surface seen from the
+        atrium; infinite where the view is open.
+    """
+
+    anterior: FloatArray
+    lateral: FloatArray
+    inside: BoolArray
+    depth: FloatArray
+
+
+@njit(cache=True)
+def _rasterise(
+    points: FloatArray,
+    triangles: IntArray,
+    x0: float,
+    y0: float,
+    step: float,
+    depth: FloatArray,
+) -> None:
+    """Lower `depth` to the height of every triangle over the pixel centres it covers."""
+    rows, columns = depth.shape
+    for t in range(triangles.shape[0]):
+        a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0.0:
+            continue
+        first_row = max(int(np.floor((min(a[0], b[0], c[0]) - x0) / step)), 0)
+        last_row = min(int(np.ceil((max(a[0], b[0], c[0]) - x0) / step)), rows - 1)
+        first_column = max(int(np.floor((min(a[1], b[1], c[1]) - y0) / step)), 0)
+        last_column = min(int(np.ceil((max(a[1], b[1], c[1]) - y0) / step)), columns - 1)
+        for i in range(first_row, last_row + 1):
+            x = x0 + i * step
+            for j in range(first_column, last_column + 1):
+                y = y0 + j * step
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                w = 1.0 - u - v
+                if u >= -1e-9 and v >= -1e-9 and w >= -1e-9:
+                    z = u * a[2] + v * b[2] + w * c[2]
+                    if z < depth[i, j]:
+                        depth[i, j] = z
+
+
+@njit(cache=True)
+def _inside_polygon(polygon: FloatArray, x: FloatArray, y: FloatArray) -> BoolArray:
+    """Even-odd rule for the grid of points ``(x[i], y[j])``."""
+    inside = np.zeros((x.size, y.size), dtype=np.bool_)
+    n = polygon.shape[0]
+    for i in range(x.size):
+        for k in range(n):
+            a, b = polygon[k], polygon[(k + 1) % n]
+            if (a[0] > x[i]) != (b[0] > x[i]):
+                crossing = a[1] + (x[i] - a[0]) / (b[0] - a[0]) * (b[1] - a[1])
+                for j in range(y.size):
+                    if y[j] < crossing:
+                        inside[i, j] = not inside[i, j]
+    return inside
+
+
+def project_leaflets(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    resolution: float = 0.1,
+) -> LeafletProjection:
+    """Rasterise the leaflets inside the annulus, seen along the annulus normal.
+
+    Parameters
+    ----------
+    vertices, triangles
+        Leaflets in their current shape, ``(n, 3)`` mm and ``(m, 3)``.
+    annulus
+        ``(k, 3)`` mm in loop order.
+    plane
+        Plane of that annulus; its normal is the line of sight.
+    resolution
+        Pixel size, mm.
+
+    Raises
+    ------
+    GeometryError
+        Pixel size not positive or so small that the image has more than 50 million pixels.
+    """
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise GeometryError(f"resolution = {resolution} mm; give a positive pixel size")
+    outline = plane.coordinates(annulus)
+    low, high = outline[:, :2].min(axis=0), outline[:, :2].max(axis=0)
+    # Pixel centres lie symmetrically about the middle plane, one of them on it.
+    first = np.floor(low / resolution).astype(np.int64)
+    last = np.ceil(high / resolution).astype(np.int64)
+    if float(np.prod((last - first + 1).astype(np.float64))) > MAX_PIXELS:
+        raise GeometryError(f"resolution = {resolution} mm gives over {MAX_PIXELS} pixels")
+    x = np.arange(first[0], last[0] + 1) * resolution
+    y = np.arange(first[1], last[1] + 1) * resolution
+    depth = np.full((len(x), len(y)), np.inf)
+    _rasterise(
+        plane.coordinates(vertices), np.asarray(triangles, np.int64), x[0], y[0], resolution, depth
+    )
+    return LeafletProjection(x, y, _inside_polygon(outline[:, :2].copy(), x, y), depth)
+
+
+def orifice_area(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    resolution: float = 0.1,
+) -> float:
+    """Orifice area (mm²) in the line of sight from the atrium.
+
+    The part of the projected annulus that no leaflet triangle covers, counted in pixels of
+    `resolution` (mm) looking along the annulus normal. An oblique gap between overlapping leaflets
+    is not seen; `mvest.valve.measure.passing_ball` finds that one.
+    """
+    image = project_leaflets(vertices, triangles, annulus, plane, resolution)
+    return float((image.inside & np.isinf(image.depth)).sum() * resolution**2)
+
+
+def _normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
+    corners = vertices[triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+
+
+def _contact_fraction(
+    points: FloatArray,
+    normals: FloatArray,
+    vertices: FloatArray,
+    opposing: IntArray,
+    contact_distance: float,
+) -> BoolArray:
+    """Say which points lie within the contact distance of an opposing, facing leaflet."""
+    corners = vertices[opposing]
+    centroids = corners.mean(axis=1)
+    # Nothing of a triangle is farther from its centroid than its corners are.
+    reach = contact_distance + float(np.linalg.norm(corners - centroids[:, None], axis=2).max())
+    gap = cKDTree(centroids).query(points, distance_upper_bound=reach * (1 + 1e-9))[0]
+    near = np.asarray(np.isfinite(gap))
+    candidate = np.flatnonzero(near)
+    closest = closest_points(points[candidate], vertices, opposing)
+    other = _normals(vertices, opposing)[closest.triangle]
+    facing = (normals[candidate] * other).sum(axis=1) < 0
+    near[candidate] = (closest.distance <= contact_distance) & facing
+    return near
+
+
+@dataclass(frozen=True, slots=True)
+class CoaptationLength:
+    """Coaptation in one plane section, mm, measured on either leaflet's own profile."""
+
+    first: float
+    second: float
+
+    @property
+    def length(self) -> float:
+        """The smaller of the two, mm: an excess of one leaflet does not count."""
+        return min(self.first, self.second)
+
+
+def coaptation_length(
+    vertices: FloatArray,
+    first: IntArray,
+    second: IntArray,
+    plane: AnnulusPlane,
+    contact_distance: float,
+    offset: float = 0.0,
+    sampling: float = 0.02,
+) -> CoaptationLength:
+    """Length over which two leaflets lie against each other in a plane along the AP direction.
+
+    Each leaflet is cut by the plane through the annulus centre (shifted by `offset` along the
+    commissures) spanned by annulus normal and anterior direction. Counted is the arc length of its
+    section whose points lie within `contact_distance` of the other leaflet (anywhere, not only in
+    the plane) where the two face each other (surface normals more than 90° apart).
+
+    Parameters
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    first, second
+        ``(m1, 3)`` and ``(m2, 3)`` triangles of the two leaflets, oriented alike (both towards
+        the ventricle).
+    contact_distance
+        mm between midsurfaces: about the thickness plus the contact model's gap.
+    offset
+        mm along the commissural direction; 0 is the middle.
+    sampling
+        mm between the points tested along a section; the answer is that fine.
+    """
+    if not (np.isfinite(contact_distance) and contact_distance > 0):
+        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
+    origin = plane.origin + offset * plane.lateral
+    lengths = []
+    for own, other in ((first, second), (second, first)):
+        segments, triangle = plane_section(vertices, own, origin, plane.lateral)
+        if len(segments) == 0 or len(other) == 0:
+            lengths.append(0.0)
+            continue
+        size = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+        pieces = np.maximum(np.ceil(size / sampling), 1).astype(np.int64)
+        owner = np.repeat(np.arange(len(segments)), pieces)
+        position = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        fraction = ((position + 0.5) / pieces[owner])[:, None]
+        points = segments[owner, 0] * (1 - fraction) + segments[owner, 1] * fraction
+        near = _contact_fraction(
+            points, _normals(vertices, own)[triangle[owner]], vertices, other, contact_distance
+        )
+        lengths.append(float((size / pieces)[owner][near].sum()))
+    return CoaptationLength(lengths[0], lengths[1])
+
+
+def coaptation_area(
+    vertices: FloatArray,
+    first: IntArray,
+    second: IntArray,
+    contact_distance: float,
+    subdivisions: int = 3,
+) -> float:
+    """Area (mm²) over which two leaflets lie against each other.
+
+    Mean of the two leaflets' own areas within `contact_distance` of the other and facing it, each
+    triangle counted by ``subdivisions²`` equal parts. Parameters as in `coaptation_length`.
+    """
+    if not (np.isfinite(contact_distance) and contact_distance > 0):
+        raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
+    weights = _part_centroids(subdivisions)
+    areas = []
+    for own, other in ((first, second), (second, first)):
+        if len(own) == 0 or len(other) == 0:
+            areas.append(0.0)
+            continue
+        corners = vertices[own]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        points = np.einsum("qk,mkd->mqd", weights, corners).reshape(-1, 3)
+        normals = np.repeat(_normals(vertices, own), len(weights), axis=0)
+        near = _contact_fraction(points, normals, vertices, other, contact_distance)
+        part = np.repeat(0.5 * np.linalg.norm(cross, axis=1) / len(weights), len(weights))
+        areas.append(float(part[near].sum()))
+    return 0.5 * (areas[0] + areas[1])
+
+
+def _part_centroids(n: int) -> FloatArray:
+    """Barycentric centroids ``(n², 3)`` of a triangle cut into n² equal ones."""
+    centroids = []
+    for i in range(n):
+        for j in range(n - i):
+            centroids.append(((i + 1 / 3) / n, (j + 1 / 3) / n))
+            if i + j < n - 1:
+                centroids.append(((i + 2 / 3) / n, (j + 2 / 3) / n))
+    uv = np.array(centroids)
+    return np.column_stack([1 - uv.sum(axis=1), uv])

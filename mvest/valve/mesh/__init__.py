@@ -1,0 +1,1 @@
+"""Solid meshes of leaflets: layers, tetrahedra, quality, material points."""

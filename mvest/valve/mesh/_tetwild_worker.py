@@ -1,0 +1,31 @@
+"""Run fTetWild on one surface, in a process of its own: it may crash without a Python exception.
+
+Started by `mvest.valve.mesh.tetrahedralize` as ``python _tetwild_worker.py INPUT.npz OUTPUT.npz``,
+in a temporary folder because fTetWild writes files of its own into the current one.
+"""
+
+import sys
+
+import numpy as np
+from pytetwild.pytetwild import tetrahedralize
+
+
+def main(source: str, target: str) -> None:
+    """Read surface and settings from `source` (npz), write nodes and tetrahedra to `target`."""
+    with np.load(source, allow_pickle=False) as data:
+        nodes, tetrahedra = tetrahedralize(
+            data["vertices"],
+            data["triangles"].astype(np.int32),
+            edge_length_fac=float(data["edge_length_fraction"]),
+            epsilon=float(data["envelope_fraction"]),
+            stop_energy=float(data["stop_energy"]),
+            num_opt_iter=int(data["iterations"]),
+            coarsen=bool(data["coarsen"]),
+            num_threads=1,
+            quiet=True,
+        )
+    np.savez(target, nodes=np.asarray(nodes, float), tetrahedra=np.asarray(tetrahedra, np.int64))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2])

@@ -1,0 +1,200 @@
+"""From a valve in images to a case: the frames chosen, what is derived, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvest.cases.case import Role
+from mvest.cases.folder import read_case
+from mvest.cases.from_images import (
+    CaseFrames,
+    CaseTexts,
+    case_of_sequence,
+    choose_frames,
+    measure_sequence,
+    samples_in_world,
+    valve_axes,
+    without_mean_error,
+)
+from mvest.cases.writer import write_case
+from mvest.errors import GeometryError, InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.sequence import ValveSequence
+from mvest.valve.anatomy.template import Template
+from tests.cases.folders import closing
+from tests.cases.test_folder import assert_equal
+
+LAYOUT = ValveLayout(32, 9)
+TEXTS = CaseTexts("imaged", "a valve from images", "made up", "MIT", True)
+FRAMES = CaseFrames(0, 2, 118.0, {3: 80.0})
+TURN = Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix()
+
+
+HERE = np.eye(3)
+
+
+def sequence(turn=HERE, origin=(0.0, 0.0, 0.0)):
+    valve = Template().valve(32, 9)
+    x = valve.surface.vertices
+    shapes = np.stack([closing(x, share) for share in (0.0, 0.5, 1.0, 0.9)])
+    tips = np.repeat(valve.papillary_tips[None], 4, axis=0)
+    return ValveSequence(
+        LAYOUT,
+        np.array([0.0, 0.04, 0.1, 0.14]),
+        shapes @ turn.T + origin,
+        tips @ turn.T + origin,
+        np.array([0.9, 0.8, 0.85, 0.9]),
+        np.ones((4, LAYOUT.size)),
+        np.linspace(0.4, 0.8, LAYOUT.size),
+        9.0,
+    )
+
+
+def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_path):
+    case = case_of_sequence(sequence(), FRAMES, TEXTS)
+    assert [(f.name, f.role, f.pressure_mmHg) for f in case.frames] == [
+        ("open", Role.REFERENCE, 0.0),
+        ("closed", Role.CLOSED, 118.0),
+        ("frame_3", Role.HELD_OUT, 80.0),
+    ]
+    assert all(frame.corresponds for frame in case.frames)
+    assert case.chordae_follow
+    assert len(case.chordae) == 34
+    np.testing.assert_array_equal(case.uncertainty.std_mm, sequence().std_mm)
+    assert_equal(read_case(write_case(tmp_path / "case", case)), case, "sha256", "derived")
+
+
+def test_a_case_does_not_depend_on_how_the_patient_lies():
+    origin = np.array([30.0, -80.0, 12.0])
+    here = case_of_sequence(sequence(), FRAMES, TEXTS)
+    there = case_of_sequence(sequence(TURN, origin), FRAMES, TEXTS)
+    np.testing.assert_allclose(there.surface.fibre, here.surface.fibre @ TURN.T, atol=1e-9)
+    np.testing.assert_allclose(there.chordae.rest_length, here.chordae.rest_length, rtol=1e-9)
+    np.testing.assert_array_equal(there.chordae.tip, here.chordae.tip)
+    assert there.derived == here.derived
+
+
+def test_what_was_seen_last_may_be_the_open_valve():
+    case = case_of_sequence(sequence(), CaseFrames(3, 2, 100.0), TEXTS)
+    assert [frame.role for frame in case.frames] == [Role.CLOSED, Role.REFERENCE]
+    np.testing.assert_array_equal(case.surface.vertices, sequence().vertices[3])
+
+
+def test_frames_are_chosen_by_orifice_and_contact_among_those_that_are_sure():
+    seen = sequence()
+    rows = measure_sequence(seen, 1.3)
+    orifice = [row["orifice_mm2"] for row in rows]
+    found = choose_frames(seen, rows, 120.0)
+    assert found.open == int(np.argmax(orifice)) == 0
+    assert found.closed not in (0, 1)
+    assert len(found.derived) == 2
+    assert all(str(n) in text for n, text in zip((found.closed, 0), found.derived, strict=True))
+    # Frames that no one believes in are not chosen, whatever they show.
+    unsure = replace(seen, frame_confidence=np.array([0.3, 0.8, 0.85, 0.9]))
+    assert choose_frames(unsure, rows, 120.0).open == 1
+    told = choose_frames(seen, rows, 120.0, open_=1, closed=3)
+    assert (told.open, told.closed, told.derived) == (1, 3, ())
+    with pytest.raises(InputError, match=r"0 of 4 frames .*landmarks by hand"):
+        choose_frames(replace(seen, frame_confidence=np.full(4, 0.2)), rows, 120.0)
+    with pytest.raises(InputError, match="closed frame 4, expected one of 0 to 3"):
+        choose_frames(seen, rows, 120.0, closed=4)
+
+
+def test_axes_are_those_of_a_moving_valve():
+    np.testing.assert_allclose(valve_axes(sequence(), 0), np.eye(3), atol=0.05)
+    turned = valve_axes(sequence(TURN), 0)
+    np.testing.assert_allclose(turned, TURN @ valve_axes(sequence(), 0), atol=1e-9)
+    assert np.linalg.det(turned) == pytest.approx(1.0)
+
+
+def test_errors_become_displacements_back_to_where_it_may_have_been():
+    errors = np.zeros((4, 2, LAYOUT.size, 3))
+    errors[1, 0, :, 2] = 0.7  # found towards the atrium, in the open frame
+    tips = np.zeros((4, 2, 2, 3))
+    tips[2, 1, 0, 0] = 1.5
+    seen = sequence(TURN)
+    found = samples_in_world(seen, FRAMES, errors, tips)
+    assert found.vertices.shape == (4, 3, LAYOUT.size, 3)
+    atrium = valve_axes(seen, 0)[:, 2]
+    np.testing.assert_allclose(found.vertices[1, 0], np.tile(-0.7 * atrium, (LAYOUT.size, 1)))
+    # Held-out frames err as the closed one does, which they are like.
+    across = valve_axes(seen, 2)[:, 0]
+    np.testing.assert_allclose(found.tips[2, 1, 0], -1.5 * across)
+    assert np.linalg.norm(found.tips[2, 2, 0]) == pytest.approx(1.5)
+    case = case_of_sequence(seen, FRAMES, TEXTS, error_samples=found)
+    assert case.error_samples is found
+    with pytest.raises(InputError, match="errors of shape"):
+        samples_in_world(seen, FRAMES, errors[:, :, :5], tips)
+
+
+def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
+    # A bias that is left in, taken off twice (valve and samples), or in the world's axes.
+    rng = np.random.default_rng(3)
+    bias, tip_bias = rng.normal(size=(2, LAYOUT.size, 3)), rng.normal(size=(2, 2, 3))
+    spread = rng.normal(size=(6, 2, LAYOUT.size, 3))
+    spread -= spread.mean(axis=0)
+    tip_spread = rng.normal(size=(6, 2, 2, 3))
+    tip_spread -= tip_spread.mean(axis=0)
+    seen = sequence(TURN)
+    found, errors, tips = without_mean_error(seen, FRAMES, bias + spread, tip_bias + tip_spread)
+    for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
+        axes = valve_axes(seen, number)
+        off = (seen.vertices[number] - found.vertices[number]) @ axes
+        np.testing.assert_allclose(off, bias[which], atol=1e-9)
+        off = (seen.tips[number] - found.tips[number]) @ axes
+        np.testing.assert_allclose(off, tip_bias[which], atol=1e-9)
+    np.testing.assert_allclose(errors, np.sqrt(7 / 5) * spread, atol=1e-9)
+    np.testing.assert_allclose(tips, np.sqrt(7 / 5) * tip_spread, atol=1e-9)
+    untouched = set(range(len(seen.times))) - set(FRAMES.in_order)
+    for number in untouched:
+        np.testing.assert_array_equal(found.vertices[number], seen.vertices[number])
+    with pytest.raises(InputError, match="errors of 1 valves"):
+        without_mean_error(seen, FRAMES, bias[None], tip_bias[None])
+
+
+def test_vertices_that_were_never_measured_have_no_weight():
+    seen = sequence()
+    std = np.array(seen.std_mm)
+    std[3:7] = np.nan
+    case = case_of_sequence(replace(seen, std_mm=std), FRAMES, TEXTS)
+    np.testing.assert_array_equal(case.uncertainty.std_mm[3:7], 10.0)
+    assert any("4 vertices whose error was never measured" in text for text in case.derived)
+    with pytest.raises(InputError, match="no vertex has a standard deviation"):
+        case_of_sequence(replace(seen, std_mm=np.full(LAYOUT.size, np.nan)), FRAMES, TEXTS)
+
+
+def broken(change, frame=0):
+    seen = sequence()
+    vertices = np.array(seen.vertices)
+    change(vertices[frame])
+    return replace(seen, vertices=vertices)
+
+
+def fold(x):
+    x[LAYOUT.vertex(90.0, 4)] = x[LAYOUT.vertex(270.0, 4)] + [0.0, -4.0, 0.0]
+
+
+def spoil(x):
+    x[5] = np.nan
+
+
+def test_a_surface_that_is_no_valve_is_refused_with_its_frame():
+    with pytest.raises(GeometryError, match="open frame 0: "):
+        case_of_sequence(broken(fold), FRAMES, TEXTS)
+    with pytest.raises(GeometryError, match="closed frame 2: a position is not finite"):
+        case_of_sequence(broken(spoil, 2), FRAMES, TEXTS)
+    seen = sequence()
+    above = replace(seen, tips=seen.tips + np.array([0.0, 0.0, 60.0]))
+    with pytest.raises(GeometryError, match=r"open frame 0: tip 0 .* above the annulus"):
+        case_of_sequence(above, FRAMES, TEXTS)
+
+
+def test_frames_and_pressures_that_are_none_are_refused():
+    with pytest.raises(InputError, match="not all different"):
+        CaseFrames(1, 1, 100.0)
+    with pytest.raises(InputError, match=r"pressure of frame 2 = 16.0 mmHg"):
+        CaseFrames(0, 2, 16.0)
+    with pytest.raises(InputError, match="thickness of anterior, expected of anterior, posterior"):
+        case_of_sequence(sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 1.3})

@@ -1,0 +1,113 @@
+"""Measures of every frame, and the tables that hold them."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from mvest.cases.from_images import (
+    closed_frame,
+    contact_distance,
+    measure_meaning,
+    measure_sequence,
+    write_measures,
+)
+from mvest.errors import InputError
+from mvest.imaging.layout import ValveLayout
+from tests import made_up_sequence
+
+SMALL = ValveLayout(32, 9)
+
+
+@pytest.fixture(scope="module")
+def valve():
+    return made_up_sequence.sequence((1.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def rows(valve):
+    return measure_sequence(valve, 1.0)
+
+
+def test_the_closed_frame_has_all_and_the_open_one_no_tenting(rows):
+    closed, opened = rows
+    assert closed.keys() == opened.keys()
+    assert [name for name, value in closed.items() if value is None] == []
+    missing = {name for name, value in opened.items() if value is None}
+    assert missing == {
+        f"{what}_{part}"
+        for what in ("tenting", "prolapse", "billow")
+        for part in ("height_mm", "volume_mm3")
+    }
+    assert (closed["frame"], opened["frame"]) == (0, 1)
+    assert opened["time_s"] == pytest.approx(0.04)
+    assert closed["confidence"] == 0.9
+    assert closed["vertex_confidence_mean"] == pytest.approx(0.8)
+    assert opened["orifice_mm2"] > 100 > closed["orifice_mm2"]
+    # The annulus stands still, the tips come 0.8 mm nearer.
+    assert closed["annulus_area_mm2"] == pytest.approx(opened["annulus_area_mm2"])
+    assert opened["tip_0_depth_mm"] - closed["tip_0_depth_mm"] == pytest.approx(0.8, abs=0.02)
+    assert closed["coaptation_length_mm"] == pytest.approx(made_up_sequence.COAPTATION, abs=1.0)
+    assert opened["coaptation_length_mm"] == 0.0
+
+
+def test_leaflets_touch_within_their_thickness_and_their_error(valve):
+    one = dataclasses.replace(valve, std_mm=np.full(valve.layout.size, 0.3))
+    assert contact_distance(one, 1.0) == pytest.approx(1.0 + 0.3 * np.sqrt(2))
+    never = dataclasses.replace(valve, std_mm=np.full(valve.layout.size, np.nan))
+    assert contact_distance(never, 1.2) == 1.2
+
+
+@pytest.mark.parametrize("thickness", [0.0, -1.0, np.nan])
+def test_a_thickness_that_is_none_is_refused(valve, thickness):
+    with pytest.raises(InputError, match="thickness_mm"):
+        measure_sequence(valve, thickness)
+
+
+def test_a_frame_without_a_valve_is_empty():
+    valve = made_up_sequence.sequence((1.0, 1.0, 1.0), SMALL)
+    valve.frame_confidence[1] = 0.0
+    valve.vertices[2, 5] = np.nan
+    rows = measure_sequence(valve, 1.0)
+    own = {"frame", "time_s", "confidence", "vertex_confidence_mean", "contact_distance_mm"}
+    for row in rows[1:]:
+        assert {name for name, value in row.items() if value is not None} == own
+    assert rows[0]["ap_diameter_mm"] is not None
+
+
+def test_the_table_has_a_row_per_frame_and_empty_cells(tmp_path, rows):
+    table, document = write_measures(tmp_path, rows)
+    with table.open(encoding="utf-8") as stream:
+        read = list(csv.DictReader(stream))
+    assert len(read) == 2
+    assert read[1]["tenting_height_mm"] == ""
+    assert float(read[0]["ap_diameter_mm"]) == pytest.approx(rows[0]["ap_diameter_mm"], rel=1e-6)
+    kept = json.loads(document.read_text(encoding="utf-8"))
+    assert kept["frames"][1]["tenting_height_mm"] is None
+    assert kept["frames"][0] == rows[0]
+    assert list(kept["measures"]) == list(read[0])
+    assert kept["measures"]["ap_diameter_mm"]["unit"] == "mm"
+    assert kept["measures"]["annulus_sphericity_ratio"]["unit"] == ""
+    assert all(entry["meaning"] for entry in kept["measures"].values())
+    assert measure_meaning("time_s")[0] == "s"
+
+
+def test_nothing_to_write_and_nowhere_to_write_are_refused(tmp_path, rows):
+    with pytest.raises(InputError, match="no frames"):
+        write_measures(tmp_path, [])
+    with pytest.raises(InputError, match="cannot be written"):
+        write_measures(tmp_path / "none", rows)
+
+
+def test_the_closed_frame_is_where_most_touches(rows):
+    assert closed_frame(rows) == 0
+
+    def row(frame, touching, orifice):
+        return {"frame": frame, "coaptation_area_mm2": touching, "orifice_mm2": orifice}
+
+    nothing = row(0, None, None)
+    assert closed_frame([nothing, row(1, 5.0, 2.0), row(2, 9.0, 8.0)]) == 2
+    assert closed_frame([nothing, row(1, 0.0, 20.0), row(2, 0.0, 8.0)]) == 2
+    assert closed_frame([nothing]) is None

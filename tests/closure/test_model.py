@@ -1,0 +1,658 @@
+"""The joint of valve and mechanics: what a filter is told about a closing valve must be true.
+
+Everything runs on 16 x 2 cells of hex18 with a stiff posterior leaflet: enough for the leaflets to
+meet in a few steps. The states mean nothing beside a real mesh's; the equations are the same.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mvest.closure.model
+from mvest.closure.model import REST, ClosedState, ClosureModel
+from mvest.errors import InputError
+from mvest.mechanics import valve_system
+from mvest.mechanics.forces.contact import Contact, ContactSettings
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.mechanics.steps import NewtonSettings, Reason
+from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Motion
+from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.structured import structured_mesh
+
+MODULI = ("E_f.anterior", "E_f.posterior")
+AT = np.array([6.0, 4.0])
+TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
+CLOSING = ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04, growth=2.0, end=0.4)
+# Two steps that do not bring the leaflets together, for what needs no contact.
+OPEN = ClosureProtocol(pressure_mmHg=20.0, ramp=0.1, dt=0.05, end=0.1, equilibrium=False)
+# So little pressure that the open valve has an equilibrium beside it.
+GENTLE = ClosureProtocol(pressure_mmHg=0.5, ramp=0.1, dt=0.05, end=0.1)
+# Converged to round-off: a residual that Newton's method leaves is divided by a small step below.
+EXACT = NewtonSettings(tolerance=1e-13, smallest_move=1e-11, max_iterations=60)
+
+TEMPLATE = Template()
+SMALL = {"cells": (10, 2), "samples": (32, 8)}
+TINY = {"cells": (8, 1), "samples": (16, 5)}
+
+
+def settings_of(protocol, **changes):
+    return MechanicsSettings(TISSUE, protocol, newton=EXACT, **changes)
+
+
+def model_of(protocol, names=MODULI, cells=(16, 2), samples=(60, 16), **changes):
+    settings = settings_of(protocol, **changes.pop("settings", {}))
+    return ClosureModel(
+        TEMPLATE.valve(16, 5),
+        TEMPLATE.valve(*samples),
+        structured_mesh(TEMPLATE, "hex18", *cells),
+        settings,
+        names,
+        **changes,
+    )
+
+
+@pytest.fixture(scope="module")
+def closed():
+    """A model that has closed once, and that closure."""
+    model = model_of(CLOSING, continuation=True)
+    result = model.close(AT)
+    assert result.simulation.converged
+    return model, result.simulation
+
+
+def continued(model, start, m, sensitivities=False):
+    """The equilibrium at ``m`` that is reached from the nodal positions ``start``."""
+    model.restart(ClosedState(np.ones(len(m)), start))
+    simulation = model.close(m, sensitivities=sensitivities).simulation
+    assert simulation.converged
+    # Two frames, the start and the equilibrium: the whole closure was not run again.
+    assert len(simulation.times) == 2
+    return simulation
+
+
+def step_study(exact, run, m, k, coarse):
+    """Errors of central differences at a relative step and at a quarter of it, and extrapolated.
+
+    The error of a central difference falls as h^2, from h to h/4 by 16, so that
+    (16 D(h/4) - D(h)) / 15 is free of it; a wrong derivative leaves an error that does not fall.
+    """
+    differences = []
+    for relative in (coarse, coarse / 4):
+        h = relative * m[k] * np.eye(len(m))[k]
+        differences.append((run(m + h) - run(m - h)) / (2 * h[k]))
+    differences.append((16 * differences[1] - differences[0]) / 15)
+    return [float(np.linalg.norm(d - exact) / np.linalg.norm(exact)) for d in differences]
+
+
+@pytest.mark.parametrize("k", [0, 1], ids=MODULI)
+def test_derivatives_of_the_closed_valve_agree_with_differences_in_contact(closed, k):
+    model, simulation = closed
+    start = simulation.frames[-1]
+    assert simulation.records[-1].active_contacts > 200
+    exact = simulation.sensitivities[-1][k]
+    assert np.linalg.norm(exact) > 1.0  # mm/MPa over all nodes
+    coarse, fine, best = step_study(
+        exact, lambda m: continued(model, start, m).frames[-1], AT, k, 8e-4
+    )
+    assert coarse / fine == pytest.approx(16, rel=0.05)
+    assert fine < 1e-6
+    assert best < 1e-8
+
+
+def test_the_derivative_is_another_one_without_the_stiffness_of_contact(closed, monkeypatch):
+    # The state is in equilibrium at a looser tolerance too, so that only the tangent differs: the
+    # test above can tell whether contact is differentiated.
+    model, simulation = closed
+    start, exact = simulation.frames[-1], simulation.sensitivities[-1]
+    newton = replace(EXACT, tolerance=1e-9)
+    loose = replace(model, settings=replace(model.settings, newton=newton))
+    same = continued(loose, start, AT, sensitivities=True)
+    np.testing.assert_allclose(same.sensitivities[-1], exact, atol=1e-9)
+    monkeypatch.setattr(Contact, "add_tangent", lambda *arguments: None)
+    other = continued(loose, start, AT, sensitivities=True)
+    np.testing.assert_array_equal(other.frames[-1], start)
+    change = np.linalg.norm(other.sensitivities[-1] - exact, axis=(1, 2))
+    assert np.all(change > 0.1 * np.linalg.norm(exact, axis=(1, 2)))
+
+
+FACTORS = ("pressure_scale", "chord_stiffness", "chord_rest_length")
+
+
+def test_derivatives_of_a_moving_valve_agree_with_differences_for_every_parameter():
+    # No equilibrium at the end: velocity, damping and the history of strain are in the derivative.
+    # The chordae are 6 % shorter than usual, so that they pull from the first step on.
+    names = (*MODULI, *FACTORS)
+    m = np.array([*AT, 1.1, 0.9, 0.94])
+    model = model_of(OPEN, names, **SMALL)
+    simulation = model.close(m).simulation
+    assert simulation.converged
+    exact = simulation.sensitivities[-1]
+    assert np.linalg.norm(simulation.frames[-1] - model.mesh.nodes) > 1.0
+
+    def run(values):
+        result = model.close(values, sensitivities=False).simulation
+        assert result.converged
+        return result.frames[-1]
+
+    for k, name in enumerate(names):
+        assert np.linalg.norm(exact[k]) > 1e-3, name
+        # The toe of the chordae ends at 1.5 % strain: their length needs a smaller step.
+        step = 4e-4 if name == "chord_rest_length" else 1.6e-3
+        coarse, fine, best = step_study(exact[k], run, m, k, step)
+        assert coarse / fine == pytest.approx(16, rel=0.1), name
+        assert best < 1e-7, name
+
+
+@pytest.mark.slow
+def test_derivatives_agree_with_differences_at_the_whole_pressure():
+    protocol = ClosureProtocol()
+    model = model_of(protocol, cells=(24, 3), samples=(96, 32), continuation=True)
+    tissue = np.array([6.23, 2.09])
+    simulation = model.close(tissue).simulation
+    assert simulation.converged
+    assert simulation.records[-1].active_contacts > 3000
+    start = simulation.frames[-1]
+    for k in range(2):
+        _, fine, best = step_study(
+            simulation.sensitivities[-1][k],
+            lambda m: continued(model, start, m).frames[-1],
+            tissue,
+            k,
+            4e-4,
+        )
+        assert fine < 1e-6
+        assert best < 1e-6
+
+
+def test_a_continued_closure_ends_in_the_state_of_one_from_the_open_valve(closed):
+    model, simulation = closed
+    other = AT * np.array([0.95, 1.05])
+    warm = continued(model, simulation.frames[-1], other, sensitivities=True)
+    cold_model = replace(model, continuation=False)
+    cold = cold_model.close(other).simulation
+    assert cold.converged
+    assert len(cold.times) > 2
+    assert np.abs(warm.frames[-1] - simulation.frames[-1]).max() > 0.01
+    np.testing.assert_allclose(warm.frames[-1], cold.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(warm.sensitivities[-1], cold.sensitivities[-1], rtol=0, atol=1e-6)
+
+
+def test_the_closed_state_does_not_depend_on_how_the_path_to_it_is_solved(closed):
+    model, simulation = closed
+    rough, last = simulation.records[:-1], simulation.records[-1]
+    assert max(r.residuals[-1] for r in rough) > 1e-4
+    assert last.residuals[-1] < 1e-9
+    # Solved in full at every step, and with continuation forbidden where every frame is wanted.
+    full = model.close(AT, sensitivities=False, every_frame=True).simulation
+    assert full.converged
+    assert len(full.times) == len(simulation.times) > 2
+    assert max(r.residuals[-1] for r in full.records) < 1e-9
+    assert np.abs(full.frames[-2] - simulation.frames[-2]).max() > 1e-6
+    np.testing.assert_allclose(full.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+
+
+def test_a_guided_closure_ends_in_the_state_of_one_from_the_open_valve(closed, monkeypatch):
+    model, simulation = closed
+    coarse = model_of(CLOSING, cells=(10, 2))
+    guided = replace(model, continuation=False, guide=coarse)
+    result = guided.close(AT).simulation
+    assert result.converged
+    # On the fine mesh, the state taken over only rests before its equilibrium is looked for.
+    assert len(result.times) == 2 + len(REST)
+    # It started where the coarse valve is closed, not where the fine one is.
+    assert 0.01 < np.abs(result.frames[0] - simulation.frames[-1]).max() < 5.0
+    np.testing.assert_allclose(result.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        result.sensitivities[-1], simulation.sensitivities[-1], rtol=0, atol=1e-6
+    )
+    # Every frame can only come from the open valve, and so does the state where the guide fails.
+    assert len(guided.close(AT, sensitivities=False, every_frame=True).simulation.times) > 2
+    monkeypatch.setattr(ClosureModel, "_guided", lambda self, guide, m: None)
+    alone = guided.close(AT, sensitivities=False).simulation
+    assert len(alone.times) > 2
+    np.testing.assert_allclose(alone.frames[-1], simulation.frames[-1], rtol=0, atol=1e-8)
+
+
+def test_a_valve_held_under_the_loads_of_the_closed_frame_stays_closed(closed):
+    model, simulation = closed
+    motion = model.contact_valve.motion
+    model.restart(ClosedState(AT, simulation.frames[-1]))
+    same = HeldState(CLOSING.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1])
+    (held,) = model.held(AT, [same])
+    np.testing.assert_allclose(held, model.observed(simulation.frames[-1]), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("pressure", "lift"), [(95.0, 0.0), (100.0, 0.3)])
+def test_a_held_valve_is_one_that_was_closed_under_these_loads(closed, pressure, lift):
+    # Reached from the closed state and from the open one.
+    model, _ = closed
+    motion = model.contact_valve.motion
+    tips = motion.papillary_tips[-1] + [0.0, 0.0, lift]
+    (held,) = model.held(AT, [HeldState(pressure, motion.annulus[-1], tips)])
+    moved = replace(motion, papillary_tips=np.stack([motion.papillary_tips[0], tips]))
+    other = replace(
+        model,
+        contact_valve=replace(model.contact_valve, motion=moved),
+        settings=settings_of(replace(CLOSING, pressure_mmHg=pressure)),
+        continuation=False,
+    )
+    closed_so = other.close(AT, sensitivities=False).simulation
+    np.testing.assert_allclose(held, other.observed(closed_so.frames[-1]), rtol=0, atol=1e-7)
+
+
+def test_held_loads_must_be_those_of_the_valve(closed):
+    model, simulation = closed
+    motion = model.contact_valve.motion
+    model.restart(ClosedState(AT, simulation.frames[-1]))
+    with pytest.raises(InputError, match="held annulus"):
+        model.held(AT, [HeldState(80.0, motion.annulus[-1][:5], motion.papillary_tips[-1])])
+
+
+def test_a_guide_has_the_model_s_parameters():
+    guide = model_of(OPEN, (*MODULI, "pressure_scale"), **TINY)
+    with pytest.raises(InputError, match=r"the guide's parameters are .*pressure_scale"):
+        replace(model_of(OPEN, **TINY), guide=guide)
+
+
+def test_a_fresh_model_has_built_nothing_and_its_guide_neither():
+    guide = model_of(GENTLE, **SMALL)
+    model = model_of(GENTLE, cells=(12, 2), samples=(32, 8))
+    model = replace(model, guide=guide, on_step=lambda t, n: None)
+    model.close(AT, sensitivities=False)
+    assert guide._system is not None
+    fresh = model.fresh()
+    assert fresh._system is None
+    assert fresh._closed is None
+    assert fresh.on_step is None
+    assert fresh.guide is not guide
+    assert fresh.guide._system is None
+    assert fresh.mesh is model.mesh
+
+
+def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
+    model = model_of(GENTLE, **SMALL)
+    model = replace(model, continuation=True)
+    first = model.close(AT, sensitivities=False).simulation
+    true_simulate, starts = mvest.closure.model.simulate, []
+
+    def simulate(*arguments, **options):
+        starts.append(options["initial_positions"])
+        result = true_simulate(*arguments, **options)
+        if options["initial_positions"] is not None:
+            result = replace(result, reason=Reason.NO_CONVERGENCE)
+        return result
+
+    monkeypatch.setattr(mvest.closure.model, "simulate", simulate)
+    again = model.close(AT, sensitivities=False).simulation
+    np.testing.assert_array_equal(starts[0], first.frames[-1])
+    assert starts[1] is None
+    assert again.converged
+    np.testing.assert_allclose(again.frames, first.frames, rtol=0, atol=1e-9)
+    # Unless it is not to be repeated: then the failure is the result.
+    starts.clear()
+    alone = replace(model, repeat=False)
+    alone.restart(ClosedState(AT, first.frames[-1]))
+    failed = alone.close(AT, sensitivities=False).simulation
+    assert len(starts) == 1
+    assert failed.reason is Reason.NO_CONVERGENCE
+
+
+def test_a_restarted_model_forgets_to_the_last_bit(closed):
+    # Contact met on another way is in the pattern and in the order of elimination, which may round
+    # differently; after a restart both begin anew.
+    model, simulation = closed
+    start = ClosedState(AT, simulation.frames[-1])
+    near = 1.05 * AT
+    found = []
+    for way in ((), (np.array([4.0, 3.0]),)):
+        model.restart(start)
+        for m in way:
+            assert model(m).converged
+            assert model._system._coupled.size
+            solver = model._solver
+            model.restart(start)
+            assert not model._system._coupled.size
+            assert model._solver is not solver
+        prediction = model(near)
+        found.append(prediction.y.tobytes() + prediction.jacobian.tobytes())
+        np.testing.assert_array_equal(model.closed.at, near)
+    assert found[0] == found[1]
+
+
+def test_a_restarted_guide_forgets_too():
+    model = model_of(GENTLE, cells=(12, 2), samples=(32, 8))
+    model = replace(model, guide=model_of(GENTLE, **SMALL), continuation=True)
+    model.close(AT, sensitivities=False)
+    state = model.closed
+    assert state.guide is not None
+    model.restart(None)
+    assert model.closed is None
+    assert model.guide.closed is None
+    model.restart(state)
+    np.testing.assert_array_equal(model.closed.positions, state.positions)
+    np.testing.assert_array_equal(model.guide.closed.positions, state.guide.positions)
+
+
+@pytest.mark.parametrize(
+    ("reach", "m", "frames"),
+    [
+        (np.inf, 3.0 * AT, 2),
+        (0.2, 1.2 * AT, 2),
+        (0.2, 1.3 * AT, 4),
+        (0.2, AT / [1.0, 1.3], 4),
+        (0.0, AT, 2),
+    ],
+)
+def test_a_closure_is_continued_within_reach_only(reach, m, frames):
+    # log 1.2 = 0.18 and log 1.3 = 0.26. Continued: start and equilibrium; else two steps more.
+    model = replace(model_of(GENTLE, **SMALL), continuation=True, reach=reach)
+    model.close(AT, sensitivities=False)
+    assert len(model.close(m, sensitivities=False).simulation.times) == frames
+
+
+def test_a_negative_reach_is_refused():
+    with pytest.raises(InputError, match=r"reach of a continuation = -1\.0"):
+        replace(model_of(GENTLE, **TINY), reach=-1.0)
+
+
+def test_one_model_after_another_leaves_nothing_behind():
+    # Retuned models keep their system; each value must come from its own arguments.
+    names = (*MODULI, *FACTORS)
+    values = (np.array([*AT, 1.0, 1.0, 0.94]), np.array([3.0, 3.0, 0.8, 1.3, 0.97]))
+    used = model_of(OPEN, names, **SMALL)
+    one, two, one_again = (used(m) for m in (*values, values[0]))
+    fresh = model_of(OPEN, names, **SMALL)(values[1])
+    np.testing.assert_allclose(two.y, fresh.y, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(two.jacobian, fresh.jacobian, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(one_again.y, one.y, rtol=0, atol=1e-10)
+    assert np.abs(two.y - one.y).max() > 0.1
+
+
+def test_another_mesh_and_other_settings_make_another_system():
+    model = model_of(OPEN, **SMALL)
+    first = model.close(AT, sensitivities=False)
+    contact = ContactSettings(reference_distance=1.1, activation_distance=1.8)
+    changed = replace(
+        model,
+        mesh=structured_mesh(TEMPLATE, "hex18", 12, 3),
+        settings=replace(model.settings, contact=contact),
+    )
+    second = changed.close(AT, sensitivities=False)
+    assert second.system is not first.system
+    assert second.system.contact.settings is contact
+    assert second.simulation.frames.shape[1] == len(changed.mesh.nodes)
+    assert first.system.contact.settings == ContactSettings()
+
+
+def test_a_prediction_is_the_open_and_the_closed_frame_and_their_derivative(closed):
+    model, simulation = closed
+    model.restart(ClosedState(AT, simulation.frames[-1]))
+    prediction = model(AT)
+    assert prediction.converged
+    n = len(model.valve.surface.vertices)
+    assert prediction.y.shape == (6 * n,)
+    assert prediction.jacobian.shape == (6 * n, 2)
+    opened, shut = prediction.y.reshape(2, n, 3)
+    # The coarse mesh cuts corners of the surface, and points outside are extrapolated exactly.
+    np.testing.assert_allclose(opened, model.valve.surface.vertices, atol=1e-8)
+    np.testing.assert_allclose(shut, model.observed(simulation.frames[-1]), atol=1e-9)
+    assert np.linalg.norm(shut - opened, axis=1).max() > 5.0
+    by_open, by_closed = prediction.jacobian.reshape(2, n, 3, 2)
+    assert np.all(by_open == 0)
+    for k in range(2):
+        expected = model.observed(simulation.sensitivities[-1][k])
+        np.testing.assert_allclose(by_closed[..., k], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ([-1.0, 2.0], "E_f = -1.0 MPa"),
+        ([6.0, 0.0], "E_f = 0.0 MPa"),
+        ([float("nan"), 2.0], "E_f = nan MPa"),
+    ],
+)
+def test_an_inadmissible_modulus_is_a_failed_prediction(values, reason):
+    prediction = model_of(OPEN, **TINY)(np.array(values))
+    assert not prediction.converged
+    assert reason in prediction.reason
+
+
+def test_a_run_that_does_not_converge_is_a_failed_prediction_with_reason_and_time():
+    model = model_of(OPEN, **SMALL)
+    newton = NewtonSettings(max_iterations=1, max_halvings=0)
+    model = replace(model, settings=replace(model.settings, newton=newton))
+    simulation = model.close(AT).simulation
+    assert simulation.reason is Reason.NO_CONVERGENCE
+    assert len(simulation.frames) == 1
+    prediction = model(AT)
+    assert not prediction.converged
+    assert prediction.reason == (
+        "Newton's method did not converge at the smallest step (t = 0.000 s)"
+    )
+    assert model._closed is None
+
+
+@pytest.mark.parametrize("support", ["hinge", "clamp"])
+def test_the_support_follows_the_annulus_within_micrometres(support):
+    model = model_of(OPEN, **SMALL, settings={"support": support})
+    result = model.close(AT, sensitivities=False)
+    assert result.simulation.converged
+    hinge, contact_valve = result.system.hinge, model.contact_valve
+    loading = boundary_loading(result.system, model.valve, contact_valve, model.settings)
+    target = loading(result.simulation.times[-1]).hinge
+    points = hinge.points(result.simulation.frames[-1])
+    n = len(contact_valve.annulus)
+    assert len(points) == (n if support == "hinge" else 2 * n)
+    assert np.linalg.norm(points - target, axis=1).max() < 0.02  # mm
+    # The targets of the closed frame: the annulus of the closed frame, midway between the faces.
+    middle = target if support == "hinge" else 0.5 * (target[:n] + target[n:])
+    np.testing.assert_allclose(middle, contact_valve.motion.annulus[-1], atol=1e-3)
+    # Stiffness per length: 50 N/mm per mm of annulus, however it is shared out.
+    loop = contact_valve.surface.vertices[contact_valve.annulus]
+    length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum()
+    assert hinge.stiffness.sum() == pytest.approx(50.0 * length)
+
+
+def test_a_hinge_lets_the_leaflets_turn_and_a_clamp_does_not():
+    def turn(support):
+        model = model_of(OPEN, **SMALL, settings={"support": support})
+        simulation = model.close(AT, sensitivities=False).simulation
+        assert simulation.converged
+        x = simulation.frames[-1]
+        nodes, n = model.mesh.nodes, len(model.mesh.nodes) // 2
+        # From the atrial to the ventricular node at the annulus, before and after; of the annulus
+        # points' own ring, which comes first in each face.
+        before, after = (v[n : n + 20] - v[:20] for v in (nodes, x))
+        cosine = np.einsum("ki,ki->k", before, after) / (
+            np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        )
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+    hinge, clamp = turn("hinge"), turn("clamp")
+    assert hinge > 5.0
+    assert clamp < 0.2 * hinge
+
+
+def test_what_hangs_on_the_valve_is_the_same_in_every_mesh():
+    # Chord patches and hinge are given in the rest frame: their rest positions and stiffness must
+    # not know the mesh. Finer and other elements are nearer to the exact surface.
+    valve, contact_valve = TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
+    settings = settings_of(CLOSING)
+    systems = [
+        build_system(valve, contact_valve, structured_mesh(TEMPLATE, *kind), settings, moduli)
+        for kind in (("hex18", 36, 4), ("hex27", 24, 3), ("tet10", 24, 3))
+    ]
+    for system in systems[1:]:
+        for part in ("cables.patches", "hinge.points", "contact.points"):
+            owner, name = part.split(".")
+            one = getattr(getattr(systems[0], owner), name)(systems[0].solid.mesh.nodes)
+            other = getattr(getattr(system, owner), name)(system.solid.mesh.nodes)
+            np.testing.assert_allclose(other, one, atol=1e-6, err_msg=part)
+        np.testing.assert_array_equal(system.hinge.stiffness, systems[0].hinge.stiffness)
+
+
+def test_a_chord_is_spread_over_its_patch():
+    valve, contact_valve = TEMPLATE.valve(16, 5), TEMPLATE.valve(96, 32)
+    mesh = structured_mesh(TEMPLATE, "hex18", 24, 3)
+    points = embed(mesh, contact_valve.surface.vertices)
+    insertion = valve.chordae.insertion
+    for radius in (1.0, 2.0):
+        patches = valve_system._patches(points, contact_valve, radius, insertion)
+        np.testing.assert_allclose(patches.weights.sum(axis=1), 1, atol=1e-12)
+        # The centre of a patch lies within it; at the free edge it is cut on one side.
+        distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
+        assert distance.max() < 0.5 * radius
+    # The patch is a piece of the leaflet, however densely that is sampled: with area weights its
+    # centre converges (unweighted, samples of the free edge count twice and move it by 0.14 mm).
+    dense = TEMPLATE.valve(240, 61)
+    exact = embed(mesh, dense.surface.vertices)
+    centres = [
+        valve_system._patches(p, v, 2.0, insertion)(mesh.nodes)
+        for p, v in ((points, contact_valve), (exact, dense))
+    ]
+    assert np.linalg.norm(centres[0] - centres[1], axis=1).max() < 0.03
+    # A patch smaller than the samples' spacing takes the nearest sample.
+    patches = valve_system._patches(points, contact_valve, 1e-6, insertion)
+    gap = np.linalg.norm(contact_valve.surface.vertices - insertion[:, None], axis=2).min(axis=1)
+    distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
+    assert np.all(distance <= 1.05 * gap + 1e-6)
+
+
+BAD = [
+    ({"dt": 0.0}, "time step dt = 0.0 s, expected > 0"),
+    ({"dt": -0.1}, "time step dt = -0.1 s"),
+    ({"dt": float("nan")}, "time step dt = nan s"),
+    ({"ramp": 0.0}, "0 < ramp <= end"),
+    ({"ramp": 0.3, "end": 0.2}, "0 < ramp <= end"),
+    ({"growth": 0.5}, "growth >= 1"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_a_protocol_that_cannot_run_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        ClosureProtocol(**changes)
+
+
+def test_the_protocol_ramps_in_equal_steps_then_grows_to_the_end_and_to_equilibrium():
+    # 0.3 s in steps of 0.1 s; then 0.2 s, and what is left to 0.6 s; then the static step.
+    protocol = ClosureProtocol(ramp=0.3, dt=0.1, growth=2.0, end=0.6)
+    steps = protocol.steps()
+    np.testing.assert_allclose([s.time for s in steps], [0.1, 0.2, 0.3, 0.5, 0.6, 1.6])
+    assert [s.static for s in steps] == [False] * 5 + [True]
+    assert not any(s.static for s in replace(protocol, equilibrium=False).steps())
+    # A smooth step: 0, 1/2 and 1, and flat at both ends (slope 30 u^2 (1 - u)^2 / ramp).
+    assert [protocol.phase(t) for t in (0, 0.15, 0.3, 9.0)] == pytest.approx([0, 0.5, 1, 1])
+    assert protocol.phase(3e-4) == pytest.approx(0, abs=1e-7)
+    assert protocol.phase(0.3 - 3e-4) == pytest.approx(1, abs=1e-7)
+
+
+def test_the_loading_runs_from_the_open_to_the_closed_frame():
+    model = model_of(replace(CLOSING, pressure_mmHg=120.0), **SMALL)
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
+    system = build_system(model.valve, model.contact_valve, model.mesh, model.settings, moduli)
+    loading = boundary_loading(system, model.valve, model.contact_valve, model.settings)
+    start, end = loading(0.0), loading(0.2)
+    assert start.pressure == 0
+    # 120 mmHg x 133.322 Pa = 15 999 Pa.
+    assert end.pressure == pytest.approx(0.015999, abs=1e-6)
+    np.testing.assert_array_equal(start.hinge, system.hinge.points(model.mesh.nodes))
+    motion = model.contact_valve.motion
+    np.testing.assert_allclose(
+        end.hinge - start.hinge, motion.annulus[-1] - motion.annulus[0], atol=1e-12
+    )
+    np.testing.assert_array_equal(end.tips, motion.papillary_tips[-1])
+    # Half way in time is half way in phase, and two frames are joined by a straight line.
+    np.testing.assert_allclose(loading(0.1).hinge, 0.5 * (start.hinge + end.hinge), atol=1e-12)
+
+
+def test_more_key_frames_are_met_exactly_and_joined_without_overshoot():
+    model = model_of(CLOSING, **SMALL)
+    valve = model.contact_valve
+    phase = np.array([0.0, 0.5, 1.0])
+    shift = np.array([0.0, 1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, 2.0])
+    moving = replace(
+        valve,
+        motion=Motion(phase, valve.motion.annulus[:1] + shift, valve.papillary_tips + shift),
+    )
+    moduli = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
+    system = build_system(model.valve, moving, model.mesh, model.settings, moduli)
+    loading = boundary_loading(system, model.valve, moving, model.settings)
+    times = np.linspace(0.0, 0.2, 41)
+    heights = [float(loading(t).tips[0, 2] - valve.papillary_tips[0, 2]) for t in times]
+    assert heights[0] == pytest.approx(0)
+    assert loading(0.1).tips[0, 2] - valve.papillary_tips[0, 2] == pytest.approx(2.0)
+    assert max(heights) <= 2.0 + 1e-12
+    assert np.all(np.diff(heights) >= -1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tissue", "moduli"),
+    [
+        ({"anterior": TISSUE["anterior"]}, {"E_f.anterior": 6.23, "E_f.posterior": 2.09}),
+        (TISSUE, {"E_f.anterior": 6.23}),
+    ],
+)
+def test_a_region_without_tissue_or_modulus_is_named(tissue, moduli):
+    mesh = structured_mesh(TEMPLATE, "hex18", 8, 1)
+    valve = TEMPLATE.valve(16, 5)
+    with pytest.raises(InputError, match=r"region 'posterior' .* given are anterior"):
+        build_system(valve, valve, mesh, MechanicsSettings(tissue), moduli)
+
+
+def test_an_unknown_support_names_the_known_ones():
+    with pytest.raises(InputError, match="support 'glue', expected hinge or clamp"):
+        model_of(OPEN, **TINY, settings={"support": "glue"})
+
+
+@pytest.mark.parametrize("name", ["density", "support_stiffness", "patch_radius"])
+def test_settings_that_must_be_positive_are_refused_by_name(name):
+    with pytest.raises(InputError, match=f"{name} = -1.0, expected > 0"):
+        model_of(OPEN, **TINY, settings={name: -1.0})
+
+
+def test_an_unknown_parameter_names_the_known_ones():
+    model = model_of(OPEN, (*MODULI, "luck"), **TINY)
+    with pytest.raises(InputError, match=r"unknown parameter 'luck'; known: E_f\.REGION"):
+        model.close(np.array([*AT, 1.0]))
+
+
+def test_fixed_values_are_used_and_estimated_ones_go_before_them():
+    names = (*MODULI, "pressure_scale")
+    both = model_of(OPEN, names, **TINY).close(np.array([*AT, 0.5])).simulation
+    fixed = model_of(OPEN, **TINY, fixed={"pressure_scale": 0.5}).close(AT).simulation
+    np.testing.assert_allclose(fixed.frames[-1], both.frames[-1], atol=1e-10)
+    over = model_of(OPEN, names, **TINY, fixed={"pressure_scale": 2.0})
+    np.testing.assert_allclose(
+        over.close(np.array([*AT, 0.5])).simulation.frames[-1], both.frames[-1], atol=1e-10
+    )
+    usual = model_of(OPEN, **TINY).close(AT).simulation
+    assert np.abs(usual.frames[-1] - both.frames[-1]).max() > 0.1
+
+
+def test_a_far_continuation_goes_through_equilibria_between(closed):
+    # In one step Newton's method would be asked for an equilibrium 0.11 away in the logarithm.
+    model, simulation = closed
+    far = AT * np.array([0.9, 1.1])
+    walking = replace(model, largest_change=0.05)
+    walking.restart(ClosedState(AT, simulation.frames[-1]))
+    between = walking._way_to(far)
+    assert len(between) == 2
+    whole = np.log(far / AT)
+    for k, m in enumerate(between, 1):
+        np.testing.assert_allclose(np.log(m / AT), whole * k / 3, atol=1e-12)
+    reached = walking.close(far).simulation
+    direct = continued(replace(model), simulation.frames[-1], far, sensitivities=True)
+    np.testing.assert_allclose(reached.frames[-1], direct.frames[-1], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(reached.sensitivities[-1], direct.sensitivities[-1], atol=1e-6)
+    assert not walking._way_to(far * 1.04)
+
+
+def test_a_largest_change_is_positive():
+    with pytest.raises(InputError, match="largest_change = 0"):
+        model_of(CLOSING, **TINY, largest_change=0.0)

@@ -1,0 +1,175 @@
+"""Every kind of parameter of a closing valve: its derivative, and what is made of its value.
+
+On the same small valve as in test_model.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.closure.model import ClosedState
+from mvest.errors import InputError
+from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS
+from mvest.mechanics.law.field import ModulusField
+from mvest.mechanics.parameters import KINDS
+from tests.closure.test_model import (
+    AT,
+    CLOSING,
+    MODULI,
+    OPEN,
+    SMALL,
+    TINY,
+    continued,
+    model_of,
+    step_study,
+)
+
+FIELDS = {"fields": {"anterior": ModulusField(8.0, 0.4, 4)}}
+VALUES = {
+    **dict(zip(MODULI, AT, strict=True)),
+    "ratio.anterior": 2.6,
+    "ratio.posterior": 1.1,
+    "G.anterior": 1.8,
+    "field.anterior.0": 0.2,
+    "field.anterior.3": -0.3,
+    "pressure_scale": 1.1,
+    "damping": 0.12,
+    "chord_stiffness": 0.9,
+    "chord_stiffness.marginal": 1.1,
+    "chord_rest_length": 0.96,
+    "chord_rest_length.marginal": 0.99,
+    "chord_rest_length.tip0": 0.99,
+}
+NAMES = tuple(VALUES)
+# Relative steps: the toe of the chordae ends at 1.5 % strain, which their length must not leave,
+# and what is nearly linear in a parameter needs a large step, or round-off is all there is.
+STEPS = {"chord_rest_length": 4e-4, "field": 2e-2}
+
+
+def step_of(name, default):
+    return STEPS.get(name.partition(".")[0], default)
+
+
+def test_there_is_a_value_of_every_kind_here():
+    # Those of the exponential law are in test_model_exponential.py.
+    assert {name.partition(".")[0] for name in NAMES} == set(KINDS) - set(EXPONENTIAL_KINDS)
+
+
+def test_derivatives_of_a_moving_valve_agree_with_differences_for_every_kind():
+    # No equilibrium at the end: velocity, damping and the history of strain are in the derivative.
+    model = model_of(OPEN, NAMES, **SMALL, settings=FIELDS)
+    m = np.array(list(VALUES.values()))
+    simulation = model.close(m).simulation
+    assert simulation.converged
+    exact = simulation.sensitivities[-1]
+
+    def run(values):
+        result = model.close(values, sensitivities=False).simulation
+        assert result.converged
+        return result.frames[-1]
+
+    for k, name in enumerate(NAMES):
+        assert np.linalg.norm(exact[k]) > 0.1, name
+        coarse, fine, best = step_study(exact[k], run, m, k, step_of(name, 1.6e-3))
+        # Second order, unless the error is round-off already.
+        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-7, name
+        assert best < 2e-8, name
+
+
+def test_derivatives_of_the_closed_valve_agree_with_differences_for_every_kind():
+    model = model_of(CLOSING, NAMES, continuation=True, settings=FIELDS)
+    m = np.array(list({**VALUES, "chord_rest_length": 1.0}.values()))
+    simulation = model.close(m).simulation
+    assert simulation.converged
+    assert simulation.records[-1].active_contacts > 200
+    start, exact = simulation.frames[-1], simulation.sensitivities[-1]
+
+    def run(values):
+        return continued(model, start, values).frames[-1]
+
+    for k, name in enumerate(NAMES):
+        if name == "damping":
+            # An equilibrium knows nothing of what damped the way to it.
+            assert np.abs(exact[k]).max() == 0
+            continue
+        assert np.linalg.norm(exact[k]) > 0.1, name
+        coarse, fine, best = step_study(exact[k], run, m, k, step_of(name, 3.2e-3))
+        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-6, name
+        assert best < 1e-6, name
+
+
+def test_factors_of_all_chordae_and_of_some_multiply():
+    # Each tip has its chordae: both tips by f is all by f, and family and tip act on top.
+    def frame(**values):
+        own = {name.replace("_of_", "."): value for name, value in values.items()}
+        model = model_of(OPEN, MODULI, **TINY, fixed=own)
+        result = model.close(AT, sensitivities=False).simulation
+        assert result.converged
+        return result.frames[-1]
+
+    both = frame(chord_rest_length_of_tip0=0.95, chord_rest_length_of_tip1=0.95)
+    np.testing.assert_array_equal(both, frame(chord_rest_length=0.95))
+    product = frame(chord_rest_length=0.97, chord_rest_length_of_tip0=0.98)
+    apart = frame(chord_rest_length_of_tip0=0.97 * 0.98, chord_rest_length_of_tip1=0.97)
+    np.testing.assert_allclose(product, apart, rtol=0, atol=1e-9)
+    assert np.abs(product - both).max() > 0.01
+
+
+def test_a_fixed_damping_replaces_that_of_the_settings():
+    damping = model_of(OPEN).settings.damping
+    given = model_of(OPEN, **TINY, settings={"damping": replace(damping, beta=0.05)})
+    fixed = model_of(OPEN, **TINY, fixed={"damping": 0.05})
+    usual = model_of(OPEN, **TINY)
+    one, two, other = (
+        m.close(AT, sensitivities=False).simulation.frames[-1] for m in (given, fixed, usual)
+    )
+    np.testing.assert_array_equal(one, two)
+    assert np.abs(one - other).max() > 0.01
+
+
+def test_a_shear_modulus_that_is_what_would_follow_changes_nothing_but_the_derivative():
+    follows = model_of(OPEN, **TINY).close(AT).simulation
+    shear = {f"G.{r}": e / (2 * 1.488) for r, e in zip(("anterior", "posterior"), AT, strict=True)}
+    own = model_of(OPEN, **TINY, fixed=shear).close(AT).simulation
+    np.testing.assert_allclose(own.frames[-1], follows.frames[-1], rtol=0, atol=1e-9)
+    change = np.linalg.norm(own.sensitivities[-1] - follows.sensitivities[-1], axis=(1, 2))
+    assert np.all(change > 0.01 * np.linalg.norm(follows.sensitivities[-1], axis=(1, 2)))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ("E_f.anterior", "E_f.posterior", "chord_stiffness.strut"),
+            "known here: .*marginal.*tip0",
+        ),
+        (("E_f.anterior", "E_f.posterior", "field.posterior.0"), "known here: field|anterior.0"),
+        (("E_f.anterior", "E_f.posterior", "viscosity"), "unknown parameter 'viscosity'"),
+    ],
+)
+def test_names_that_the_valve_does_not_have_are_refused_before_anything_is_closed(names, message):
+    with pytest.raises(InputError, match=message):
+        model_of(OPEN, names, **TINY, settings=FIELDS).close(np.array([6.0, 4.0, 1.0]))
+
+
+def test_an_inadmissible_ratio_is_a_failed_prediction():
+    # 1 - nu - 2 nu^2 / ratio > 0 needs a ratio of more than 0.93.
+    model = model_of(OPEN, (*MODULI, "ratio.anterior"), **TINY)
+    prediction = model(np.array([*AT, 0.9]))
+    assert prediction.y is None or "not positive definite" in str(prediction.reason)
+
+
+def test_the_way_to_other_coefficients_is_measured_in_the_logarithm_of_the_modulus():
+    names = ("E_f.anterior", "E_f.posterior", "field.anterior.0")
+    model = model_of(
+        OPEN, names, **TINY, settings=FIELDS, continuation=True, reach=0.5, largest_change=0.1
+    )
+    start = np.array([6.0, 4.0, -0.5])
+    model.restart(ClosedState(start, model.mesh.nodes))
+    # A change of 0.6 of the coefficient is one of 0.4 x 0.6 = 0.24 in log E_f: three parts.
+    way = model._way_to(np.array([6.0, 4.0, 0.1]))
+    np.testing.assert_allclose(way, [[6, 4, -0.3], [6, 4, -0.1]], rtol=0, atol=1e-12)
+    # 0.4 x 1.5 = 0.6 is beyond the reach.
+    assert not model._near(np.array([6.0, 4.0, 1.0]))
+    assert model._near(np.array([6.6, 4.0, 0.5]))

@@ -1,0 +1,146 @@
+"""The simplex filter: exact for linear models, and what its rounds do for others."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.estimation import (
+    ExtendedFilter,
+    Gaussian,
+    IteratedFilter,
+    Log,
+    Prediction,
+    Reason,
+    UnscentedFilter,
+)
+from mvest.estimation.filters.unscented import simplex_points
+from tests.estimation.problems import Linear, square
+
+PRIOR, Y, R = Gaussian(np.array([2.0]), np.array([[1.0]])), np.array([6.0]), 2.0
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_corners_of_the_simplex_have_mean_zero_and_unit_covariance(size: int) -> None:
+    points = simplex_points(size)
+    assert points.shape == (size + 1, size)
+    np.testing.assert_allclose(points.sum(axis=0), 0.0, atol=1e-14)
+    np.testing.assert_allclose(points.T @ points / (size + 1), np.eye(size), atol=1e-14)
+    # Regular: all corners are as far from the centre, √p.
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.sqrt(size))
+
+
+@pytest.mark.parametrize(
+    ("filter_", "solves"),
+    [
+        (ExtendedFilter(), 2),  # at the prior's mean and at the estimate
+        (UnscentedFilter(max_iterations=1), 5),  # p + 1 = 4 points, and the estimate
+        (UnscentedFilter(), 9),  # a second round finds that nothing changes
+        (UnscentedFilter(spread=0.1), 9),
+    ],
+)
+def test_on_a_linear_model_it_is_the_kalman_filter(filter_, solves: int) -> None:
+    problem = Linear()
+    model = problem.differentiated if isinstance(filter_, ExtendedFilter) else problem.plain
+    found = filter_(model, problem.prior, problem.y, problem.R)
+    np.testing.assert_allclose(found.mean, problem.mean, rtol=1e-11)
+    np.testing.assert_allclose(found.covariance, problem.covariance, rtol=1e-10, atol=1e-11)
+    assert found.converged
+    assert found.forward_solves == solves
+    assert found.prediction is not None
+    np.testing.assert_allclose(found.prediction.jacobian, problem.H, atol=1e-11)
+    reference = IteratedFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    assert found.innovation.nis == pytest.approx(reference.innovation.nis, rel=1e-10)
+    assert found.log_likelihood[-1] == pytest.approx(reference.log_likelihood[-1], rel=1e-10)
+    assert found.objective[-1] == pytest.approx(reference.objective[-1], rel=1e-10)
+
+
+def test_hand_worked_rounds_on_a_square() -> None:
+    # p = 1: points m ± s. h = m² has ȳ = m² + s² and the slope 2 m. Round 1 about N(2, 1):
+    #   ȳ = 5, H = 4, e = 6 - 5 = 1, S = 16 + 2 = 18, m⁺ = 2 + (4/18) = 20/9, P⁺ = 1 - 16/18 = 1/9.
+    # Round 2 about N(20/9, 1/9) from the prior again: ȳ = 400/81 + 1/9 = 409/81, H = 40/9,
+    #   e + H (m - 2) = 6 - 409/81 + (40/9)(2/9) = 157/81, S = 1600/81 + 2 = 1762/81,
+    #   m⁺ = 2 + (40/9)(157/81)/(1762/81) = 2 + 40 · 157/(9 · 1762), P⁺ = 2/S = 162/1762.
+    once = UnscentedFilter(max_iterations=1)(square, PRIOR, Y, R)
+    assert once.mean[0] == pytest.approx(20 / 9, rel=1e-14)
+    assert once.covariance[0, 0] == pytest.approx(1 / 9, rel=1e-12)
+    assert once.reason is Reason.COMPLETED
+    twice = UnscentedFilter(max_iterations=2, tolerance=1e-300)(square, PRIOR, Y, R)
+    assert twice.mean[0] == pytest.approx(2 + 40 * 157 / (9 * 1762), rel=1e-14)
+    assert twice.covariance[0, 0] == pytest.approx(162 / 1762, rel=1e-12)
+    assert twice.reason is Reason.MAX_ITERATIONS
+    assert twice.forward_solves == 2 * 2 + 1
+
+
+def test_close_points_give_the_iterated_extended_filter() -> None:
+    # With a spread of 1e-4 the slope is the derivative but for the second order, and the fixed
+    # point the posterior mode 1 + √2 with the variance 1/(7 + 4√2) (see test_filters).
+    found = UnscentedFilter(spread=1e-4, tolerance=1e-10)(square, PRIOR, Y, R)
+    assert found.converged
+    assert found.mean[0] == pytest.approx(1 + np.sqrt(2), rel=1e-7)
+    assert found.covariance[0, 0] == pytest.approx(1 / (7 + 4 * np.sqrt(2)), rel=1e-6)
+
+
+def test_observations_are_counted_once_however_many_rounds() -> None:
+    model = lambda m: Prediction.undifferentiated(m)  # noqa: E731
+    prior = Gaussian(np.zeros(1), np.eye(1))
+    for rounds in (1, 2, 7):
+        found = UnscentedFilter(max_iterations=rounds, tolerance=1e-300)(
+            model, prior, np.ones(1), 1.0
+        )
+        assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-14)
+
+
+def test_points_draw_together_where_the_model_fails() -> None:
+    # The points of the prior are 2 ± 1; beyond 2.6 the model fails, so that the spread is halved,
+    # to 2 ± 1/2, and nothing else changes for a linear model.
+    def narrow(m):
+        return Prediction.failed("too large") if m[0] > 2.6 else Prediction.undifferentiated(m)
+
+    found = UnscentedFilter()(narrow, PRIOR, np.array([2.2]), 1.0)
+    assert found.converged
+    assert found.mean[0] == pytest.approx(2.1, rel=1e-12)
+    assert found.covariance[0, 0] == pytest.approx(0.5, rel=1e-12)
+
+
+def test_a_model_that_always_fails_ends_with_its_words() -> None:
+    found = UnscentedFilter()(lambda m: Prediction.failed("no valve"), PRIOR, Y, R)
+    assert found.reason is Reason.MODEL_FAILED
+    assert "no valve" in found.detail
+    assert found.prediction is None
+    assert found.forward_solves == 7  # 1 + max_rejections, each ends at its first point
+
+
+def test_a_parameter_that_the_prior_holds_fixed_stays() -> None:
+    problem = Linear(p=2)
+    prior = Gaussian(problem.prior.mean, np.diag([1.0, 0.0]))
+    found = UnscentedFilter()(problem.plain, prior, problem.y, problem.R)
+    reference = IteratedFilter()(problem.differentiated, prior, problem.y, problem.R)
+    np.testing.assert_allclose(found.mean, reference.mean, rtol=1e-11)
+    np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-10, atol=1e-14)
+
+
+def test_it_works_in_logarithms() -> None:
+    # log h is linear in log m, so that in logarithms h(m) = log m is the linear problem itself.
+    model = lambda m: Prediction.undifferentiated(np.log(m))  # noqa: E731
+    prior = Gaussian(np.array([3.0]), np.array([[9.0 * 0.25]]))  # standard deviation of the log 0.5
+    found = UnscentedFilter()(model, prior, np.array([1.0]), 0.25, transform=Log())
+    # Equal variances: half way between log 3 and 1; variance 1/8.
+    assert np.log(found.mean[0]) == pytest.approx(0.5 * (np.log(3.0) + 1.0), rel=1e-12)
+    assert found.transformed.covariance[0, 0] == pytest.approx(0.125, rel=1e-12)
+    # dh/dm = 1/m, from the slope 1 in logarithms.
+    assert found.prediction.jacobian[0, 0] == pytest.approx(1 / found.mean[0], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"spread": 0.0}, {"tolerance": -1.0}, {"max_iterations": 0}, {"max_rejections": -1}],
+)
+def test_inadmissible_settings_are_refused(settings) -> None:
+    with pytest.raises(InputError):
+        UnscentedFilter(**settings)
+
+
+def test_a_filter_that_needs_derivatives_says_so() -> None:
+    problem = Linear()
+    with pytest.raises(InputError, match="derivatives"):
+        IteratedFilter()(problem.plain, problem.prior, problem.y, problem.R)

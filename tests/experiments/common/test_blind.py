@@ -1,0 +1,184 @@
+"""An estimating process cannot open what its case hides, and is told nothing of it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.common.cases import blind
+from experiments.common.cases.blind import ESTIMATE, SECRET, estimate_blindly
+from mvest.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+WAYS = {
+    "open": "open(secret)",
+    "io.open": "io.open(secret, 'rb')",
+    "os.open": "os.open(secret, os.O_RDONLY)",
+    "bytes": "open(os.fsencode(secret))",
+    "Path.read_text": "Path(secret).read_text()",
+    "Path.open": "Path(secret).open()",
+    "numpy.load": "np.load(str(folder / 'positions.npz'))",
+    "numpy.fromfile": "np.fromfile(secret)",
+    "relative": "open(os.path.join('hidden', 'hidden.json'))",
+    "dots": "open(os.path.join('case', '..', 'hidden', 'hidden.json'))",
+    "symlink to the folder": "open(os.path.join('door', 'hidden.json'))",
+    "symlink to the file": "open('window.json')",
+    "listdir": "os.listdir(folder)",
+    "listdir by symlink": "os.listdir('door')",
+    "scandir": "list(os.scandir(folder))",
+    "iterdir": "list(folder.iterdir())",
+    "chdir": "os.chdir(folder)",
+    "rename": "os.rename(secret, 'out.json')",
+    "rename the folder": "os.rename(folder, 'elsewhere')",
+    "rename what holds it": "os.rename(root, str(root) + '_moved')",
+    "link": "os.link(secret, 'out.json')",
+    "symlink": "os.symlink(folder, 'new_door')",
+    "copy": "shutil.copyfile(secret, 'out.json')",
+    "copytree": "shutil.copytree(folder, 'out')",
+    "remove": "os.remove(secret)",
+    "write": "open(folder / 'new', 'w')",
+    "sqlite": "sqlite3.connect(folder / 'new.db')",
+}
+
+ATTEMPT = """
+import io, os, shutil, sqlite3, sys
+from pathlib import Path
+import numpy as np
+from experiments.common.cases.blind import seal
+root = Path(sys.argv[1]); folder = root / "hidden"; secret = str(folder / "hidden.json")
+os.chdir(root)
+seal(folder)
+for way in sys.stdin.read().splitlines():
+    os.chdir(root)
+    try:
+        eval(way)
+    except PermissionError as error:
+        print("sealed" if "is sealed" in str(error) else f"refused otherwise: {error}")
+    except Exception as error:
+        print(f"refused otherwise: {error!r}")
+    else:
+        print("done")
+"""
+
+
+@pytest.fixture
+def root(tmp_path):
+    folder = tmp_path / "root"
+    for name in ("hidden", "case", "hidden_from_nobody"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "hidden.json").write_text('{"E_f.anterior": 4.321}')
+        (folder / name / "positions.npz").write_bytes(b"")
+    (folder / "door").symlink_to("hidden", target_is_directory=True)
+    (folder / "window.json").symlink_to(Path("hidden") / "hidden.json")
+    return folder
+
+
+def attempt(root, ways):
+    finished = subprocess.run(
+        [sys.executable, "-c", ATTEMPT, str(root)],
+        input="\n".join(ways),
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return dict(zip(ways, finished.stdout.splitlines(), strict=True))
+
+
+def test_a_sealed_folder_cannot_be_opened_in_any_usual_way(root):
+    outcome = attempt(root, list(WAYS.values()))
+    assert {way: outcome[code] for way, code in WAYS.items()} == dict.fromkeys(WAYS, "sealed")
+    assert sorted(path.name for path in (root / "hidden").iterdir()) == [
+        "hidden.json", "positions.npz"
+    ]  # fmt: skip
+
+
+def test_all_other_folders_can(root):
+    ways = [
+        "open(os.path.join('case', 'hidden.json')).read()",
+        # Only begins alike.
+        "open(os.path.join('hidden_from_nobody', 'hidden.json')).read()",
+        "os.listdir(root)",
+        "Path('out.json').write_text('x')",
+        "os.mkdir('more')",
+    ]
+    assert set(attempt(root, ways).values()) == {"done"}
+
+
+def test_a_walk_does_not_name_what_is_sealed(root):
+    way = "print(*[name for _, _, names in os.walk(root) for name in names], file=sys.stderr)"
+    finished = subprocess.run(
+        [sys.executable, "-c", ATTEMPT, str(root)],
+        input=way,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert finished.stderr.split().count("hidden.json") == 2
+
+
+def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
+    """What the process is asked, and what comes of its answer."""
+    heard = []
+
+    def run(command, *, input, env, **options):
+        heard.append(SimpleNamespace(command=command, text=input, env=env))
+        if answer is not None:
+            (tmp_path / ESTIMATE).write_text(json.dumps(answer))
+        return SimpleNamespace(returncode=returncode, stderr=stderr)
+
+    monkeypatch.setattr(blind.subprocess, "run", run)
+    record = estimate_blindly(values, "hash", tmp_path, Path("case"), Path("hidden"))
+    return heard[0], record
+
+
+VALUES = {
+    "name": "patients",
+    "patient": {"moduli": {"E_f.anterior": 4.321}},
+    "truth": {"values": [4.321]},
+    "valve": {"half_ap": 13.579},
+    "seed": 24680,
+    "parameters": ["E_f.anterior"],
+    "row": "drawn_24680",
+    "factors": {"seed": 24680},
+    "personal": {"unknowns": {}},
+    "case": None,
+}
+
+
+def test_the_process_is_told_nothing_of_the_patient(monkeypatch, tmp_path):
+    heard, record = asked(monkeypatch, tmp_path, VALUES, {"status": "converged"})
+    told = json.loads(heard.text)["values"]
+    assert not set(SECRET) & set(told)
+    for secret in ("4.321", "13.579", "24680"):
+        assert secret not in heard.text.replace(str(tmp_path), "")
+    assert told["case"] == "case"
+    assert told["personal"] == VALUES["personal"]
+    assert record == {"status": "converged"}
+    assert not any("4.321" in value or "24680" in value for value in heard.env.values())
+
+
+def test_a_process_that_leaves_nothing_is_told_by_its_last_words(monkeypatch, tmp_path):
+    with pytest.raises(InputError, match="the estimation of case left no result: the case is bad"):
+        asked(monkeypatch, tmp_path, VALUES, None, 2, "note\nerror: the case is bad\n")
+    with pytest.raises(InputError, match="left no result: exit status -9"):
+        asked(monkeypatch, tmp_path, VALUES, None, -9)
+
+
+def test_what_an_earlier_run_left_is_not_taken_for_the_answer(monkeypatch, tmp_path):
+    (tmp_path / ESTIMATE).write_text('{"status": "old"}')
+    with pytest.raises(InputError, match="left no result"):
+        asked(monkeypatch, tmp_path, VALUES, None, 0)
+
+
+def test_the_real_process_says_what_is_wrong_with_a_case(tmp_path):
+    (tmp_path / "case").mkdir()
+    values = {"case": None, "personal": {}, "mechanics": {}}
+    with pytest.raises(InputError, match=r"no case\.yaml in this folder"):
+        estimate_blindly(values, "hash", tmp_path, tmp_path / "case", tmp_path / "hidden")

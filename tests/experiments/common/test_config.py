@@ -1,0 +1,154 @@
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from experiments.common.build import build_filter, build_twin, truth_mesh
+from experiments.common.config import hash_of, register
+from experiments.common.mirror import build
+from experiments.runner.request import as_published
+from mvest.mechanics.settings import MechanicsSettings
+from mvest.observation.errors import WhiteNoise
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+def composed(*overrides: str) -> DictConfig:
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def plain(config: DictConfig) -> dict:
+    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes_and_names_its_table(name: str) -> None:
+    config = plain(composed(f"experiment={name}"))
+    assert config["name"] == name
+    assert config["title"]
+    assert config["row"]
+    assert config["table"]
+    if config["study"] == "twin":
+        build(MechanicsSettings, config["mechanics"])
+        build_filter(config["filter"], tuple(config["parameters"]))
+        assert len(config["truth"]["values"]) == len(config["parameters"])
+    if name.startswith("table1"):
+        assert config["paper"]["table"] == "Table 1"
+        assert config["paper"]["estimate"] == [6.02, 2.13]
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [
+        (path.parent.name, path.stem)
+        for path in sorted(CONF.glob("*/*.yaml"))
+        if path.parent.name not in ("experiment", "hydra")
+    ],
+)
+def test_every_part_can_be_chosen(group: str, name: str) -> None:
+    plain(composed(f"{group}={name}"))
+
+
+def test_a_hash_depends_on_what_changes_the_result_only() -> None:
+    base = hash_of(composed("experiment=table1"))
+    assert hash_of(composed("experiment=table1", "paths.outputs=elsewhere")) == base
+    assert hash_of(composed("experiment=table1", "tracking.enabled=false")) == base
+    others = {
+        hash_of(composed("experiment=table1", override))
+        for override in (
+            "seed=2",
+            "filter.P0=0.02",
+            "filter.P0=[0.01,0.02]",
+            "mechanics.element=tet4",
+            "mesh.layers=2",
+            "observation.noise_mm=0.5",
+            "truth.values=[4.5,3.2]",
+            "mechanics.reading=C",
+        )
+    }
+    assert base not in others
+    assert len(others) == 8
+
+
+def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
+    base = hash_of(composed("experiment=imaging"))
+    same = ["imaging.processes=7", "imaging.publish_model=true"]
+    assert hash_of(composed("experiment=imaging", *same)) == base
+    assert hash_of(composed("experiment=imaging", "imaging.evaluate=false")) != base
+    assert as_published(["experiment=imaging", *same], None)
+    assert not as_published(["experiment=imaging", "imaging.evaluate=false"], None)
+    assert not as_published(["+imaging.train.count=7"], None)
+    assert as_published(["paths.outputs=elsewhere", "~sweep"], None)
+
+
+def test_the_usual_overrides_reach_the_objects() -> None:
+    config = plain(
+        composed(
+            "experiment=debug",
+            "truth.values=[4.5,3.2]",
+            "filter.initial=[8,1.5]",
+            "filter.mode=iterated",
+            "filter.P0=[1,4]",
+            "mechanics.element=tet4",
+            "mechanics.reading=C",
+            "mesh.layers=1",
+            "observation.noise_mm=0.5",
+            "filter.R=[0.01,0.25]",
+        )
+    )
+    twin = build_twin(config)
+    assert list(twin.truth_values) == [4.5, 3.2]
+    assert list(twin.case.prior.mean) == [8.0, 1.5]
+    assert twin.case.prior.covariance.diagonal().tolist() == [1.0, 4.0]
+    assert type(twin.case.filter).__name__ == "IteratedFilter"
+    assert twin.model.mesh.element_type == "tet4"
+    assert {tissue.reading for tissue in twin.model.settings.tissue.values()} == {"C"}
+    assert twin.errors == (WhiteNoise(0.5),)
+    assert list(twin.variance) == [0.01, 0.25]  # type: ignore[arg-type]
+    # Truth and estimator share the mesh here, but no object that could carry a value across.
+    assert twin.truth_model is not twin.model
+    assert twin.truth_model.fixed is not twin.model.fixed
+    assert twin.truth_model.mesh.sha256 == twin.model.mesh.sha256
+
+
+def test_guides_are_coarser_down_to_the_coarsest() -> None:
+    config = plain(composed("mesh.columns=108", "mesh.rows=12"))
+    config["mechanics"]["element"] = "tet4"
+    twin = build_twin(config)
+    found, model = [], twin.model
+    while model.guide is not None:
+        model = model.guide
+        assert model.mesh.element_type == "hex18"
+        assert model.names == twin.model.names
+        assert model.valve is twin.model.valve
+        found.append(len(model.mesh.elements))
+    assert found == [54 * 6, 24 * 3]
+    # The truth is not guided, nor is who does not want to be.
+    assert twin.truth_model.guide is None
+    assert build_twin(plain(composed("guided=false"))).model.guide is None
+
+
+def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
+    config = plain(composed("experiment=debug", "truth=independent"))
+    twin = build_twin(config)
+    assert twin.truth_model.mesh.element_type == "tet10"
+    assert truth_mesh(config["mesh"], config["truth"])["columns"] == 2 * config["mesh"]["columns"]
+    steps = (twin.truth_model.settings.protocol.dt, twin.model.settings.protocol.dt)
+    assert steps[0] == pytest.approx(steps[1] / 4)
+    assert twin.truth_model.mesh.sha256 != twin.model.mesh.sha256
+
+
+def test_the_default_observation_has_3248_vertices() -> None:
+    observation = plain(composed("experiment=table1"))["observation"]
+    assert observation["columns"] * observation["rows"] == 3248

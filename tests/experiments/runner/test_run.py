@@ -1,0 +1,370 @@
+"""The application: from the command line to its files, messages and exit status."""
+
+import json
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import tables
+from experiments.run import main
+from mvest.closure.model import ClosureModel
+from mvest.estimation import Prediction
+
+ROOT = Path(__file__).resolve().parents[2]
+
+REQUIRED = {
+    "parameters": list,
+    "truth": list,
+    "estimate": list,
+    "std": list,
+    "relative_error": list,
+    "distance_mm": dict,
+    "reason": str,
+    "iterations": int,
+    "forward_solves": int,
+    "seconds": float,
+    "provenance": dict,
+}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the application in an empty folder: exit status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
+        status = main()
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+def test_debug_runs_end_to_end(tmp_path) -> None:
+    finished = subprocess.run(
+        [sys.executable, "-m", "experiments.run", "experiment=debug"],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "E_f.anterior [MPa]" in finished.stdout
+    (folder,) = (tmp_path / "outputs" / "debug").iterdir()
+    record = json.loads((folder / "result.json").read_text())
+    for key, kind in REQUIRED.items():
+        assert isinstance(record[key], kind), key
+    assert record["status"] == "converged"
+    assert set(record["distance_mm"]) == {"mean", "std", "max"}
+    assert max(abs(error) for error in record["relative_error"]) < 1e-4
+    assert len(record["moduli"]) == 6
+    assert (
+        record["closure"]["open"]["orifice_area"] > record["closure"]["closed"]["orifice_area"] > 0
+    )
+    provenance = record["provenance"]
+    assert {"git", "config_hash", "mesh_hash", "seed", "versions", "threads"} <= set(provenance)
+    assert provenance["config_hash"].startswith(folder.name)
+    assert set(provenance["threads"].values()) == {"1"}
+    names = {path.name for path in folder.iterdir()}
+    assert {
+        "debug.csv",
+        "debug.md",
+        "debug.tex",
+        "iterates.png",
+        "valve.pdf",
+        "config.json",
+    } <= names
+    assert not [name for name in names if name.endswith(".tmp")]
+    assert not (tmp_path / "results").exists()
+
+    with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
+        assert database.execute("select name from experiments where name = 'debug'").fetchall()
+        tags = dict(database.execute("select key, value from tags").fetchall())
+        metrics = dict(database.execute("select key, value from latest_metrics").fetchall())
+        settings = dict(database.execute("select key, value from params").fetchall())
+    assert tags["config_hash"] == provenance["config_hash"]
+    assert tags["status"] == "converged"
+    assert {"sweep_id", "git_sha", "mesh_hash"} <= set(tags)
+    assert metrics["estimate.anterior"] == pytest.approx(record["estimate"][0])
+    assert settings["initial.anterior"] == "5.0"
+    assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
+
+
+ERRORS = [
+    ("experiment=nope", "Could not find 'experiment/nope'; known: chord, closure, cycle, debug"),
+    ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
+    ("mesh/nope=a", "Key 'mesh/nope'"),
+    ("filter.inital=[1,2]", "Key 'inital' not in 'FilterConfig'; did you mean initial?"),
+    ("mechanics.elment=tet4", "did you mean element?"),
+    ("mechanics.protocol.dts=1", "mechanics.protocol.dts"),
+    ("sed=3", "did you mean seed?"),
+    ("seed=abc", "seed: Value 'abc' of type 'str' could not be converted to Integer"),
+    ("mesh.columns=many", "mesh.columns: Value 'many'"),
+    ("observation.noise_mm=[1]", "observation.noise_mm"),
+    ("filter=[", "filter=[: no viable alternative"),
+    ("mechanics.protocol.dt=0", "time step dt = 0.0 s, expected > 0"),
+    ("truth.dt_factor=0", "truth.dt_factor = 0.0, expected > 0"),
+    ("truth.refine=0", "truth.refine = 0"),
+    ("truth.values=[1]", "truth.values has 1 values"),
+    ("truth.values=[-1,2]", "E_f = -1.0 MPa, expected > 0"),
+    ("filter.initial=[1,2,3]", "filter.initial has 3 values"),
+    ("filter.initial=[0,2]", "E_f = 0.0 MPa"),
+    ("filter.P0=-1", "filter.P0 = -1: the variance has a negative variance"),
+    ("filter.P0=[[1,2],[3,4]]", "must be symmetric"),
+    ("filter.P0=[[1,2],[2,1]]", "positive semi-definite"),
+    ("filter.P0=much", "filter.P0 = 'much', expected a number"),
+    ("filter.Q=-1", "filter.Q = -1"),
+    ("filter.R=0", "filter.R = 0: R must be positive"),
+    ("filter.R=[1,2,3]", "R has shape (3,)"),
+    ("filter.mode=magic", "filter.mode = 'magic', expected one of paper, extended, iterated"),
+    ("filter.transform=exp", "filter.transform = 'exp'"),
+    ("filter.tolerance=0", "tolerance must be positive"),
+    ("filter.max_iterations=0", "at least one iteration"),
+    ("observation.noise_mm=-1", "noise of -1.0 mm"),
+    ("observation.frames=[shut]", "observed frames ['shut']"),
+    ("observation.columns=7", "template of 7 x 7 vertices"),
+    ("mechanics.element=hex99", "hex99"),
+    ("mechanics.support=glue", "annulus support 'glue'"),
+    ("mechanics.solver=magic", "unknown linear solver 'magic'"),
+    ("mechanics.reading=D", "reading = 'D', expected one of A, C"),
+    ("mechanics.tissue.anterior.ratio=-1", "ratio = -1.0"),
+    ("mesh.rows=0", "rows >= 1"),
+    ("mesh.source=clay", "mesh.source = 'clay', expected structured or tetwild"),
+    ("mesh=unstructured", "an unstructured mesh needs tet10 or tet4"),
+    ("valve.taper=0", "template taper = 0.0"),
+    ("valve.length_anterior=3", "leaflet at phi"),
+    ("parameters=[E_f.middle,E_f.posterior]", "no tissue is given for the region 'middle'"),
+    ("parameters=[E_f.anterior,luck]", "unknown parameter 'luck'"),
+    ("study=magic", "study = 'magic', expected one of twin"),
+    ("hydra.run.dir=file/below", "file/below: Not a directory"),
+    ("paths.outputs=file", "file"),
+    ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),
+    ("sweep=nope", "Could not find 'sweep/nope'; known: "),
+    ("sweep.size=full", "sweep.size"),
+    ("time_limit_s=soon", "time_limit_s: Value 'soon'"),
+    ("force=perhaps", "force: Value 'perhaps'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("override", "words"), ERRORS, ids=[override for override, _ in ERRORS])
+def test_a_wrong_request_is_one_clear_line(run, tmp_path, override: str, words: str) -> None:
+    (tmp_path / "file").touch()
+    first = [] if override.startswith("experiment=") else ["experiment=debug"]
+    status, out, err = run(*first, override)
+    assert status == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert len(err.strip().splitlines()) == 1, err
+    assert words in err
+    assert not list(tmp_path.rglob("result.json"))
+
+
+@pytest.fixture
+def instead_of_closing(monkeypatch):
+    """Put a function of the parameters and the rest positions in the place of the forward model."""
+
+    def replace(function) -> None:
+        monkeypatch.setattr(
+            ClosureModel, "__call__", lambda self, m: function(m, self.valve.surface.vertices)
+        )
+
+    return replace
+
+
+def shrinking(m, rest) -> Prediction:
+    """The valve narrows along x by 1/m[0] and along y by 1/m[1]."""
+    closed = rest * np.array([1 - 1 / m[0], 1 - 1 / m[1], 1.0])
+    slope = np.zeros((2, *rest.shape, 2))
+    slope[1, :, 0, 0] = rest[:, 0] / m[0] ** 2
+    slope[1, :, 1, 1] = rest[:, 1] / m[1] ** 2
+    return Prediction(np.concatenate([rest.ravel(), closed.ravel()]), slope.reshape(-1, 2))
+
+
+def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) -> None:
+    instead_of_closing(lambda m, rest: Prediction.failed("Newton's method did not converge"))
+    status, out, err = run("experiment=debug", "hydra.run.dir=here", "paths.results=published")
+    assert status == 1
+    assert err.startswith("no estimate: no synthetic observation: Newton's method")
+    assert "result.json" in err
+    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert record["status"] == "failed"
+    assert record["estimate"] is None
+    assert record["distance_mm"] is None
+    assert "Newton" in record["reason"]
+    assert "no synthetic observation" in out
+    assert not (tmp_path / "published").exists()
+    with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
+        assert database.execute("select status from runs").fetchall() == [("FAILED",)]
+
+
+def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_closing) -> None:
+    def breaks(m, rest) -> Prediction:
+        at_start = m[0] == 5.0
+        return Prediction.failed("it buckled") if at_start else shrinking(m, rest)
+
+    instead_of_closing(breaks)
+    status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.enabled=false")
+    assert status == 1
+    assert "it buckled" in err
+    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert record["forward_solves"] == 1
+    assert record["estimate"] is None
+    assert record["iterates"] == [[5.0, 3.0]]
+
+
+def test_the_papers_element_says_what_is_wrong_with_it(run, instead_of_closing) -> None:
+    instead_of_closing(shrinking)
+    status, _, err = run("experiment=debug", "mechanics.element=tet4", "tracking.enabled=false")
+    assert status == 0
+    assert err.startswith("note: linear tetrahedra")
+
+
+def test_an_interruption_leaves_nothing_behind(run, tmp_path, instead_of_closing) -> None:
+    def interrupted(m, rest):
+        raise KeyboardInterrupt
+
+    instead_of_closing(interrupted)
+    status, _, err = run("experiment=debug", "hydra.run.dir=here")
+    assert status == 130
+    assert err.startswith("interrupted")
+    assert [path.name for path in (tmp_path / "here").iterdir()] == [".lock"]
+    # Whose turn it was to simulate the truth is all that is known of it.
+    left = [path for path in (tmp_path / "outputs").rglob("*") if path.is_file()]
+    assert [path.suffix for path in left] == [".lock"]
+
+
+def test_an_untracked_result_survives_a_broken_store(run, tmp_path, instead_of_closing) -> None:
+    instead_of_closing(shrinking)
+    status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.uri=nonsense://place")
+    assert status == 0
+    assert "warning: tracking store nonsense://place" in err
+    assert (tmp_path / "here" / "result.json").exists()
+
+
+def test_results_are_renewed_by_the_experiment_as_configured_only(
+    run, tmp_path, instead_of_closing, capsys
+) -> None:
+    instead_of_closing(shrinking)
+    elsewhere = ("tracking.enabled=false", "paths.results=published", "hydra.run.dir=here")
+    status, out, _ = run("experiment=table1", "seed=3", *elsewhere)
+    assert status == 0
+    assert "left as it is" in out
+    assert not (tmp_path / "published").exists()
+
+    status, out, _ = run("experiment=table1", *elsewhere)
+    assert status == 0
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
+    assert {"table1.csv", "table1.md", "table1.tex", "table1.png", "table1_valve.png"} <= set(kept)
+    assert b"paper, Table 1" in kept["table1.md"]
+    # The tables follow from the record alone.
+    for name in kept:
+        if "valve" not in name:
+            (tmp_path / "published" / name).unlink()
+    assert tables.main([str(tmp_path / "published")]) == 0
+    capsys.readouterr()
+    again = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
+    assert again == kept
+
+
+def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of_closing) -> None:
+    calls = []
+
+    def counted(m, rest) -> Prediction:
+        calls.append(m)
+        return shrinking(m, rest)
+
+    instead_of_closing(counted)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false")
+    status, first, err = run(*usual)
+    assert status == 0, err
+    (folder,) = (tmp_path / "outputs" / "debug").iterdir()
+    assert (folder / "done").exists()
+    once = len(calls)
+    status, again, _ = run(*usual)
+    assert (status, len(calls)) == (0, once)
+    assert "force=true runs it again" in again
+    assert again.splitlines()[:5] == first.splitlines()[:5]
+    assert run(*usual, "force=true")[0] == 0
+    assert len(calls) > once
+
+
+def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
+    instead_of_closing(shrinking)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "hydra.run.dir=here")
+    assert run(*usual)[0] == 0
+    _, out, _ = run(*usual, "seed=2")
+    assert "force=true" not in out
+    assert json.loads(Path("here/result.json").read_text())["provenance"]["seed"] == 2
+
+
+def test_a_dry_run_writes_nothing(run, tmp_path) -> None:
+    status, out, err = run("experiment=debug", "dry_run=true")
+    assert status == 0, err
+    assert "1 jobs, 0 done" in out
+    assert "time unknown" in out
+    assert not list(tmp_path.iterdir())
+    status, out, err = run("experiment=debug", "dry_run=true", "filter.P0=-1")
+    assert (status, out) == (2, "")
+    assert "filter.P0 = -1" in err
+
+
+@pytest.mark.slow
+def test_an_experiment_of_several_runs_keeps_a_record_of_each(
+    run, tmp_path, instead_of_closing
+) -> None:
+    instead_of_closing(shrinking)
+    status, _, err = run(
+        "experiment=mesh_independence",
+        "hydra/launcher=basic",
+        "isolate=false",
+        "tracking.enabled=false",
+        "paths.results=published",
+    )
+    assert status == 0, err
+    kept = sorted(path.name for path in (tmp_path / "published" / "records").iterdir())
+    assert kept == [
+        "mesh-independence-hex18-structured-36-x-4.json",
+        "mesh-independence-hex18-structured-36-x-8.json",
+        "mesh-independence-hex18-structured-40-x-5.json",
+        "mesh-independence-hex18-structured-54-x-6.json",
+        "mesh-independence-hex18-structured-72-x-8.json",
+    ]
+    table = (tmp_path / "published" / "mesh_independence.md").read_text(encoding="utf-8")
+    assert table.count("hex18 structured") == 5
+
+
+def test_tables_without_records_say_what_to_do(tmp_path, capsys) -> None:
+    assert tables.main([str(tmp_path)]) == 2
+    assert "experiment=table1" in capsys.readouterr().err
+    assert tables.main(["a", "b"]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+@pytest.mark.slow
+def test_a_sweep_runs_in_workers_and_logs_to_one_store(tmp_path) -> None:
+    finished = subprocess.run(
+        [
+            *(sys.executable, "-m", "experiments.run", "--multirun", "experiment=debug"),
+            *("seed=1,2", "hydra.launcher.n_jobs=2"),
+        ],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert len(list((tmp_path / "outputs" / "debug").glob("*/result.json"))) == 2
+    with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
+        sweeps = database.execute("select value from tags where key = 'sweep_id'").fetchall()
+    assert len(sweeps) == 2
+    assert len(set(sweeps)) == 1
+    assert sweeps[0] != ("none",)

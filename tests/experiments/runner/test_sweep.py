@@ -1,0 +1,415 @@
+"""Sweeps: planned, run, resumed and collected. The study itself takes no time here."""
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.common import progress
+from experiments.common.progress import SweepBar
+from experiments.run import main
+from experiments.runner import guard, sweep
+from experiments.runner.folder import mark_done, write_failure
+from experiments.runner.job import STUDIES
+from experiments.runner.plan import Plan, PlannedJob
+from experiments.runner.request import Request
+from mvest.provenance import write_json
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = ("hydra/launcher=basic", "tracking.enabled=false")
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run a sweep in an empty folder: exit status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+    fake = Path(__file__).with_name("fake_worker.py")
+    monkeypatch.setattr(guard, "WORKER", (sys.executable, str(fake)))
+    for name in guard.THREAD_VARIABLES:
+        monkeypatch.setenv(name, "1")
+    guard.own_worker.cache_clear()
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments, *QUICK])
+        status = main()
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    yield call
+    guard.own_worker().close()
+    guard.own_worker.cache_clear()
+
+
+DEBUG = Path("outputs/sweep_debug")
+
+
+def collected() -> dict:
+    return json.loads((DEBUG / "sweep.json").read_text())
+
+
+def runs() -> list[str]:
+    place = Path("runs")
+    return place.read_text().split() if place.exists() else []
+
+
+def test_a_sweep_is_planned_run_and_collected(run):
+    status, out, err = run("sweep=debug", "publish=true")
+    assert status == 0, err
+    plan = json.loads((DEBUG / "plan.json").read_text())
+    assert (plan["sweep"], plan["size"], len(plan["jobs"])) == ("debug", "small", 4)
+    first = plan["jobs"][0]
+    assert first["hash"] == first["folder"]
+    assert first["factors"] == {"start_anterior": 5.0, "start_posterior": 3.0, "seed": 1}
+    assert {"filter.initial=[5,3]", "seed=1"} <= set(first["overrides"])
+    for job in plan["jobs"]:
+        folder = DEBUG / job["folder"]
+        assert (folder / "done").read_bytes() == b""
+        assert f"seed {job['factors']['seed']}" in (folder / "log.txt").read_text()
+
+    found = collected()
+    assert [job["hash"] for job in found["jobs"]] == [job["hash"] for job in plan["jobs"]]
+    assert [job["status"] for job in found["jobs"]] == ["converged"] * 4
+    assert [job["runs"][0]["seed"] for job in found["jobs"]] == [1, 2, 1, 2]
+    assert found["jobs"][1]["runs"][0]["estimate"] == [6.2, 2.0]
+    assert found["jobs"][2]["initial"] == [4.0, 2.0]
+    assert (found["truth_hits"], found["truth_misses"]) == (4, 0)
+    assert found["sweep"]["kind"] == "initial_guess"
+    assert "factors" not in found["settings"]
+    assert json.loads(Path("results/sweeps/debug.json").read_text()) == found
+    lines = Path("results/sweep_debug.csv").read_text().splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == 1 + 4
+    assert "4 jobs, 0 done" in out
+
+
+def test_only_what_is_missing_or_failed_is_run_again(run):
+    Path("kill-2").touch()
+    Path("raise-1").touch()
+    usual = ("sweep=debug", "sweep.size=small", "publish=true")
+    status, out, err = run(*usual)
+    assert status == 1
+    assert "2 of 4 jobs done" in out
+    assert "2 without an estimate" in out
+    reasons = [job["reason"] for job in collected()["jobs"]]
+    assert reasons[0] == "RuntimeError: it broke"
+    assert reasons[1].startswith("killed by signal 9")
+    assert "seed=1: RuntimeError: it broke" in err
+    assert "seed=2: killed by signal 9" in err
+    assert "Traceback" in (DEBUG / collected()["jobs"][0]["hash"] / "log.txt").read_text()
+    with_failures = Path("results/sweep_debug.csv").read_text()
+    assert with_failures.count("failed") == 2
+
+    status, out, err = run(*usual)
+    assert (status, err) == (0, "")
+    assert "2 done, 2 failed before, 2 to run" in out
+    assert runs() == ["1", "2", "1", "2", "1", "2"]
+    resumed = Path("results/sweep_debug.csv").read_bytes()
+
+    status, out, _ = run(*usual)
+    assert "nothing left" in out
+    assert len(runs()) == 6
+    assert Path("results/sweep_debug.csv").read_bytes() == resumed
+
+    status, out, _ = run(*usual, "force=true")
+    assert status == 0
+    assert len(runs()) == 10
+    # Undisturbed, the table is the same one, byte for byte.
+    assert Path("results/sweep_debug.csv").read_bytes() == resumed
+
+
+def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
+    status, out, err = run("sweep=debug", "dry_run=true")
+    assert (status, err) == (0, "")
+    assert not Path("outputs").exists()
+    assert out.count("  run   ") == 4
+    assert "time unknown" in out
+    Path("raise-2").touch()
+    run("sweep=debug")
+    _, out, _ = run("sweep=debug", "dry_run=true")
+    assert out.count("  done  ") == 3
+    assert "seed=2  [failed before: RuntimeError: it broke]" in out
+    assert "about " in out
+    assert len(runs()) == 4
+
+
+@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_sweep", "_tell"])
+def test_nothing_is_launched_after_a_mistake_of_ours(run, monkeypatch, broken):
+    # Hydra only warns of what a callback raises, and would then launch every job in its own way.
+    def fail(*_):
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setattr(sweep, broken, fail)
+    dry = ("dry_run=true",) if broken == "_tell" else ()
+    with pytest.raises(ZeroDivisionError):
+        run("sweep=debug", *dry)
+    assert runs() == []
+    assert not list(Path().rglob("result.json"))
+
+
+def test_a_closed_pipe_ends_a_dry_run(run, monkeypatch):
+    def closed(_):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(sweep, "_tell", closed)
+    status, _, err = run("sweep=debug", "dry_run=true")
+    assert status == 2
+    assert "Broken pipe" in err
+    assert not Path("outputs").exists()
+
+
+def test_a_sweep_may_be_the_union_of_grids(run):
+    status, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true")
+    assert status == 0
+    assert "5 jobs" in out
+    # What the command line says holds for every grid.
+    _, out, _ = run("sweep=debug", "sweep.size=full", "dry_run=true", "filter.initial=[9,9],[1,1]")
+    assert out.count("start_anterior=9.0") == 3
+
+
+def test_a_sweep_from_the_command_line_is_planned_as_well(run):
+    status, out, _ = run("-m", "experiment=debug", "seed=1,2,3")
+    assert status == 0
+    found = json.loads(Path("outputs/debug/sweep.json").read_text())
+    assert found["sweep"] == {"name": "debug", "size": None, "kind": None}
+    assert [job["runs"][0]["seed"] for job in found["jobs"]] == [1, 2, 3]
+    _, out, _ = run("-m", "experiment=debug", "seed=1,2,3,4")
+    assert "3 done, 0 failed before, 1 to run" in out
+
+
+def test_results_are_renewed_by_a_sweep_as_configured_only(run):
+    _, out, _ = run("sweep=debug", "publish=true", "filter.tolerance=1e-3")
+    assert "left as it is" in out
+    run("sweep=debug", "publish=true", "sweep.small.seed='1'")
+    assert not Path("results").exists()
+    run("sweep=debug", "publish=true", "sweep.size=full")
+    assert json.loads(Path("results/sweeps/debug.json").read_text())["sweep"]["size"] == "full"
+
+
+WRONG = [
+    (("sweep=nope",), "Could not find 'sweep/nope'; known: "),
+    (("sweep=debug", "sweep.size=huge"), "sweep.size = 'huge', expected one of small, full"),
+    (("sweep=debug", "sweep.sise=full"), "did you mean size?"),
+    (("sweep=debug", "sed=1,2"), "did you mean seed?"),
+    (("sweep=debug", "mesh=coarse,huge"), "Could not find 'mesh/huge'; known: coarse"),
+    (("sweep=debug", "seed=1,many"), "seed: Value 'many'"),
+    (("sweep=debug", "filter.P0=0.01,-1"), "filter.P0 = -1: the variance has a negative variance"),
+    (("sweep=debug", "filter.P0=1,[[1,2],[3,4]]"), "must be symmetric"),
+    (("sweep=debug", "filter.P0=1,[[1,2],[2,1]]"), "positive semi-definite"),
+    (("sweep=debug", "filter.Q=-1"), "filter.Q = -1"),
+    (("sweep=debug", "filter.R=1,0"), "filter.R = 0: R must be positive"),
+    (("sweep=debug", "filter.mode=paper,magic"), "filter.mode = 'magic'"),
+    (("sweep=debug", "filter.initial=[5,3],[1,2,3]"), "filter.initial has 3 values"),
+    (("sweep=debug", "observation.noise_mm=0,-1"), "observation.noise_mm = -1.0"),
+    (("sweep=debug", "time_limit_s=0"), "time_limit_s = 0.0, expected > 0"),
+    (("sweep=debug", "study=magic"), "study = 'magic', expected one of twin"),
+    (("sweep=debug", "seed=1,1"), "two jobs are one and the same: "),
+    (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
+    (("sweep=debug", "paths.outputs=file"), "file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("overrides", "words"), WRONG, ids=[" ".join(o) for o, _ in WRONG])
+def test_a_wrong_sweep_is_one_clear_line_and_launches_nothing(run, overrides, words):
+    Path("file").touch()
+    status, out, err = run(*overrides)
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ")
+    assert len(err.splitlines()) == 1, err
+    assert words in err
+    assert runs() == []
+    assert [path.name for path in Path().rglob("*") if path.is_file()] == ["file"]
+
+
+def test_a_wrong_job_is_named(run):
+    _, _, err = run("sweep=debug", "filter.P0=0.01,-1")
+    assert "filter.initial=[5,3]" in err
+    assert "filter.P0=-1" in err
+
+
+def test_equal_jobs_are_both_named(run):
+    _, _, err = run("sweep=debug", "filter.initial=[5,3],[5.0,3.0]")
+    assert "filter.initial=[5,3]" in err
+    assert "filter.initial=[5.0,3.0]" in err
+
+
+def test_a_full_disk_is_a_clear_error_and_leaves_no_half_file(run, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        status, out, err = run("sweep=debug")
+    assert (status, out) == (2, "")
+    assert "plan.json: No space left on device" in err
+    assert len(err.splitlines()) == 1
+    assert not [path for path in Path().rglob("*") if path.is_file()]
+
+
+def test_a_disk_that_fills_up_within_a_job_costs_its_row(run):
+    Path("full-2").touch()
+    status, _, err = run("sweep=debug")
+    assert status == 1
+    assert err.count("No space left on device") == 1
+    assert "result.json: No space left on device" in collected()["jobs"][1]["reason"]
+
+
+def test_a_launcher_that_loses_its_jobs_is_told_in_a_line_and_can_go_on(run, monkeypatch):
+    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+    def lose(self, job_overrides, initial_job_idx):
+        raise RuntimeError("a worker died. At length.")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(BasicLauncher, "launch", lose)
+        status, _, err = run("sweep=debug", "publish=true")
+    assert status == 1
+    assert err.startswith("error: the launcher lost its jobs (RuntimeError: a worker died); run ")
+    assert len(err.splitlines()) == 1
+    assert [job["reason"] for job in collected()["jobs"]] == ["not run"] * 4
+    assert not Path("results").exists()
+    assert run("sweep=debug")[0] == 0
+
+
+def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
+    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+    def interrupt(self, job_overrides, initial_job_idx):
+        raise KeyboardInterrupt
+
+    run("sweep=debug", "filter.initial=[5,3]")
+    monkeypatch.setattr(BasicLauncher, "launch", interrupt)
+    status, _, err = run("sweep=debug")
+    assert status == 130
+    assert err.startswith("interrupted")
+    states = [job["status"] for job in collected()["jobs"]]
+    assert states == ["converged", "converged", "failed", "failed"]
+
+
+def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
+    told = replace(STUDIES["twin"], text=lambda record: f"told: {record['status']}")
+    monkeypatch.setitem(STUDIES, "twin", told)
+    alone = ("experiment=debug", "time_limit_s=600", "seed=2")
+    Path("raise-2").touch()
+    status, _, err = run(*alone)
+    assert status == 1
+    assert err.startswith("no estimate: RuntimeError: it broke (recorded in ")
+    status, out, err = run(*alone)
+    assert (status, err) == (0, "")
+    assert out.startswith("told: converged")
+
+
+def planned(folder: Path, seed: int) -> PlannedJob:
+    values = {
+        **{"name": "a", "title": "b", "row": "c", "table": "d", "paper": None, "seed": seed},
+        **{"parameters": ["x"], "factors": {"seed": seed}, "truth": {"values": [1.0]}},
+        **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
+        **{"mechanics": {"element": "hex18"}, "force": False},
+        **{"mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured"}},
+    }
+    folder = folder / str(seed)
+    folder.mkdir()
+    return PlannedJob(f"{seed}" * 64, folder, (f"seed={seed}",), values, None, False)
+
+
+def end(job: PlannedJob, status: str, reason: str) -> None:
+    asked = Request(job.values, job.config_hash, job.folder)
+    record = write_failure(asked, reason, time.time()) | {"status": status}
+    write_json(job.folder / "result.json", record)
+
+
+def test_the_bar_counts_and_names_failures(tmp_path, monkeypatch, capsys):
+    true = progress.tqdm
+    shown = io.StringIO()
+
+    def visible(**settings):
+        return true(**{**settings, "disable": False, "file": shown})
+
+    visible.write, visible.format_interval = true.write, true.format_interval
+    monkeypatch.setattr(progress, "tqdm", visible)
+    jobs = [planned(tmp_path, seed) for seed in (1, 2, 3)]
+    end(jobs[1], "failed", "an old failure")
+    with SweepBar(Plan("trial", tmp_path, {}, tuple(jobs), 1)) as bar:
+        bar.look()
+        assert (bar._done, bar._failed) == (0, 0)
+        end(jobs[0], "converged", "")
+        bar.look()
+        # On disk, but what follows its result is not.
+        assert (bar._done, bar._failed) == (0, 0)
+        mark_done(jobs[0].folder)
+        end(jobs[1], "failed", "it buckled")
+        bar.look()
+        assert (bar._done, bar._failed, bar._bar.n) == (1, 1, 2)
+    assert "seed=2: it buckled" in capsys.readouterr().err
+    assert "1 done, 1 failed, 0 skipped" in shown.getvalue()
+
+
+def sweep_process(folder: Path, *more: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-m", "experiments.run", "sweep=debug", "publish=true"),
+            *("tracking.enabled=false", "hydra.launcher.n_jobs=2", *more),
+        ],
+        cwd=folder,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(folder)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def worker_of(folder: Path) -> int:
+    """A process that is in the middle of a job: its output goes to the job's log."""
+    while True:
+        for place in Path("/proc").glob("[0-9]*"):
+            try:
+                here = (place / "cwd").readlink() == folder
+                busy = here and (place / "fd" / "1").readlink().name == "log.txt"
+                if busy and b"experiments.runner.worker" in (place / "cmdline").read_bytes():
+                    return int(place.name)
+            except OSError:
+                continue
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> bytes:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    finished = sweep_process(folder)
+    _, err = finished.communicate(timeout=600)
+    assert finished.returncode == 0, err
+    return (folder / "results" / "sweep_debug.csv").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
+@pytest.mark.parametrize("victim", ["job", "launcher"])
+def test_a_sweep_whose_worker_was_killed_ends_as_an_undisturbed_one(tmp_path, undisturbed, victim):
+    running = sweep_process(tmp_path)
+    while not list(tmp_path.glob("outputs/sweep_debug/*/done")):
+        assert running.poll() is None
+        time.sleep(0.05)
+    pid = worker_of(tmp_path)
+    if victim == "launcher":
+        pid = int(Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1].split()[1])
+    os.kill(pid, 9)
+    out, err = running.communicate(timeout=600)
+    found = json.loads((tmp_path / "outputs" / "sweep_debug" / "sweep.json").read_text())
+    lost = [job["reason"] for job in found["jobs"] if job["status"] == "failed"]
+    assert running.returncode == 1, out + err
+    if victim == "job":
+        assert len(lost) == 1
+        assert lost[0].startswith("killed by signal 9")
+    else:
+        assert "the launcher lost its jobs" in err
+        assert lost
+
+    again = sweep_process(tmp_path)
+    out, err = again.communicate(timeout=600)
+    assert again.returncode == 0, out + err
+    assert (tmp_path / "results" / "sweep_debug.csv").read_bytes() == undisturbed

@@ -1,0 +1,416 @@
+"""Tracking: from a job's folder to MLflow, also when the store is locked, away or lost."""
+
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from experiments import sync
+from experiments.dashboard import save_comparison, view_state
+from experiments.runner import comparison, tracking
+from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
+from mvest.errors import ConfigurationError, InputError
+
+NAMES = ["E_f.anterior", "E_f.posterior"]
+
+
+@pytest.fixture(scope="module")
+def empty_database(tmp_path_factory) -> Path:
+    """A tracking database without the experiment: MLflow takes seconds to make one."""
+    folder = tmp_path_factory.mktemp("store")
+    open_store(None, folder, "another")
+    return folder / "mlflow.db"
+
+
+@pytest.fixture(autouse=True)
+def database(tmp_path, empty_database) -> None:
+    shutil.copy(empty_database, tmp_path / "mlflow.db")
+
+
+def make_config(outputs: Path, **changes) -> dict:
+    config = {
+        "name": "debug",
+        "study": "twin",
+        "title": "A quick check",
+        "parameters": NAMES,
+        "seed": 1,
+        "repeats": 1,
+        "factors": {"noise": 0.5, "kind": "white"},
+        "valve": {"taper": 0.75},
+        "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
+        "mechanics": {"element": "hex18"},
+        "filter": {"mode": "paper", "initial": [5.0, 3.0], "P0": 0.01, "Q": 0.01, "R": 1e-4},
+        "observation": {"frames": ["open", "closed"], "noise_mm": 0.5},
+        "truth": {"values": [6.23, 2.09], "source": None},
+        "donor": {"vertices": 430},
+        "paths": {"outputs": str(outputs)},
+        "tracking": {"enabled": True, "uri": None},
+    }
+    return config | changes
+
+
+def make_record(config_hash: str = "c" * 64, **changes) -> dict:
+    record = {
+        "experiment": "debug",
+        "row": "white noise",
+        "status": "converged",
+        "reason": "tolerance",
+        "parameters": NAMES,
+        "estimate": [6.0, 2.0],
+        "std": [0.1, 0.05],
+        "relative_error": [-0.04, 0.02],
+        "distance_mm": {"mean": 0.1, "std": 0.05, "max": 0.4},
+        "distance_to_truth_mm": None,
+        "iterations": 2,
+        "forward_solves": 3,
+        "seconds": 4.0,
+        "seconds_total": 5.0,
+        "iterates": [[5.0, 3.0], [6.0, 2.0]],
+        "mesh": {"sha256": "m" * 64, "nodes": 700, "truth_sha256": "t" * 64},
+        "model": {"element": "hex18", "cells": [24, 3, 1]},
+        "provenance": {
+            "config_hash": config_hash,
+            "mesh_hash": "m" * 64,
+            "seed": 1,
+            "git": {"sha": "a" * 40},
+        },
+    }
+    return record | changes
+
+
+def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
+    folder = outputs / "debug" / name
+    folder.mkdir(parents=True)
+    record = make_record((name * 64)[:64], **changes)
+    (folder / "config.json").write_text(json.dumps(config or make_config(outputs)))
+    (folder / "result.json").write_text(json.dumps(record))
+    (folder / "iterates.png").write_bytes(b"picture")
+    if record["status"] == "converged":
+        (folder / "done").touch()
+    return folder
+
+
+def stored(outputs: Path) -> list:
+    return open_store(None, outputs, "debug").list_runs()
+
+
+# --- what is compared ---------------------------------------------------------------------------
+
+
+def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
+    config = make_config(tmp_path)
+    config["filter"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
+    found = comparison.parameters(config, make_record())
+    assert found["P0"] == "0.01"
+    assert (found["initial.anterior"], found["initial.posterior"]) == ("5.0", "3.0")
+    assert (found["Q.anterior"], found["Q.posterior"]) == ("0.1", "0.2")
+    assert found["noise"] == "0.5"
+    assert found["kind"] == "white"
+    assert found["truth.posterior"] == "2.09"
+    assert not [name for name in found if name.startswith(("paths", "tracking", "donor"))]
+    assert "truth.source" not in found, "a setting that is not set would make its axis no number"
+
+
+def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
+    runs = [
+        {"seed": 4, "status": "converged", "estimate": [6.0, 2.0], "std": [0.1, 0.1],
+         "relative_error": [-0.04, 0.02], "seconds": 1.0, "forward_solves": 3, "iterations": 2},
+        {"seed": 5, "status": "converged", "estimate": [6.4, 2.0], "std": [0.1, 0.1],
+         "relative_error": [0.02, 0.04], "seconds": 2.0, "forward_solves": 3, "iterations": 4},
+        {"seed": 6, "status": "failed", "estimate": None, "std": None, "relative_error": None,
+         "seconds": 3.0, "forward_solves": 1, "iterations": 0},
+    ]  # fmt: skip
+    found = comparison.metrics(make_record(repeats=runs))
+    single = {name: value for name, value, _ in found if not name.startswith(("repeat", "iterate"))}
+    assert single["error.anterior"] == pytest.approx((4 + 2) / 2)
+    assert single["error.mean"] == pytest.approx((4 + 2 + 2 + 4) / 4)
+    assert single["estimate.anterior"] == pytest.approx(6.2)
+    assert single["spread.anterior"] == pytest.approx(0.4 / 2**0.5)
+    assert (single["failed"], single["seconds"], single["iterations"]) == (1, 6.0, 2)
+    seeds = [(v, step) for name, v, step in found if name == "repeat.estimate.anterior"]
+    assert seeds == [(6.0, 4), (6.4, 5)]
+
+
+def test_a_failed_run_has_no_errors() -> None:
+    nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
+    record = make_record(status="failed", mesh={}, repeats=[], **nothing)
+    found = {name: value for name, value, _ in comparison.metrics(record)}
+    assert found["failed"] == 1
+    assert not [name for name in found if name.startswith(("error", "estimate", "distance"))]
+
+
+def test_axes_are_what_varies_in_the_order_of_a_study() -> None:
+    settings = {"noise": "0.5", "filter": "paper", "P0": "0.1", "initial.a": "5", "rows": "3"}
+    numbers = ["error.mean", "error.a", "seconds"]
+    settings |= {"cells": "3"}
+    changed = {"rows": "4", "cells": "4", "filter": "iterated"}
+    runs = [(settings, numbers), ({**settings, **changed}, numbers)]
+    assert comparison.axes(runs) == (
+        ["P0", "initial.a", "noise", "rows"],
+        ["error.a", "error.mean"],
+    )
+
+
+# --- upload -------------------------------------------------------------------------------------
+
+
+def test_a_job_becomes_one_flat_run(tmp_path) -> None:
+    job = make_job(tmp_path)
+    assert upload(open_store(None, tmp_path, "debug"), job, "sweep-1")
+    (run,) = stored(tmp_path)
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name == "white noise"
+    tags = run.data.tags
+    assert tags["sweep_id"] == "sweep-1"
+    assert (tags["config_hash"], tags["mesh_hash"]) == (("job" * 64)[:64], "m" * 64)
+    assert (tags["git_sha"], tags["status"], tags["reason"]) == ("a" * 40, "converged", "tolerance")
+    assert "mlflow.parentRunId" not in tags
+    assert float(run.data.params["P0"]) == 0.01
+    assert run.data.metrics["error.anterior"] == pytest.approx(4.0)
+    inputs = {one.tags[0].value: one.dataset for one in run.inputs.dataset_inputs}
+    assert inputs["mesh"].digest == "m" * 36
+    assert json.loads(inputs["observation"].source)["noise_mm"] == 0.5
+    kept = tmp_path / "mlartifacts" / run.info.run_id / "artifacts"
+    assert {path.name for path in kept.iterdir()} == {"config.json", "result.json", "iterates.png"}
+
+
+def test_upload_again_changes_nothing(tmp_path) -> None:
+    job = make_job(tmp_path)
+    for _ in range(2):
+        store = open_store(None, tmp_path, "debug")
+        upload(store, job, "sweep-1")
+    (job / RECEIPT).unlink()
+    assert not upload(store, job, None)
+    (run,) = stored(tmp_path)
+    assert run.data.tags["sweep_id"] == "sweep-1"
+    assert json.loads((job / RECEIPT).read_text())["run_id"] == run.info.run_id
+
+
+def test_a_new_result_takes_the_place_of_the_old_one(tmp_path) -> None:
+    job = make_job(tmp_path)
+    store = open_store(None, tmp_path, "debug")
+    upload(store, job, "sweep-1")
+    assert tracking.is_tracked(job)
+    changed = make_record(("job" * 64)[:64], estimate=[6.1, 2.1])
+    (job / "result.json").write_text(json.dumps(changed))
+    assert not tracking.is_tracked(job)
+    assert upload(store, job, None)
+    (run,) = stored(tmp_path)
+    assert run.data.metrics["estimate.anterior"] == 6.1
+    assert run.data.tags["sweep_id"] == "sweep-1"
+
+
+def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch) -> None:
+    job = make_job(tmp_path)
+    store = open_store(None, tmp_path, "debug")
+    with monkeypatch.context() as patch:
+        patch.setattr(store.client, "log_inputs", lambda *_, **__: 1 / 0)
+        with pytest.raises(TrackingError):
+            upload(store, job, "sweep-1")
+    assert not (job / RECEIPT).exists()
+    assert [run.info.status for run in stored(tmp_path)] == ["RUNNING"]
+    assert upload(open_store(None, tmp_path, "debug"), job, "sweep-1")
+    assert [run.info.status for run in stored(tmp_path)] == ["FINISHED"]
+
+
+def test_a_failed_run_is_told_with_its_reason(tmp_path) -> None:
+    nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
+    killed = {"status": "failed", "reason": "killed by signal 9", "mesh": {}, "repeats": []}
+    upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, **killed, **nothing), "s")
+    (run,) = stored(tmp_path)
+    assert (run.info.status, run.data.tags["reason"]) == ("FAILED", "killed by signal 9")
+
+
+def test_a_password_is_not_written_down(tmp_path) -> None:
+    address = "postgresql+psycopg://me:" + "secret@db.example.org/mlflow"
+    with pytest.raises(ConfigurationError, match=r"pgpass") as refused:
+        open_store(address, tmp_path, "debug")
+    assert "secret" not in str(refused.value)
+
+
+# --- a locked database, and `sync` --------------------------------------------------------------
+
+
+def test_a_locked_database_costs_one_line_and_sync_makes_up_for_it(
+    tmp_path, capsys, monkeypatch
+) -> None:
+    job, other = make_job(tmp_path, "a"), make_job(tmp_path, "b")
+    open_store(None, tmp_path, "debug")
+    place = f"sqlite:///{tmp_path / 'mlflow.db'}?timeout=0.2"
+    real = tracking.open_store
+    monkeypatch.setattr(tracking, "open_store", lambda _, *more: real(place, *more))
+    holder = sqlite3.connect(tmp_path / "mlflow.db", isolation_level=None)
+    holder.execute("begin exclusive")
+    tracking.track_job(job, make_config(tmp_path))
+    said = capsys.readouterr().err
+    assert "database is locked" in said
+    assert "make sync" in said
+    assert len(said.strip().splitlines()) == 1
+    assert not (job / RECEIPT).exists()
+    holder.execute("rollback")
+    holder.close()
+
+    assert sync.main([str(tmp_path)]) == 0
+    assert "debug: 2 uploaded, 0 already there" in capsys.readouterr().out
+    assert len(stored(tmp_path)) == 2
+    assert tracking.is_tracked(job)
+    assert tracking.is_tracked(other)
+    assert sync.main([str(tmp_path)]) == 0
+    assert "debug: 0 uploaded, 2 already there" in capsys.readouterr().out
+
+
+def test_a_lost_database_is_rebuilt(tmp_path, capsys, empty_database) -> None:
+    jobs = [make_job(tmp_path, name) for name in "abc"]
+    store = open_store(None, tmp_path, "debug")
+    for job in jobs:
+        upload(store, job, "sweep-1")
+    before = {run.data.tags["folder"]: run.data.metrics for run in stored(tmp_path)}
+    # A process keeps its databases open, so it is lost together with its folder's name.
+    rescued = tmp_path / "rescued"
+    shutil.copytree(tmp_path / "debug", rescued / "debug")
+    shutil.copy(empty_database, rescued / "mlflow.db")
+    assert sync.main([str(rescued)]) == 0
+    assert "3 uploaded" in capsys.readouterr().out
+    after = stored(rescued)
+    assert {run.data.tags["folder"]: run.data.metrics for run in after} == before
+    assert {run.data.tags["sweep_id"] for run in after} == {"sweep-1"}
+
+
+def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read(
+    tmp_path, capsys
+) -> None:
+    make_job(tmp_path, "a", make_config(tmp_path, tracking={"enabled": False, "uri": None}))
+    (make_job(tmp_path, "b") / "done").unlink()  # killed before everything was on disk
+    (make_job(tmp_path, "c") / "config.json").write_text("{")
+    make_job(tmp_path, "d")
+    assert sync.main([str(tmp_path)]) == 1
+    captured = capsys.readouterr()
+    assert [run.data.tags["folder"] for run in stored(tmp_path)] == ["d"]
+    assert captured.err.count("left out") == 1
+    assert "config.json" in captured.err
+    assert sync.main([str(tmp_path / "nowhere")]) == 2
+
+
+# --- a sweep ------------------------------------------------------------------------------------
+
+
+def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sync, "INTERVAL", 0.05)
+    upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, "before"), "an-earlier-sweep")
+    untracked = make_config(tmp_path)
+    untracked["tracking"]["enabled"] = False
+    make_job(tmp_path, "kept-quiet", untracked)
+    plan = {"jobs": [{"folder": name} for name in ("before", "kept-quiet", "a", "b")]}
+    (tmp_path / "debug" / "plan.json").write_text(json.dumps(plan))
+    uploader = sync.SweepUploader(None, tmp_path, "debug")
+    uploader.start()
+    job = make_job(tmp_path, "a")
+    until = time.monotonic() + 30.0
+    while not (job / RECEIPT).exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert (job / RECEIPT).exists()
+    make_job(tmp_path, "b")
+    make_job(tmp_path, "of-another-sweep")
+    uploader.finish()
+    found = {run.data.tags["folder"]: run.data.tags["sweep_id"] for run in stored(tmp_path)}
+    sweep = json.loads((tmp_path / "debug" / sync.LAST_SWEEP).read_text())
+    # Whoever sweeps with tracking wants to see the whole sweep, whatever its jobs were told before.
+    assert sweep["jobs"] == ["a", "b", "before", "kept-quiet"]
+    assert {name for name, one in found.items() if one == sweep["sweep_id"]} == set(sweep["jobs"])
+    assert found["of-another-sweep"] == "none"
+
+    store, compared = save_comparison(tmp_path)
+    assert len(compared.runs) == 4
+    assert compared.parameters[:2] == ("P0", "initial.anterior")
+    assert compared.metrics == ("error.anterior", "error.posterior", "error.mean")
+    tags = store.client.get_experiment(store.experiment).tags
+    saved = json.loads(tags["mlflow.sharedViewState.last_sweep"])
+    assert json.loads(saved["state"]) == view_state(compared)
+
+    again = sync.SweepUploader(None, tmp_path, "debug")
+    again.start()
+    again.finish()
+    resumed = json.loads((tmp_path / "debug" / sync.LAST_SWEEP).read_text())
+    assert resumed["sweep_id"] == sweep["sweep_id"], "a resumed sweep is the same sweep"
+
+
+def test_a_sweep_without_its_store_warns_once(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sync, "INTERVAL", 0.05)
+    uploader = sync.SweepUploader("nonsense://place", tmp_path, "debug")
+    uploader.start()
+    job = make_job(tmp_path, "a")
+    uploader.finish()
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 2
+    assert "tracking store nonsense://place" in said[0]
+    assert said[1] == "warning: 1 of 1 runs are not in MLflow"
+    assert (job / "result.json").exists()
+
+
+def test_no_sweep_is_said_so(tmp_path) -> None:
+    with pytest.raises(InputError, match="no finished sweep"):
+        save_comparison(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sync, "INTERVAL", 0.05)
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+
+    def serve() -> subprocess.Popen:
+        command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1"]
+        command += ["--port", "50917", "--workers", "1", "--backend-store-uri"]
+        command += [
+            f"sqlite:///{tmp_path}/server.db",
+            "--artifacts-destination",
+            f"{tmp_path}/kept",
+        ]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        server = subprocess.Popen(command, start_new_session=True, **quiet)
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            try:
+                with urllib.request.urlopen("http://127.0.0.1:50917/health", timeout=1.0):
+                    return server
+            except OSError:
+                time.sleep(0.1)
+        raise AssertionError("the server did not start")
+
+    def kill(server: subprocess.Popen) -> None:
+        os.killpg(server.pid, signal.SIGKILL)
+        server.wait()
+
+    uri = "http://127.0.0.1:50917"
+    config = make_config(tmp_path, tracking={"enabled": True, "uri": uri})
+    server = serve()
+    try:
+        uploader = sync.SweepUploader(uri, tmp_path, "debug")
+        uploader.start()
+        first = make_job(tmp_path, "a", config)
+        until = time.monotonic() + 60.0
+        while not (first / RECEIPT).exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        assert (first / RECEIPT).exists()
+        kill(server)
+        second = make_job(tmp_path, "b", config)
+        uploader.finish()
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 2
+        assert said[1] == "warning: 1 of 2 runs are not in MLflow"
+        assert not (second / RECEIPT).exists()
+        server = serve()
+        assert sync.main([str(tmp_path)]) == 0
+        assert "debug: 1 uploaded, 1 already there" in capsys.readouterr().out
+        found = open_store(uri, tmp_path, "debug").list_runs()
+        assert sorted(run.data.tags["folder"] for run in found) == ["a", "b"]
+        assert len({run.data.tags["sweep_id"] for run in found}) == 1
+    finally:
+        kill(server)

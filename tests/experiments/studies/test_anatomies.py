@@ -1,0 +1,94 @@
+"""The configured anatomies are valves, and have what their names say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+from experiments.common.build import template_of
+from experiments.common.config import plain, register
+from mvest.valve.anatomy.template import Template
+from mvest.valve.mesh.structured import structured_mesh
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+NAMES = sorted(path.stem for path in (CONF / "valve").glob("*.yaml"))
+NORMAL = [name for name in NAMES if name.startswith("normal")]
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+def anatomy(name: str) -> Template:
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [f"valve={name}"])
+    return template_of(plain(config, ("hydra", "paths", "tracking")))
+
+
+def diameters(template: Template) -> tuple[float, float]:
+    """Antero-posterior and commissural diameter of the open annulus, mm."""
+    x, y, _ = template.annulus(np.arange(0.0, 360.0)).T
+    return float(np.ptp(y)), float(np.ptp(x))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_anatomy_is_a_valve_that_can_be_meshed(name: str) -> None:
+    template = anatomy(name)
+    valve = template.valve()
+    structured_mesh(template, "hex18", 40, 5)  # refuses elements that are inside out
+    # No chord is taut in the open valve, which is the state without stress.
+    chordae = valve.chordae
+    span = np.linalg.norm(chordae.insertion - valve.papillary_tips[chordae.tip], axis=1)
+    assert np.all(chordae.rest_length > span)
+
+
+@pytest.mark.parametrize("name", NORMAL)
+def test_normal_valves_have_normal_annuli_and_anterior_leaflets(name: str) -> None:
+    template = anatomy(name)
+    ap, commissural = diameters(template)
+    assert 24 - 3 <= ap <= 30.8 + 4.4
+    assert 35 - 5 <= commissural <= 35.1 + 4.9
+    assert 20 <= template.parameters.length_anterior <= 25
+    assert 13 <= template.parameters.tips[0] <= 19
+
+
+def test_the_two_normal_valves_differ() -> None:
+    small, large = (diameters(anatomy(name)) for name in ("normal_small", "normal_large"))
+    # One standard deviation of normal valves apart: 3 mm and 5 mm.
+    assert large[0] - small[0] > 3
+    assert large[1] - small[1] > 5
+
+
+def test_functional_regurgitation_is_a_wide_annulus_and_displaced_tips() -> None:
+    template = anatomy("functional_mr")
+    ap, commissural = diameters(template)
+    assert 33 <= ap <= 41  # 33 +- 6 to 36 +- 5
+    assert 41 <= commissural <= 48  # 41 +- 5 to 43 +- 5
+    outward, _, up = template.parameters.tips_displacement
+    assert outward > 0
+    assert up < 0
+    assert 5 <= np.linalg.norm(template.parameters.tips_displacement) <= 10
+
+
+def test_prolapse_is_a_long_posterior_leaflet_on_long_chordae() -> None:
+    p, normal = anatomy("prolapse").parameters, anatomy("template").parameters
+    width = p.half_ap / normal.half_ap
+    assert p.length_posterior > 1.1 * width * normal.length_posterior
+    assert p.length_anterior < 1.1 * width * normal.length_anterior
+    plain_chordae = Template(normal).chordae()
+    assert len(anatomy("prolapse").chordae()) == len(plain_chordae)
+    middle = np.prod([f for low, high, f in p.chordae.elongated if low <= 270 <= high])
+    assert 1.1 <= middle <= 1.2
+
+
+def test_fibroelastic_deficiency_is_thin_and_lacks_one_chord() -> None:
+    template, normal = anatomy("fibroelastic"), anatomy("template")
+    here, there = template.valve().surface.thickness, normal.valve().surface.thickness
+    assert 0.75 <= here.min() / there.min() <= 0.8
+    assert 0.75 <= here.max() / there.max() <= 0.8
+    assert len(normal.chordae()) - len(template.chordae()) == 1

@@ -1,0 +1,312 @@
+"""A case from the command line: its settings, its record, and what is refused."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from experiments.common.cases.own_case import read_configured, run_case, settings_of
+from experiments.common.cases.record import case_record, fields_of, of_all_unknowns
+from experiments.common.config import hash_of
+from experiments.run import main
+from mvest.cases.writer import write_case
+from mvest.errors import ConfigurationError
+from mvest.personalise import Treatment, personalise
+from mvest.provenance import write_json
+from mvest.reporting.case.fields import read_case_fields
+from tests.experiments.common.test_config import composed, plain
+from tests.made_up_closure import made_up_case, use
+
+OWN = ("experiment=own_valve", "personal.mesh.source=structured", "figures=false")
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("given") / "case"
+    write_case(place, made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    return place
+
+
+@pytest.fixture
+def config(folder, tmp_path):
+    return plain(composed(*OWN, f"case={folder}", f"paths.outputs={tmp_path}"))
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the application in an empty folder: exit status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
+        status = main()
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def made(folder):
+    """A record with all that belongs to it, and what it was made from."""
+    with pytest.MonkeyPatch.context() as patch:
+        use(patch)
+        config = plain(composed(*OWN, f"case={folder}"))
+        found = personalise(read_configured(config), settings_of(config))
+        return case_record(config, found, "hash", 0.0), found
+
+
+@pytest.fixture
+def unmeasured(monkeypatch):
+    """Measuring a shape takes a second, and is tested elsewhere."""
+    monkeypatch.setattr(
+        "experiments.common.cases.record.clinical_measurements", lambda *arguments: {}
+    )
+
+
+def test_settings_are_those_of_the_configuration(config):
+    settings = settings_of(config)
+    about = {unknown.name: unknown for unknown in settings.unknowns}
+    assert list(about)[:2] == ["E_f.anterior", "E_f.posterior"]
+    assert (about["E_f.anterior"].mean, about["E_f.anterior"].std) == (6.23, 3.1)
+    assert {u.treatment for u in settings.unknowns} == {Treatment.ESTIMATED}
+    assert (settings.moduli_only, settings.confirm, settings.paper) == (True, True, None)
+    assert settings.mesh.source == "structured"
+    assert settings.correspondence
+    given = plain(
+        composed(
+            *OWN, "personal=considered", "personal.tolerance=0.03", "personal.max_iterations=4",
+            "personal.largest_change=0.3", "personal.correspondence=false",
+            "personal.confirm=false",
+            "personal.moduli_only=false",
+        )
+    )  # fmt: skip
+    given["personal"]["paper"] = {"P0": 1.0, "Q": 0.1, "R": 0.25, "max_iterations": 3}
+    settings = settings_of(given)
+    treated = {u.name: u.treatment for u in settings.unknowns}
+    assert treated["E_f.posterior"] is Treatment.ESTIMATED
+    assert treated["turn.x"] is Treatment.CONSIDERED
+    assert (settings.tolerance, settings.max_iterations, settings.largest_change) == (0.03, 4, 0.3)
+    assert (settings.correspondence, settings.confirm, settings.moduli_only) == (False,) * 3
+    assert settings.paper.R == 0.25
+
+
+def test_a_record_is_plain_and_knows_no_truth(made, tmp_path):
+    record, found = made
+    write_json(tmp_path / "record.json", record)
+    back = json.loads((tmp_path / "record.json").read_text())
+    assert back["status"] == "converged"
+    assert back["row"] == "made_up"
+    assert back["case"]["simulated"] is True
+    assert len(back["case"]["sha256"]) == 64
+    assert back["truth"] is None
+    assert back["relative_error"] is None
+    for row in (*back["unknowns"], *back["moduli"], *back["without_nuisances"]["parameters"]):
+        assert row["truth"] is None
+        assert "inside" not in row
+    assert all(row["to_truth"] is None for row in back["distances"])
+    # The record of every study is of the moduli; unknowns tell all.
+    assert back["parameters"] == ["E_f.anterior", "E_f.posterior"]
+    assert back["estimate"] == found.result.estimate[:2].tolist()
+    assert back["std"] == found.result.std[:2].tolist()
+    assert back["initial"] == [6.23, 2.09]
+    assert [len(row) for row in back["iterates"]] == [2] * len(back["iterates"])
+    assert len(back["identifiability"]["cramer_rao_std"]) == 2
+    assert [row["name"] for row in back["unknowns"]] == list(found.names)
+    assert [len(row) for row in back["of_all_unknowns"]["iterates"]] == [11] * len(back["iterates"])
+    whole = of_all_unknowns(back)
+    assert whole["parameters"] == back["unknowns"]
+    assert len(whole["iterates"][0]) == 11
+
+
+def test_moduli_follow_by_their_ratios(made, config):
+    record, _ = made
+    rows = {(row["region"], row["name"]): row for row in record["moduli"]}
+    unknowns = {row["name"]: row for row in record["unknowns"]}
+    assert len(rows) == 6
+    # E_f over E_perp is 2.35/6.23 of the anterior and 1.89/2.09 of the posterior leaflet's inverse.
+    ratios = {region: tissue["ratio"] for region, tissue in config["mechanics"]["tissue"].items()}
+    for region, ratio in ratios.items():
+        own = unknowns[f"E_f.{region}"]
+        for key in ("estimate", "std", "low", "high"):
+            assert rows[region, "E_f"][key] == pytest.approx(own[key])
+            assert rows[region, "E_perp"][key] == pytest.approx(own[key] / ratio)
+            share = rows[region, "G"][key] / own[key]
+            assert share == pytest.approx(rows[region, "G"]["estimate"] / own["estimate"])
+        assert own["low"] < own["estimate"] < own["high"]
+
+
+def test_intervals_of_what_is_positive_are_those_of_its_logarithm(made):
+    record, found = made
+    for k, row in enumerate(record["unknowns"]):
+        std = found.result.filtered.transformed.std[k]
+        if row["name"].startswith(("shift", "turn")):
+            assert row["high"] - row["estimate"] == pytest.approx(1.959964 * std)
+        else:
+            assert np.log(row["high"] / row["estimate"]) == pytest.approx(1.959964 * std)
+            assert row["low"] * row["high"] == pytest.approx(row["estimate"] ** 2)
+
+
+def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(made):
+    record, _ = made
+    measured = record["measurements"]
+    assert {frame: list(which) for frame, which in measured.items()} == {
+        "open": ["observed"],
+        "closed": ["observed", "generic", "personalised"],
+        "late": ["observed", "generic", "personalised"],
+    }
+    # The template's annulus is 36 mm wide, and contracts by a few per cent at most.
+    for which in measured["closed"].values():
+        assert which["commissural_diameter_mm"] == pytest.approx(36, rel=0.05)
+    assert measured["open"]["observed"]["orifice_mm2"] > 100
+
+
+def test_what_would_narrow_is_told_of_each_modulus(made):
+    record, found = made
+    rows = [row for row in record["narrow"] if row["what"].endswith("pressure known")]
+    assert [row["parameter"] for row in rows] == ["E_f.anterior", "E_f.posterior"]
+    assert rows[0]["what"] == "E_f anterior, pressure known"
+    for k, row in enumerate(rows):
+        assert row["std_if_known"] == found.narrower["pressure known"][k]
+        assert row["std_now"] == found.narrower["now"][k] > row["std_if_known"]
+    assert not [row for row in record["narrow"] if row["what"].endswith("now")]
+
+
+def test_a_failed_estimation_is_a_record_too(config, monkeypatch, tmp_path, unmeasured):
+    use(monkeypatch, fails_above=4.0)
+    found = personalise(read_configured(config), settings_of(config))
+    record = case_record(config, found, "hash", 0.0)
+    write_json(tmp_path / "record.json", record)
+    assert record["status"] == "failed"
+    assert record["estimate"] is None
+    assert record["moduli"] == record["distances"] == record["narrow"] == []
+    assert all(row["estimate"] is row["low"] is None for row in record["unknowns"])
+    assert record["without_nuisances"]["status"] == "failed"
+
+
+@pytest.mark.parametrize("overrides", [(), ("personal=considered",)])
+def test_files_of_a_case_are_written_and_read(config, monkeypatch, tmp_path, unmeasured, overrides):
+    use(monkeypatch)
+    config = plain(
+        composed(*OWN, *overrides, f"case={config['case']}", f"paths.outputs={tmp_path}")
+    )
+    (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
+    record, files = run_case(config, "hash", tmp_path, 0.0)
+    assert record["status"] == "converged"
+    assert files == [tmp_path / "fields.npz"]
+    fields = read_case_fields(files[0])
+    assert fields.frames == ("closed", "late")
+    assert fields.seen.tolist() == [True, False]
+    assert fields.truth is None
+    assert fields.sensitivity.shape == (288, 3, 11)
+    distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
+    np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)
+    assert np.mean(distance[0]) == pytest.approx(
+        record["distances"][0]["personalised"]["mean"], abs=1e-4
+    )
+
+
+def test_nothing_of_an_earlier_run_is_left_where_nothing_is_found(
+    config, monkeypatch, tmp_path, unmeasured
+):
+    use(monkeypatch, fails_above=4.0)
+    (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
+    _, files = run_case(config, "hash", tmp_path, 0.0)
+    assert files == []
+    assert not (tmp_path / "fields.npz").exists()
+
+
+def test_fields_without_correspondence_have_points(config, monkeypatch, tmp_path):
+    use(monkeypatch)
+    case = made_up_case(0.05, corresponds=False, displaced=False)
+    config["personal"]["unknowns"] = {
+        name: about
+        for name, about in config["personal"]["unknowns"].items()
+        if name.startswith(("E_f", "shift"))
+    }
+    found = personalise(case, settings_of(config))
+    np.savez(tmp_path / "fields.npz", **fields_of(found))
+    fields = read_case_fields(tmp_path / "fields.npz")
+    assert fields.observed is None
+    assert fields.distance_fitted is None
+    assert set(fields.observed_points) == {"closed", "late"}
+
+
+def test_a_case_must_be_given(run):
+    status, _, err = run("experiment=own_valve")
+    assert status == 2
+    assert "case is not given; expected case=FOLDER" in err
+    status, _, err = run("experiment=own_valve", "case=nowhere")
+    assert status == 2
+    assert "nowhere: no such folder" in err
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("personal.mesh.source=voxels", "mesh source 'voxels'"),
+        ("personal.tolerance=0", "tolerance"),
+    ],
+)
+def test_settings_that_are_none_are_refused(run, folder, override, message):
+    status, _, err = run(*OWN, f"case={folder}", override)
+    assert status == 2
+    assert message in err
+    assert err.startswith("error: ")
+
+
+def test_an_unknown_treatment_names_the_known_ones(config):
+    config["personal"]["unknowns"]["shift.x"]["treatment"] = "guessed"
+    with pytest.raises(
+        ConfigurationError,
+        match=r"shift\.x\.treatment = 'guessed', expected one of estimated, considered, fixed",
+    ):
+        settings_of(config)
+
+
+def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
+    (built,) = [use(monkeypatch)]
+    monkeypatch.setattr(
+        "mvest.personalise.chain.estimate", lambda *a, **k: pytest.fail("something was estimated")
+    )
+    status, out, err = run(*OWN, f"case={folder}", "check=true")
+    assert status == 0, err
+    assert "made_up: 288 vertices" in out
+    assert "leaflets anterior, posterior" in out
+    assert "frame late (held_out) at 0.4 s, 70 mmHg, 288 vertices, same vertices" in out
+    assert "In order; drawn in" in out
+    written = {path.name for path in (tmp_path / "outputs").rglob("*") if path.is_file()}
+    assert {name for name in written if not name.startswith(".")} == {"case.png", "case.pdf"}
+    # One closure, at the prior's means; the values that were seen play no part.
+    (model,) = built
+    (at,) = model.calls
+    assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
+    assert "864 numbers of closed; 0.3 mm of noise stated, alike over 8 mm" in out
+    assert "No estimation was run." in out
+    # The formula's belly is pressure over stiffness, and its other parts tell the pressure.
+    rows = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
+    for name in model.names:
+        assert rows[name][0] == name
+
+
+def test_a_study_without_data_cannot_be_checked(run):
+    status, _, err = run("experiment=gate", "check=true")
+    assert status == 2
+    assert "experiment gate: check=true has nothing to say of a study of the kind gate" in err
+    assert "expected one of twin, joint, cycle, chord, patch, case, volume, patient" in err
+
+
+def test_a_check_is_no_part_of_the_result(folder):
+    plainly = composed(*OWN, f"case={folder}")
+    checked = composed(*OWN, f"case={folder}", "check=true")
+    assert hash_of(plainly) == hash_of(checked)
+    other = composed(*OWN, f"case={folder}", "personal.confirm=false")
+    assert hash_of(plainly) != hash_of(other)

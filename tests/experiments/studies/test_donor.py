@@ -1,0 +1,150 @@
+"""The study of the recorded donor valve, on a small made-up recording and without any."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from experiments.common.config import register
+from experiments.run import main
+from experiments.studies.donor.study import build_donor
+from mvest.valve.io.donor_file import CITATION, DATA_VARIABLE
+from mvest.valve.mesh.embedding import embed
+
+ROOT = Path(__file__).resolve().parents[2]
+
+TRUTH = np.array([2.0, 1.0, 3.0])
+SMALL = [
+    "experiment=donor",
+    "donor.vertices=70",
+    "donor.contact_vertices=336",
+    "donor.starts=[[1.5,1.5,1.5],[3,1,2]]",
+    "filter.initial=[1.5,1.5,1.5]",
+    "filter.P0=2.25",
+    "filter.R=1e-8",
+    "filter.tolerance=1e-3",
+    "mechanics.protocol.pressure_mmHg=-10",
+    "mechanics.protocol.dt=0.5",
+    "mechanics.protocol.end=1.0",
+    "mechanics.newton.tolerance=1e-8",
+]
+"""Sucked outwards, so that nothing touches or buckles; the annulus narrows by a tenth."""
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the application in an empty folder: exit status, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
+        status = main()
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+def settings(*overrides: str) -> dict:
+    register()
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose("config", list(overrides))
+    GlobalHydra.instance().clear()
+    return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
+
+
+def reader_tests() -> ModuleType:
+    """The tests of the reader, which make up a recording."""
+    path = ROOT / "tests" / "valve" / "test_donor.py"
+    spec = importlib.util.spec_from_file_location("tests_valve_donor", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def made_up_recording(folder: Path) -> str:
+    """A skirt whose last frame is our own closure with the moduli ``TRUTH``."""
+    module = reader_tests()
+    arrays = module.skirt()
+    arrays["frames_xyz_mm"] = arrays["frames_xyz_mm"].astype(np.float64)
+    place = f"paths.donor={module.write(folder, arrays)}"
+    study = build_donor(settings(*SMALL, place))
+    closed = study.model().close(TRUTH, sensitivities=False).simulation
+    assert closed.converged
+    fine = study.recording.surface.vertices
+    free = np.setdiff1d(np.arange(len(fine)), study.recording.annulus)
+    positions = embed(study.mesh, fine)(closed.frames[-1])
+    arrays["frames_xyz_mm"][-1, free] = positions[free]
+    module.write(folder, arrays)
+    return place
+
+
+def test_made_up_valve_end_to_end(run, tmp_path: Path) -> None:
+    place = made_up_recording(tmp_path)
+    status, out, err = run(*SMALL, place, "hydra.run.dir=here", "paths.results=published")
+    assert status == 0, err
+    assert "tricuspid" in out
+    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert record["status"] == "converged"
+    assert record["truth"] is None
+    assert [row["closure"] for row in record["rows"]] == [
+        "generic",
+        "fitted, start 1",
+        "fitted, start 2",
+    ]
+    # The recording is ours, but interpolated on other triangles than the mesh is made of.
+    for row in record["rows"][1:]:
+        assert row["estimate"] == pytest.approx(TRUTH, rel=0.1)
+        assert row["distance_mm"]["mean"] < 0.5 * record["rows"][0]["distance_mm"]["mean"]
+    summary = record["summary"]
+    assert summary["closer_than_generic"] is True
+    assert summary["largest_difference_between_starts"] < 5e-3
+    assert CITATION in record["data"]["citation"]
+    names = {path.name for path in (tmp_path / "here").iterdir()}
+    assert {"donor.csv", "donor.md", "donor.png", "result.json", "fields.npz"} <= names
+    # Overrides keep a run out of the results.
+    assert not (tmp_path / "published").exists()
+
+
+def test_absent_data_are_one_clear_line(run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path / "nowhere"))
+    status, out, err = run("experiment=donor")
+    assert (status, out) == (2, "")
+    assert len(err.strip().splitlines()) == 1
+    assert err.startswith("error: donor valve: there is no file")
+    for part in (CITATION, DATA_VARIABLE):
+        assert part in err
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("filter.mode=paper", "needs the iterated filter"),
+        ("donor.starts=[[1,2]]", "expected lists of 3 moduli"),
+        ("donor.starts=[]", "expected lists of 3 moduli"),
+        ("donor.vertices=10", "remesh to 10 vertices"),
+        ("donor.vertexes=10", "did you mean vertices?"),
+        ("mechanics.element=hex18", "cannot thicken into 'hex18'"),
+    ],
+)
+def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
+    module = reader_tests()
+    module.write(tmp_path, module.skirt())
+    status, _, err = run(*SMALL, f"paths.donor={tmp_path}", override)
+    assert status == 2
+    assert words in err

@@ -1,0 +1,165 @@
+"""The studies of the forward model, in a size that takes seconds: configuration, record, tables."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from experiments.common.config import register
+from experiments.common.forward import model_of
+from experiments.run import main
+from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import GATE_CASES, GateCase
+from mvest.estimation import Prediction
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SMALL = (
+    "mesh.columns=12",
+    "mesh.rows=2",
+    "observation.columns=16",
+    "observation.rows=5",
+    "mechanics.contact_points.columns=24",
+    "mechanics.contact_points.rows=6",
+    "mechanics.protocol.pressure_mmHg=5",
+    "mechanics.protocol.ramp=0.1",
+    "mechanics.protocol.dt=0.1",
+    "mechanics.protocol.end=0.1",
+    "mechanics.protocol.equilibrium=false",
+    "tracking.enabled=false",
+)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the application in an empty folder: exit status, record, folder and what it said."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str):
+        monkeypatch.setattr(
+            sys, "argv", ["experiments.run", *SMALL, *arguments, "hydra.run.dir=here"]
+        )
+        status = main()
+        folder = tmp_path / "here"
+        record = json.loads((folder / "result.json").read_text())
+        return status, record, folder, capsys.readouterr()
+
+    return call
+
+
+def composed(*overrides: str) -> dict:
+    register()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", list(overrides))
+        return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def test_each_case_changes_its_own_setting_only():
+    config = composed("experiment=gate", "mesh.columns=12", "mesh.rows=2")
+    base = model_of(config, GateCase("reference"))
+
+    def described(model: ClosureModel) -> dict:
+        settings = model.settings
+        return {
+            "dt": settings.protocol.dt,
+            "activation": settings.contact.activation_distance,
+            "sampling": len(model.contact_valve.surface.vertices),
+            "mesh": model.mesh.sha256,
+            "rest": (settings.tissue, settings.newton, settings.protocol.ramp, model.names),
+            "observed": model.valve.surface.vertices.shape,
+        }
+
+    reference = described(base)
+    changed = {
+        case.name: {k for k, v in described(model_of(config, case)).items() if v != reference[k]}
+        for case in GATE_CASES
+    }
+    assert list(changed.values())[:6] == [
+        {"dt"},
+        {"dt"},
+        {"dt"},
+        {"activation"},
+        {"sampling"},
+        {"mesh"},
+    ]
+    assert set(map(frozenset, list(changed.values())[6:])) == {frozenset()}
+    finer = model_of(config, GATE_CASES[5]).mesh
+    assert len(finer.elements) == 18 * 3
+    assert model_of(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
+        0.5 * reference["dt"]
+    )
+
+
+def test_the_gate_study_records_every_case(run):
+    status, record, folder, said = run("experiment=gate")
+    assert status == 0
+    assert record["status"] == "converged"
+    assert record["forward_solves"] == len(record["rows"]) == 1 + len(GATE_CASES)
+    assert [row["case"] for row in record["rows"]] == ["reference", *(c.name for c in GATE_CASES)]
+    assert set(record["slopes"]) == {"0.01", "0.05", "0.2"}
+    assert record["limits"] == {"mean_mm": 0.1, "max_mm": 0.5, "slope": 0.05}
+    assert isinstance(record["passed"], bool)
+    # No contact and little load: moduli change the state as the derivative says.
+    small = {row["case"]: row for row in record["rows"]}["E_f + 1 %"]
+    assert small["passed"]
+    assert 0 < small["max_mm"] < 0.05
+    assert record["slopes"]["0.01"] < 0.01
+    names = {path.name for path in folder.iterdir()}
+    assert {"gate.csv", "gate.md", "result.json", "config.json"} <= names
+    for case in GATE_CASES:
+        assert case.name.replace(" %", "") in (folder / "gate.csv").read_text()
+        assert f"{case.name}: mean" in said.err
+    assert "reference" in said.out
+
+
+def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypatch):
+    monkeypatch.setattr(ClosureModel, "__call__", lambda self, m: Prediction.failed("it buckled"))
+    status, record, _, said = run("experiment=gate")
+    assert status == 1
+    assert (record["status"], record["reason"]) == ("failed", "it buckled")
+    assert record["passed"] is False
+    assert len(record["rows"]) == 1
+    assert "it buckled" in said.err
+
+
+def test_a_case_that_does_not_close_has_no_distance(run, monkeypatch):
+    true = ClosureModel.__call__
+
+    def sometimes(self, m):
+        return Prediction.failed("it buckled") if len(self.mesh.elements) > 24 else true(self, m)
+
+    monkeypatch.setattr(ClosureModel, "__call__", sometimes)
+    status, record, _, _ = run("experiment=gate")
+    assert status == 0
+    row = {row["case"]: row for row in record["rows"]}["mesh x 1.5"]
+    assert row["mean_mm"] is None
+    assert (row["passed"], row["reason"]) == (False, "it buckled")
+    assert record["passed"] is False
+
+
+def test_the_closure_study_measures_every_step(run):
+    status, record, folder, _ = run(
+        "experiment=closure", "mechanics.protocol.end=0.2", "mechanics.protocol.growth=1"
+    )
+    assert status == 0
+    rows = record["rows"]
+    assert [row["time"] for row in rows] == pytest.approx([0.0, 0.1, 0.2])
+    assert [row["pressure_mmhg"] for row in rows] == pytest.approx([0.0, 5.0, 5.0])
+    assert all(row["intersections"] == 0 for row in rows)
+    assert rows[0]["orifice_mm2"] > rows[-1]["orifice_mm2"] > 0
+    # Drawn is the thick leaflets' closed surface: both faces of 16 x 5 vertices, 2 x 128 triangles,
+    # and two rims of 2 x 16.
+    with np.load(folder / "fields.npz") as fields:
+        assert fields["frames"].shape == (3, 160, 3)
+        assert fields["triangles"].shape == (2 * 128 + 2 * 32, 3)
+        assert fields["region"].shape == fields["triangles"].shape[:1]
+        assert np.isfinite(fields["frames"]).all()
+    names = {path.name for path in folder.iterdir()}
+    assert {"closure.csv", "closure.md", "closure.png", "closure.pdf"} <= names

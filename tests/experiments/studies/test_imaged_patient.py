@@ -1,0 +1,87 @@
+"""Virtual patients in volumes: what is put together of both estimations, and what is kept."""
+
+import json
+
+import pytest
+
+from experiments.studies.imaged_patient import study as imaged_patient
+from experiments.studies.imaged_patient.report import publish_volume
+from experiments.studies.imaged_patient.study import ImagedPlace, volume_rows
+from mvest.errors import InputError
+from tests.reporting.records import record as a_record
+
+
+def estimated(anterior, posterior, status="converged"):
+    rows = [
+        {"name": f"E_f.{region}", "estimate": value, "low": 0.8 * value, "high": 1.2 * value}
+        for region, value in (("anterior", anterior), ("posterior", posterior))
+    ]
+    return {"status": status, "unknowns": [*rows, {"name": "pressure_scale", "estimate": 1.1}]}
+
+
+TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
+
+
+def test_rows_put_volume_and_known_geometry_side_by_side():
+    rows = volume_rows("one", estimated(5.0, 2.5), estimated(5.8, 2.1), TRUTH)
+    assert [(row["modulus"], row["truth"]) for row in rows] == [
+        ("anterior", 6.0),
+        ("posterior", 2.0),
+    ]
+    assert rows[0] == {
+        "patient": "one", "modulus": "anterior", "truth": 6.0, "estimate": 5.0, "low": 4.0,
+        "high": 6.0, "known_geometry": 5.8,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("found", [None, estimated(5.0, 2.5, "failed")])
+def test_a_volume_without_an_estimate_keeps_its_rows(found):
+    rows = volume_rows("one", found, estimated(5.8, 2.1), TRUTH)
+    assert [row["estimate"] for row in rows] == [None, None]
+    assert [row["known_geometry"] for row in rows] == [5.8, 2.1]
+
+
+def test_what_is_hidden_lies_together(tmp_path):
+    place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
+    assert place.known.parent == place.truth.parent == place.hidden
+    assert place.hidden not in place.volume.parents
+    assert place.truth not in place.known.parents
+
+
+def test_the_table_is_that_of_all_patients(tmp_path):
+    for name, found in (("a", estimated(5.0, 2.5)), ("b", None)):
+        rows = volume_rows(name, found, estimated(5.8, 2.1), TRUTH)
+        publish_volume(tmp_path, f"volumes-{name}", {**a_record(), "rows": rows})
+    kept = json.loads((tmp_path / "volume.json").read_text())
+    assert [row["patient"] for row in kept["rows"]] == ["a", "a", "b", "b"]
+    assert (tmp_path / "volume" / "volumes-b.json").is_file()
+    # Run again, a patient takes its own place.
+    rows = volume_rows("a", estimated(5.5, 2.2), estimated(5.8, 2.1), TRUTH)
+    publish_volume(tmp_path, "volumes-a", {**a_record(), "rows": rows})
+    kept = json.loads((tmp_path / "volume.json").read_text())
+    assert [row["estimate"] for row in kept["rows"]] == [5.5, 2.2, None, None]
+    assert list(tmp_path.glob("volume.md"))
+
+
+def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
+    monkeypatch, tmp_path
+):
+    place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
+    place.truth.mkdir(parents=True)
+    hidden = {"told": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
+    (place.truth / "hidden.json").write_text(json.dumps(hidden))
+
+    def blindly(config, config_hash, folder, case, sealed):
+        if case == place.known:
+            raise InputError("the estimation left no result: MemoryError")
+        return estimated(5.0, 2.5) | {"reason": "converged", "provenance": {}}
+
+    monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda config: place)
+    monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
+    config = {"imaged": {}, "patient": {"name": "one"}, "row": "one", "seed": 1}
+    record, _ = imaged_patient.run_imaged_patient(config, "hash", tmp_path, 0.0)
+
+    assert record["status"] == "converged"
+    assert [row["estimate"] for row in record["rows"]] == [5.0, 2.5]
+    assert [row["known_geometry"] for row in record["rows"]] == [None, None]
+    assert "MemoryError" in record["known_geometry"]["reason"]

@@ -1,0 +1,395 @@
+"""The study of the image step, in a size that takes seconds."""
+
+import copy
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from experiments import tables
+from experiments.common.config import register
+from experiments.run import main
+from experiments.studies.imaging import store as imaging_store
+from experiments.studies.imaging import study as imaging
+from experiments.studies.imaging.held_out import HeldOut
+from experiments.studies.imaging.record import _confidences, _threshold, learning_rows, table_row
+from experiments.studies.imaging.report import publish_imaging
+from experiments.studies.imaging.store import ImagingStore, StoredSamples
+from experiments.studies.imaging.trials import KINDS, Trial
+from mvest.errors import ConfigurationError, InputError
+from mvest.imaging.detection import model as detection_model
+from mvest.imaging.detection.model import STAGES, default_model, load_model
+from mvest.imaging.simulator import SMALL
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+STUDY = ("experiment=imaging", "imaging=small", "tracking.enabled=false")
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+def composed(*overrides: str) -> dict:
+    register()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", ["experiment=imaging", "imaging=small", *overrides])
+        return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def call(place: Path, *arguments: str) -> int:
+    """Run the study in a folder; returns the exit status."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        patch.setattr(sys, "argv", ["experiments.run", *STUDY, *arguments])
+        try:
+            return main()
+        finally:
+            GlobalHydra.instance().clear()
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory) -> Path:
+    """A folder in which the whole study was run, in ``run``."""
+    place = tmp_path_factory.mktemp("imaging")
+    assert call(place, "hydra.run.dir=run") == 0
+    return place
+
+
+def record_of(place: Path, run: str = "run") -> dict:
+    return json.loads((place / run / "result.json").read_text(encoding="utf-8"))
+
+
+def changed(place: Path) -> dict[str, int]:
+    """When each file of the store was written."""
+    root = place / "outputs" / "detectors"
+    return {str(p.relative_to(root)): p.stat().st_mtime_ns for p in root.rglob("*.npz")}
+
+
+def test_the_study_tells_how_far_detectors_are_off(done: Path):
+    record = record_of(done)
+    assert (record["status"], record["reason"]) == ("converged", "trained and tested")
+    assert [row["setting"] for row in record["rows"]] == ["in distribution"] * 2 + ["shifted"] * 2
+    assert all(row["seconds"] > 0 for row in record["rows"])
+    # The curve has both trainings, on the same volumes.
+    found = {(row["stage"], row["training_volumes"], row["setting"]) for row in record["training"]}
+    stages = ("position", "pose", "landmarks", "hinge", "surface")
+    settings = ("in distribution", "shifted")
+    assert found == {(stage, n, s) for stage in stages for n in (3, 6) for s in settings}
+    assert {row["volumes"] for row in record["training"]} == {1}
+    units = {row["stage"]: row["unit"] for row in record["training"]}
+    assert units["pose"] == "degrees"
+    # Confidences with a valve and without one.
+    assert set(record["confidence"]["values"]) == set(KINDS)
+    accuracy = record["accuracy"]
+    assert len(accuracy["std_mm"]) == 16 * 5
+    assert {(row["setting"], row["frame"]) for row in accuracy["within_95"]} == {
+        (s, f) for s in settings for f in ("open", "closed")
+    }
+    assert all(0 <= row["share"] <= 1 for row in accuracy["within_95"])
+    parts = ("valves", "volumes", "draft", "trees")
+    for part in (*parts, "training"):
+        assert record["spent"][part]["cpu_s"] > 0
+    total = sum(record["spent"][part]["cpu_s"] for part in parts)
+    assert record["spent"]["training"]["cpu_s"] == pytest.approx(total)
+    assert record["measures"]["training_cpu_s"] == pytest.approx(total)
+
+
+def test_what_is_tested_on_was_not_trained_on(done: Path):
+    record, trained = record_of(done), load_model(done / "run" / "tee.npz").trained_on
+    tested = {row["valve"] for rows in record["volumes"].values() for row in rows}
+    tested |= {row["valve"] for row in record["sequences"]}
+    calibrated = {row["valve"] for row in record["sequence_frames"]["calibration"]}
+    assert len(trained["valves"]) == 4
+    assert set(trained["calibrated_on"]) == calibrated
+    assert len(calibrated) == len(tested) == 2
+    groups = (set(trained["valves"]), calibrated, tested)
+    assert len(set.union(*groups)) == sum(map(len, groups))
+    # By seed, as their names say.
+    assert [{name.split("_")[1] for name in group} for group in groups] == [{"1"}, {"3"}, {"2"}]
+
+
+def test_the_model_tells_its_errors(done: Path):
+    model, record = load_model(done / "run" / "tee.npz"), record_of(done)
+    assert model.accuracy is not None
+    assert model.accuracy.samples.shape == (2, 2, 80, 3)
+    assert model.accuracy.tip_samples.shape == (2, 2, 2, 3)
+    assert (model.accuracy.std_mm > 0).all()
+    about = model.accuracy.samples - model.accuracy.samples.mean(axis=0)
+    std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / 6)
+    assert model.accuracy.std_mm == pytest.approx(std, rel=1e-5)
+    length = record["accuracy"]["correlation_length_mm"]
+    assert model.accuracy.correlation_length_mm == pytest.approx(length)
+    assert model.sha256 == record["model_file"]["sha256"]
+    assert model.trained_on["config_hash"] == record["provenance"]["config_hash"]
+
+
+def test_tables_and_figures_are_made_and_made_again(
+    done: Path, tmp_path: Path, monkeypatch, capsys
+):
+    names = {path.name for path in (done / "run").iterdir()}
+    for name in ("imaging", "imaging_sequences", "imaging_confidence"):
+        assert {f"{name}.csv", f"{name}.md", f"{name}.tex"} <= names
+    for name in ("distance", "training", "confidence", "std", "correlation"):
+        assert {f"imaging_{name}.png", f"imaging_{name}.pdf"} <= names
+    text = (done / "run" / "imaging.md").read_text(encoding="utf-8")
+    assert "imulated" in text
+    assert "CPU time" in text
+    # Overrides keep a run out of the results.
+    assert not (done / "results").exists()
+    results = tmp_path / "results"
+    publish_imaging(results, record_of(done))
+    assert (results / "imaging.md").read_text(encoding="utf-8") == text
+    assert "volumes" not in json.loads((results / "imaging.json").read_text(encoding="utf-8"))
+    for path in results.glob("imaging*.md"):
+        path.unlink()
+    # Only its own record is there: the others' tables are asked for by name.
+    monkeypatch.setattr(tables, "regenerate", lambda _results: [])
+    assert tables.main([str(results)]) == 0
+    assert (results / "imaging.md").read_text(encoding="utf-8") == text
+    assert "imaging_std.png" in capsys.readouterr().out
+
+
+def test_an_interrupted_study_goes_on_where_it_was(done: Path):
+    again, before = done / "again", record_of(done)
+    store = changed(done)
+    lost = [
+        next(name for name in store if name.startswith(part)) for part in ("volumes", "samples")
+    ]
+    for name in lost:
+        (done / "outputs" / "detectors" / name).unlink()
+    assert call(done, f"hydra.run.dir={again.name}") == 0
+    now = changed(done)
+    assert set(now) == set(store)
+    assert {name for name in now if now[name] != store[name]} <= set(lost)
+    after = record_of(done, "again")
+    assert after["accuracy"] == before["accuracy"]
+    without_time = [
+        [{k: v for k, v in row.items() if k != "seconds"} for row in record["rows"]]
+        for record in (before, after)
+    ]
+    assert without_time[0] == without_time[1]
+
+
+def test_the_seed_decides_and_not_the_processes(done: Path, tmp_path: Path):
+    valves = tmp_path / "outputs" / "detectors" / "valves"
+    shutil.copytree(done / "outputs" / "detectors" / "valves", valves)
+    first = load_model(done / "run" / "tee.npz")
+    assert call(tmp_path, "imaging.evaluate=false", "imaging.processes=2", "hydra.run.dir=two") == 0
+    record = record_of(tmp_path, "two")
+    assert (record["reason"], record["rows"]) == ("trained", [])
+    second = load_model(tmp_path / "two" / "tee.npz")
+    assert second.accuracy is None
+    for name in STAGES:
+        assert first.boosters[name].texts == second.boosters[name].texts
+    assert np.array_equal(first.shape.modes, second.shape.modes)
+    # Only a training: nothing else was drawn or written.
+    assert not (tmp_path / "outputs" / "detectors" / "volumes").exists()
+    assert not (tmp_path / "two" / "imaging.md").exists()
+    assert call(tmp_path, "imaging.evaluate=false", "seed=2", "hydra.run.dir=other") == 0
+    other = load_model(tmp_path / "other" / "tee.npz")
+    assert other.boosters["boundary"].texts != first.boosters["boundary"].texts
+
+
+def test_a_model_is_made_the_one_of_the_package_without_training_again(
+    done: Path, tmp_path: Path, monkeypatch, capsys
+):
+    place = tmp_path / "models" / "tee.npz"
+    for module in (imaging, detection_model):
+        monkeypatch.setattr(module, "MODEL_FILE", place)
+    with pytest.raises(InputError, match="no trained detectors come with this installation"):
+        default_model()
+    store = changed(done)
+    assert call(done, "hydra.run.dir=run", "imaging.publish_model=true") == 0
+    assert "Done on" in capsys.readouterr().out
+    assert changed(done) == store
+    assert place.read_bytes() == (done / "run" / "tee.npz").read_bytes()
+    assert default_model().accuracy is not None
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("imaging.test.seed=1", "expected different seeds"),
+        ("imaging.train.count=0", "imaging.train.count = 0, expected a number >= 1"),
+        ("imaging.calibration.count=1", "imaging.calibration.count = 1"),
+        ("imaging.curve=[6]", "imaging.curve has 6 volumes, expected 1 to 5"),
+        ("imaging.curve=[3,3]", "expected other numbers"),
+        ("imaging.processes=0", "imaging.processes = 0"),
+        ("imaging.held_out.shifted=0", "imaging.held_out.shifted = 0"),
+        ("imaging.held_out.curve_volumes=3", "expected at most 2"),
+        ("imaging.held_out.wrong_mm=0", "imaging.held_out.wrong_mm = 0"),
+        ("imaging.training.modes=7", "expected at least 8"),
+        ("imaging.training.acquisition.beats=0", "beats"),
+        ("imaging.population.motion.columns=12", "no column"),
+        ("imaging.population.motion.frames=30", "frames = 30"),
+        ("imaging.targets={shifted:{colour:1}}", "imaging.targets"),
+        ("imaging.procesess=3", "did you mean processes?"),
+        ("imaging.training.volumes=many", "imaging.training.volumes"),
+    ],
+)
+def test_wrong_settings_are_told_in_one_line(tmp_path: Path, override: str, words: str, capsys):
+    assert call(tmp_path, override) == 2
+    told = capsys.readouterr().err.strip()
+    assert len(told.splitlines()) == 1
+    assert words in told
+    assert not (tmp_path / "outputs" / "detectors").exists()
+
+
+def test_populations_with_a_valve_in_common_are_refused(done: Path):
+    config = composed(f"paths.outputs={done / 'outputs'}")
+    store = ImagingStore(config)
+    train, test = (store.population(which).valves for which in ("train", "test"))
+    imaging.require_apart(train, test)
+    with pytest.raises(ConfigurationError, match="two populations"):
+        imaging.require_apart(train, (*test, train[1]))
+    # The same shape under another name.
+    twin = copy.copy(test[0])
+    object.__setattr__(twin, "vertices", train[0].vertices)
+    with pytest.raises(ConfigurationError, match="two populations"):
+        imaging.require_apart(train, (twin,))
+
+
+def test_keys_follow_what_they_are_of():
+    def keys(*overrides: str) -> tuple[str, ...]:
+        store = ImagingStore(composed(*overrides))
+        return store.population_key("train"), store.samples_key, store.model_key(6)
+
+    base = keys()
+    assert keys("imaging.processes=2", "imaging.held_out.volumes=9") == base
+    trees = keys("imaging.training.many_trees=5")
+    assert trees[:2] == base[:2]
+    assert trees[2] != base[2]
+    # More volumes go on from those that are there.
+    more = keys("imaging.training.volumes=9")
+    assert more == base
+    assert keys("imaging.training.draft_volumes=2")[1] != base[1]
+    other = keys("seed=2")
+    assert other[0] == base[0]
+    assert other[1] != base[1]
+    assert not set(keys("imaging.train.seed=9")) & set(base)
+    assert ImagingStore(composed()).model_key(3) != base[2]
+
+
+def test_the_modules_that_train_are_those_of_imaging_but_some():
+    every, some = imaging_store.imaging_source(()), imaging_store.imaging_source(("reading",))
+    assert "imaging/detection/training.py" in some
+    assert "imaging/simulator/scene.py" in some
+    assert {name for name in every if name not in some} == {
+        name for name in every if name.startswith("imaging/reading/")
+    }
+    root = Path(imaging_store.mvest.__file__).parent
+    for name in (*imaging_store.NOT_SAMPLED_BY, *imaging_store.NOT_DETECTED_BY):
+        assert (root / "imaging" / name).exists()
+
+
+def test_samples_in_files_are_read_stage_by_stage(done: Path):
+    path = next((done / "outputs" / "detectors" / "samples").rglob("00000.npz"))
+    samples = StoredSamples(path)
+    assert list(samples) == list(STAGES)
+    x, y = samples["boundary"]
+    assert len(x) == len(y) == 60
+    assert samples.cpu_s > 0
+
+
+def test_every_trial_has_a_stream_of_its_own():
+    trials = [Trial(kind, k, 1, SMALL) for kind in KINDS for k in range(3)]
+    states = {tuple(trial.random.generate_state(2)) for trial in trials}
+    states |= {tuple(np.random.SeedSequence(1, spawn_key=(k,)).generate_state(2)) for k in range(3)}
+    assert len(states) == len(trials) + 3
+    assert {trial.spread for trial in trials if "shifted" in trial.kind} == {"shifted"}
+    assert {trial.spread for trial in trials if "shifted" not in trial.kind} == {"training"}
+
+
+def volume(kind: str, number: int, size: float, confidence: float = 0.9) -> dict:
+    errors = dict.fromkeys(("position", "turn", "annulus", "surface", "points", "tips"), size)
+    measured = {"annulus_area_mm2": 100.0, "ap_diameter_mm": 30.0, "is_open": True}
+    return {
+        "kind": kind, "number": number, "valve": "a", "frame": 0, "cpu_s": 2.0,
+        "confidence": confidence,
+        "errors": errors | {"surface": 2 * size, "stages": {"landmarks": 3 * size}},
+        "true": measured,
+        "found": measured | {"annulus_area_mm2": 90.0, "ap_diameter_mm": 31.5, "is_open": False},
+    }  # fmt: skip
+
+
+def test_rows_have_signs_and_nothing_where_no_valve_was_found():
+    row = table_row(volume("shifted", 0, 1.0), 0.5)
+    assert row["surface_mm"] == 2.0
+    assert row["annulus_area_error_percent"] == pytest.approx(-10.0)
+    assert row["ap_error_mm"] == pytest.approx(1.5)
+    assert row["state_right"] is False
+    lost = table_row(volume("shifted", 0, 1.0, 0.4), 0.5)
+    assert lost["surface_mm"] is lost["ap_error_mm"] is lost["state_right"] is None
+    assert lost["seconds"] == 2.0
+
+
+def test_trainings_are_compared_on_the_same_volumes():
+    rows = {
+        10: [volume("shifted", 0, 4.0)],
+        20: [volume("shifted", 0, 1.0), volume("shifted", 1, 100.0), volume("walls only", 0, 9.0)],
+    }
+    found = {(row["training_volumes"], row["stage"]): row["median"] for row in learning_rows(rows)}
+    assert found[10, "surface"] == 8.0
+    assert found[20, "surface"] == 2.0
+    assert found[20, "landmarks"] == 3.0
+    assert found[20, "pose"] == 1.0
+
+
+def test_the_threshold_tells_with_from_without():
+    assert _threshold(np.array([0.6, 0.8, 0.9]), np.array([0.1, 0.4])) == pytest.approx(0.5)
+    # One outlier does not move it.
+    assert 0.4 < _threshold(np.array([0.3, 0.8, 0.9]), np.array([0.1, 0.4])) < 0.8
+
+
+def sequence(confidence: float, off: float) -> tuple[dict, dict]:
+    frames = [
+        {"confidence": confidence - 0.1, "points": off},
+        {"confidence": confidence, "points": off},
+    ]
+    return {"frames": frames, "valve": f"{off}"}, {"errors": np.full((2, 4, 3), off)}
+
+
+def test_errors_are_told_of_valves_that_were_found_only():
+    held_out = HeldOut(
+        {}, {"calibration": [sequence(0.9, 1.0), sequence(0.8, 30.0), sequence(0.3, 2.0)]}
+    )
+    right = held_out.found("calibration", 0.5, 5.0)
+    assert right.stacked("calibration", "errors").max() == 1.0
+    assert len(held_out.found("calibration", 0.5).sequences["calibration"]) == 2
+    config = {"imaging": {"detection": {"least_confidence": 0.5}, "held_out": {"wrong_mm": 5.0}}}
+    with pytest.raises(InputError, match="in 1 of 3 volumes the valve was found"):
+        imaging._calibrated(config, held_out)
+
+
+def test_a_wrong_valve_counts_as_none():
+    volumes = [
+        volume("in distribution", 0, 1.0, 0.9),
+        volume("in distribution", 1, 8.0, 0.6),
+        *({"kind": kind, "confidence": 0.2} for kind in ("walls only", "no tissue", "white noise")),
+    ]
+    sequences = {"calibration": [sequence(0.8, 1.0)[0]], "sequence": [], "shifted sequence": []}
+    found = _confidences(volumes, sequences, 0.5, 5.0)
+    assert found["highest_without_valve"] == 0.2
+    assert found["highest_wrong"] == 0.6
+    assert found["lowest_right"] == 0.8
+    assert found["best_threshold"] == pytest.approx(0.7)
+    rows = {row["kind"]: row for row in found["rows"]}
+    assert rows["in distribution"]["called a valve [%]"] == 100
+    assert rows["in distribution"]["wrongly called so [%]"] == 50
+    assert rows["walls only"]["wrongly called so [%]"] == 0
+    assert "sequence" not in rows
+
+
+def test_the_small_scanner_is_the_simulators():
+    assert ImagingStore(composed()).training.acquisition == SMALL

@@ -1,0 +1,101 @@
+"""What is told of a study of the image step: numbers in words, and what figures show."""
+
+import numpy as np
+import pytest
+
+from experiments.studies.imaging.report import (
+    confidence_figure,
+    correlation_figure,
+    imaging_text,
+    study_words,
+    write_imaging_study,
+)
+
+CONFIDENCE = {
+    "least_confidence": 0.5,
+    "wrong_mm": 5.0,
+    "values": {"shifted": [0.9, 0.6], "walls only": [0.2], "sequence": []},
+    "off_mm": {"shifted": [1.0, 20.0], "walls only": [None], "sequence": []},
+    "highest_without_valve": 0.2,
+    "highest_wrong": 0.6,
+    "lowest_right": 0.9,
+    "best_threshold": 0.75,
+    "rows": [],
+}
+ACCURACY = {
+    "std_mm": [0.5] * 80,
+    "median_std_mm": 0.5,
+    "mean_error_mm": 0.3,
+    "sequences": 18,
+    "left_out": 2,
+    "correlation_length_mm": 8.0,
+    "correlogram": {"distance": [1.0, 8.0], "correlation": [0.97, 0.48], "pairs": [3, 4]},
+    "within_95": [
+        {
+            "setting": "shifted", "frame": "open", "sequences": 4, "share": 0.62,
+            "share_about_mean": 0.7,
+        }
+    ],
+}  # fmt: skip
+
+
+def spent(**cpu: float | None) -> dict:
+    return {part: {"cpu_s": cpu.get(part, 10.0)} for part in
+            ("valves", "volumes", "draft", "trees", "training")}  # fmt: skip
+
+
+def record(**more) -> dict:
+    return {
+        "row": "detectors", "reason": "trained", "rows": [], "targets": {},
+        "training_volumes": 24, "valves": {"train": {"count": 8}}, "spent": spent(training=120.0),
+    } | more  # fmt: skip
+
+
+def test_words_of_a_training_alone_are_its_cost(tmp_path):
+    words = study_words(record())
+    assert words[0].startswith("Trained on 24 volumes of 8 simulated valves; CPU time 10 s for")
+    assert words[0].endswith("2.0 minutes in all.")
+    assert words[1:] == ["Not tested."]
+    # What was not measured is not told.
+    unknown = study_words(record(spent=spent(valves=None, training=None)))[0]
+    assert "for valves" not in unknown
+    assert "in all" not in unknown
+    assert "Not tested" in imaging_text(record())
+    assert write_imaging_study(tmp_path, record()) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_words_say_whether_the_errors_told_are_true():
+    rows = [{"state_right": True}, {"state_right": False}, {"state_right": None}]
+    words = " ".join(study_words(record(accuracy=ACCURACY, confidence=CONFIDENCE, rows=rows)))
+    assert "right in 1 of 2 volumes" in words
+    assert "from 18 volumes over time" in words
+    assert "taken for it: 2." in words
+    assert "Shifted, open frame: 62 % of coordinates" in words
+    assert "(70 % with the mean error taken off)" in words
+    assert "without a valve: at most 0.20" in words
+    assert "0.75 would tell these apart" in words
+
+
+def test_the_figure_of_confidences_shows_wrong_valves_hollow():
+    axes = confidence_figure(CONFIDENCE).axes[0]
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels == ["shifted (2)", "no valve: walls only (1)"]
+    faces = {
+        float(x): line.get_markerfacecolor()
+        for line in axes.lines
+        if line.get_linestyle() == "None"
+        for x in line.get_xdata()
+    }
+    assert faces[0.6] == "white"
+    assert faces[0.9] != "white"
+    assert faces[0.2] not in ("white", faces[0.9])
+
+
+def test_the_figure_of_correlations_shows_the_fitted_one():
+    axes = correlation_figure(ACCURACY).axes[0]
+    curve = next(line for line in axes.lines if "8.0 mm" in str(line.get_label()))
+    x, y = (np.asarray(v, float) for v in curve.get_data())
+    assert y[0] == pytest.approx(1.0)
+    assert y[-1] == pytest.approx((1 + np.sqrt(3)) * np.exp(-np.sqrt(3)), rel=1e-6)
+    assert x[-1] == 8.0

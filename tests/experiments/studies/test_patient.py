@@ -1,0 +1,313 @@
+"""Virtual patients: hidden before the estimation, revealed after it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from experiments.common.cases.blind import SECRET
+from experiments.common.cases.own_case import run_case
+from experiments.common.expectation import foresee_patient
+from experiments.studies.patient import study as patient
+from experiments.studies.patient.study import make_patient, reveal, run_patient
+from mvest.cases.folder import read_case
+from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.provenance import write_json
+from mvest.reporting.case.fields import read_case_fields
+from mvest.simulation.virtual_patient import Hidden, VirtualPatient
+from tests.experiments.common.test_config import composed, plain
+from tests.made_up_closure import TRUE, made_up_case, use
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+def config_of(folder, *overrides):
+    return plain(
+        composed(
+            "experiment=patients", "patient=normal_small", "figures=false",
+            f"paths.outputs={folder}", *overrides,
+        )
+    )  # fmt: skip
+
+
+def made_up_patient(name, description, template, values, simulation, mechanics, rng):
+    """Stands for a simulation: the case of the formula, whatever was drawn."""
+    case = made_up_case(0.3, 8.0, rng)
+    exact = made_up_case()
+    positions = {frame.name: frame.vertices for frame in exact.frames}
+    return VirtualPatient(case, Hidden(dict(TRUE), positions))
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """How often a patient was simulated, and with what."""
+    calls = []
+
+    def simulate(*arguments):
+        calls.append(arguments)
+        return made_up_patient(*arguments)
+
+    monkeypatch.setattr(patient, "simulate_patient", simulate)
+    return calls
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Let the estimating process be this one, and the closure a formula."""
+    use(monkeypatch)
+    monkeypatch.setattr(
+        "experiments.common.cases.record.clinical_measurements", lambda *arguments: {}
+    )
+    seen = []
+
+    def blindly(values, config_hash, folder, case, sealed):
+        told = {k: v for k, v in values.items() if k not in SECRET}
+        told |= {"case": str(case), "seed": None, "parameters": [], "row": None}
+        record, _ = run_case(told, config_hash, folder, 0.0)
+        write_json(folder / "estimate.json", record)
+        seen.append((folder, sealed))
+        return json.loads((folder / "estimate.json").read_text())
+
+    monkeypatch.setattr(patient, "estimate_blindly", blindly)
+    return seen
+
+
+def test_a_patient_is_simulated_once(tmp_path, simulated):
+    place = make_patient(config_of(tmp_path))
+    again = make_patient(config_of(tmp_path, "personal=considered"))
+    assert place == again
+    assert len(simulated) == 1
+    other = make_patient(config_of(tmp_path, "seed=2"))
+    assert other.case != place.case
+    assert read_case(place.case).simulated
+    # What was interrupted before the truth was written is simulated again, and whole.
+    (place.hidden / "hidden.json").unlink()
+    (place.case / "rest.txt").write_text("left")
+    make_patient(config_of(tmp_path))
+    assert len(simulated) == 3
+    assert not (place.case / "rest.txt").exists()
+
+
+def test_the_case_and_the_truth_lie_apart(tmp_path, simulated):
+    place = make_patient(config_of(tmp_path))
+    hidden = json.loads((place.hidden / "hidden.json").read_text())
+    assert hidden["values"] == TRUE
+    assert place.case.parent == place.hidden.parent
+    text = b"".join(p.read_bytes() for p in place.case.rglob("*") if p.is_file()).decode("latin-1")
+    for name, value in TRUE.items():
+        assert name not in text, name
+        # Short values may occur by chance; the moduli of the configuration must not.
+        assert json.dumps({name: value})[1:-1] not in text
+    assert "normal_small" not in {p.name for p in place.case.rglob("*")}
+
+
+def test_moduli_are_those_of_the_configuration_or_drawn_about_them(tmp_path, simulated):
+    make_patient(config_of(tmp_path))
+    values = simulated[0][3]
+    assert (values["E_f.anterior"], values["E_f.posterior"]) == (6.28, 2.61)
+    draws = []
+    config = config_of(tmp_path, "patient=drawn", "patient.variation=0")
+    for seed in range(1, 41):
+        make_patient(config | {"seed": seed})
+        draws.append([simulated[-1][3][f"E_f.{r}"] for r in ("anterior", "posterior")])
+    logs = np.log(np.array(draws) / [6.23, 2.09])
+    # Forty draws of 0.4: a standard error of 0.063 of the mean and 0.045 of the spread.
+    assert np.abs(logs.mean(axis=0)).max() < 4 * 0.063
+    assert np.abs(logs.std(axis=0) - 0.4).max() < 4 * 0.045
+    assert abs(np.corrcoef(logs.T)[0, 1]) < 0.6
+
+
+def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
+    shapes = []
+
+    def simulate(name, description, template, *rest):
+        shapes.append(template.parameters)
+        if len(shapes) < 3:
+            raise GeometryError("does not close")
+        return made_up_patient(name, description, template, *rest)
+
+    monkeypatch.setattr(patient, "simulate_patient", simulate)
+    place = make_patient(config_of(tmp_path, "patient=drawn", "seed=7"))
+    assert len(set(map(repr, shapes))) == 3
+    assert json.loads((place.hidden / "hidden.json").read_text())["anatomies_drawn"] == 3
+    # An anatomy that is given is not exchanged for another one, and draws come to an end.
+    for overrides, tries in (("patient=drawn", 5), ("patient=prolapse", 1)):
+        shapes.clear()
+        monkeypatch.setattr(
+            patient,
+            "simulate_patient",
+            lambda *a: shapes.append(a) or (_ for _ in ()).throw(GeometryError("does not close")),
+        )
+        with pytest.raises(GeometryError, match="does not close"):
+            make_patient(config_of(tmp_path, overrides, "seed=8"))
+        assert len(shapes) == tries
+
+
+def test_a_study_of_patients_needs_one():
+    with pytest.raises(ConfigurationError, match="patient is not given"):
+        make_patient({"patient": None})
+
+
+def test_nothing_is_revealed_before_the_estimation_has_ended(
+    tmp_path, simulated, in_process, monkeypatch
+):
+    out = tmp_path / "job"
+    out.mkdir()
+    files = {}
+    true_reveal = patient.reveal
+
+    def watch(record, place, fields):
+        files.update({p.name: p.read_bytes() for p in out.iterdir()})
+        assert all(row["truth"] is None for row in record["unknowns"])
+        return true_reveal(record, place, fields)
+
+    monkeypatch.setattr(patient, "reveal", watch)
+    record, _ = run_patient(config_of(tmp_path), "hash", out, 0.0)
+    assert set(files) == {"estimate.json", "fields.npz"}
+    told = json.loads(files["estimate.json"])
+    assert told["truth"] is None
+    assert told["relative_error"] is None
+    assert "made_from" not in told
+    for value in (6.28, 2.61, *TRUE.values()):
+        assert value not in leaves(told)
+    # What was estimated did not change when the truth came.
+    for key in ("estimate", "std", "iterates", "narrow", "objective"):
+        assert record[key] == told[key]
+    assert record["provenance"]["seed"] == 1
+    assert record["paper_patient"] == {"moduli": [6.28, 2.61], "distance_mm": [1.5, 1.47]}
+
+
+def leaves(value):
+    if isinstance(value, dict):
+        # The priors and the settings of the mechanics are told to everyone.
+        return {v for k, item in value.items() if k != "settings" for v in leaves(item)}
+    if isinstance(value, list):
+        return {v for item in value for v in leaves(item)}
+    return {value}
+
+
+def test_what_is_revealed_is_right(tmp_path, simulated, in_process):
+    out = tmp_path / "job"
+    out.mkdir()
+    record, _ = run_patient(config_of(tmp_path), "hash", out, 0.0)
+    write_json(tmp_path / "record.json", record)
+    assert record["status"] == "converged"
+    for row in record["unknowns"]:
+        assert row["truth"] == TRUE[row["name"]]
+        assert row["inside"] is (row["low"] <= row["truth"] <= row["high"])
+    for key in ("without_nuisances", "as_in_the_paper"):
+        rows = record[key]["parameters"]
+        assert [row["truth"] for row in rows] == [5.1, 2.6]
+        assert all(isinstance(row["inside"], bool) for row in rows)
+    # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
+    assert not all(row["inside"] for row in record["without_nuisances"]["parameters"])
+    assert record["truth"] == [5.1, 2.6]
+    np.testing.assert_allclose(
+        record["relative_error"], np.array(record["estimate"]) / [5.1, 2.6] - 1
+    )
+    moduli = {(row["region"], row["name"]): row for row in record["moduli"]}
+    for region, true in (("anterior", 5.1), ("posterior", 2.6)):
+        own = moduli[region, "E_f"]
+        assert own["truth"] == pytest.approx(true)
+        for name in ("E_perp", "G"):
+            row = moduli[region, name]
+            assert row["truth"] / own["truth"] == pytest.approx(row["estimate"] / own["estimate"])
+            assert row["relative_error"] == pytest.approx(own["relative_error"])
+        assert own["relative_error"] == pytest.approx(own["estimate"] / true - 1)
+    fields = read_case_fields(out / "fields.npz")
+    truth = made_up_case().frames
+    for k, row in enumerate(record["distances"]):
+        gap = np.linalg.norm(fields.fitted[k] - fields.truth[k], axis=1)
+        assert row["to_truth"]["personalised"]["mean"] == pytest.approx(gap.mean(), abs=1e-4)
+        assert row["to_truth"]["personalised"]["max"] == pytest.approx(gap.max(), abs=1e-4)
+        assert row["to_truth"]["generic"]["mean"] > row["to_truth"]["personalised"]["mean"]
+        # The truth is where it would have been seen without errors, of this frame and no other.
+        same = np.linalg.norm(truth[k + 1].vertices - truth[2 - k].vertices, axis=1)
+        assert same.max() > 0.5
+        raw = np.load(out / "fields.npz")["truth"][k]
+        np.testing.assert_allclose(raw, truth[k + 1].vertices, atol=1e-4)
+
+
+def test_revealing_leaves_what_it_was_given(tmp_path, simulated, in_process):
+    place = make_patient(config_of(tmp_path))
+    out = tmp_path / "job"
+    out.mkdir()
+    record = patient.estimate_blindly(config_of(tmp_path), "hash", out, place.case, place.hidden)
+    before = json.dumps(record)
+    revealed = reveal(record, place, out / "fields.npz")
+    assert json.dumps(record) == before
+    assert revealed["truth"] == [5.1, 2.6]
+
+
+def test_a_failed_estimation_is_revealed_too(tmp_path, simulated, in_process, monkeypatch):
+    use(monkeypatch, fails_above=4.0)
+    out = tmp_path / "job"
+    out.mkdir()
+    record, files = run_patient(config_of(tmp_path, "figures=true"), "hash", out, 0.0)
+    write_json(tmp_path / "record.json", record)
+    assert record["status"] == "failed"
+    assert files == []
+    assert [row["truth"] for row in record["unknowns"]] == [
+        TRUE[row["name"]] for row in record["unknowns"]
+    ]
+    assert all(row["inside"] is None for row in record["unknowns"])
+    assert record["relative_error"] is None
+
+
+def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
+    place = make_patient(config_of(tmp_path))
+    (place.hidden / "positions.npz").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="does not hold what a patient hides"):
+        reveal({}, place, tmp_path / "fields.npz")
+
+
+SMALLEST = (
+    "patient.simulation.columns=16", "patient.simulation.rows=2",
+    "patient.simulation.dt_factor=1", "patient.simulation.contact_columns=60",
+    "patient.simulation.contact_rows=16", "patient.simulation.seen_columns=32",
+    "patient.simulation.seen_rows=9", "patient.simulation.held_pressure_mmHg=[95]",
+    "patient.simulation.held_relaxation=[0.1]", "patient.deviations.pressure=0.02",
+    "patient.deviations.chord_stiffness=0.02", "patient.deviations.chord_rest_length=0.002",
+    "valve=template", "personal=moduli", "personal.moduli_only=false", "personal.confirm=false",
+    "personal.mesh.columns=16", "personal.mesh.rows=2", "personal.mesh.guide_columns=16",
+    "personal.mesh.guide_rows=2", "personal.mesh.contact_columns=60",
+    "personal.mesh.contact_rows=16", "personal.max_iterations=2",
+    "mechanics.protocol.pressure_mmHg=100", "mechanics.protocol.ramp=0.2",
+    "mechanics.protocol.dt=0.04", "mechanics.protocol.growth=2", "mechanics.protocol.end=0.4",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
+    config = config_of(tmp_path, *SMALLEST)
+    config["personal"]["paper"] = None
+    place = make_patient(config)
+    records = []
+    for name in ("one", "two"):
+        out = tmp_path / name
+        out.mkdir()
+        records.append(patient.estimate_blindly(config, "hash", out, place.case, place.hidden))
+        if name == "one":
+            revealed = reveal(records[0], place, out / "fields.npz")
+            shutil.rmtree(place.hidden)
+    for key in ("estimate", "std", "iterates", "objective", "distances", "measurements"):
+        assert records[0][key] == records[1][key]
+    assert revealed["truth"] == [6.28, 2.61]
+
+
+def test_a_check_tells_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
+    use(monkeypatch)
+    said = foresee_patient(config_of(tmp_path))
+    assert len(simulated) == 1
+    assert "numbers of closed" in said
+    assert "No estimation was run." in said
+    rows = {line.split()[0]: line.split()[2] for line in said.splitlines() if "E_f." in line}
+    # The assumed values are the prior's, not the patient's.
+    assert rows
+    assert all(float(rows[name]) != pytest.approx(TRUE[name], rel=1e-3) for name in rows)

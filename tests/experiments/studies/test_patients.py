@@ -1,0 +1,413 @@
+"""Tables 2 and 3, Figure 3 and the population, from made-up records."""
+
+import copy
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from experiments.common.cases import tables as patient_tables
+from experiments.common.cases.report import (
+    KEPT_ARRAYS,
+    case_text,
+    publish_patient,
+    write_case_tables,
+)
+from experiments.common.cases.tables import (
+    figure3,
+    read_kept,
+    table2,
+    table3,
+    write_patient_tables,
+)
+from experiments.studies.patient.population import (
+    _clopper_pearson,
+    population_figure,
+    population_frame,
+    write_population_tables,
+)
+from mvest.errors import InputError
+from mvest.provenance import write_json
+from mvest.reporting.case.fields import read_case_fields
+from tests.reporting.case.made_up_case import arrays
+
+TRUTH = {"E_f.anterior": 6.0, "E_f.posterior": 2.0, "pressure_scale": 1.05, "shift.x": 0.4}
+UNIT = {"E_f": "MPa", "shift": "mm"}
+
+
+def row(name, estimate, half):
+    """An unknown with the interval estimate ± half."""
+    truth = TRUTH[name]
+    low, high = (None, None) if estimate is None else (estimate - half, estimate + half)
+    return {
+        "name": name,
+        "label": name.replace(".", " "),
+        "unit": UNIT.get(name.partition(".")[0], ""),
+        "treatment": "estimated",
+        "prior_mean": 1.0,
+        "prior_std": 1.0,
+        "estimate": estimate,
+        "std": None if estimate is None else half / 1.96,
+        "low": low,
+        "high": high,
+        "truth": truth,
+        "inside": None if estimate is None else low <= truth <= high,
+    }
+
+
+def moduli(anterior, posterior, half=0.5):
+    return [row("E_f.anterior", anterior, half), row("E_f.posterior", posterior, half)]
+
+
+def spread(mean):
+    return {"mean": mean, "std": 0.1, "max": 3 * mean}
+
+
+def distance(frame, seen, generic, registered, personalised):
+    means = {"generic": generic, "registered": registered, "personalised": personalised}
+    return {
+        "frame": frame,
+        "seen": seen,
+        **{which: spread(mean) for which, mean in means.items()},
+        "to_truth": {which: spread(mean / 2) for which, mean in means.items()},
+    }
+
+
+def made_up(name="normal_small", **changes):
+    """Inside for both moduli; without nuisances for one, by the paper's filter for none."""
+    return {
+        "schema": 1,
+        "experiment": "patients",
+        "case": {"name": name},
+        "table": "patients",
+        "status": "converged",
+        "reason": "converged",
+        "unknowns": [
+            *moduli(5.8, 2.1), row("pressure_scale", 1.02, 0.05), row("shift.x", 0.1, 0.2)
+        ],
+        "without_nuisances": {
+            "status": "converged", "reason": "converged", "parameters": moduli(5.7, 3.1)
+        },
+        "as_in_the_paper": {
+            "status": "failed", "reason": "no rounds left", "parameters": moduli(9.0, 4.0)
+        },
+        "distances": [
+            distance("closed", True, 2.0, 1.5, 0.5), distance("late", False, 1.0, 0.4, 0.8)
+        ],
+        "narrow": [
+            {"what": "E_f anterior, pressure known", "std_now": 0.4, "std_if_known": 0.3},
+            {"what": "E_f posterior, pressure known", "std_now": 0.4, "std_if_known": 0.1},
+            {"what": "E_f anterior, registration known", "std_now": 0.4, "std_if_known": 0.38},
+        ],
+        "settings": {},
+        "measurements": {},
+        "paper_patient": {"moduli": [6.28, 2.61], "distance_mm": [1.5, 1.47]},
+        "provenance": {
+            "git": {"sha": "0123456789abcdef" * 2 + "01234567", "dirty": False},
+            "versions": {"mvest": "0.1.0"},
+            "config_hash": "cd" * 32,
+            "mesh_hash": "ab" * 32,
+            "seed": 1,
+            "finished": "2025-01-31T12:00:00Z",
+        },
+        **changes,
+    }  # fmt: skip
+
+
+def failed(name="prolapse"):
+    """Nothing was found, by no filter."""
+    nothing = moduli(None, None)
+    return made_up(
+        name,
+        status="failed",
+        reason="the model failed",
+        unknowns=[*nothing, row("pressure_scale", None, 0), row("shift.x", None, 0)],
+        without_nuisances={"status": "failed", "reason": "the model failed", "parameters": nothing},
+        as_in_the_paper={"status": "failed", "reason": "the model failed", "parameters": nothing},
+        distances=[],
+        narrow=[],
+    )
+
+
+def keep(results, records, table="patients"):
+    (results / table).mkdir(parents=True, exist_ok=True)
+    for record in records:
+        write_json(results / table / f"{record['case']['name']}.json", record)
+
+
+@pytest.fixture(scope="module")
+def fields_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("fields") / "fields.npz"
+    stored = arrays(np.random.default_rng(1))
+    known = {k: np.nan_to_num(v, nan=1.0) for k, v in stored.items() if k.startswith("distance")}
+    np.savez(path, **stored | known)
+    return path
+
+
+def test_table2_lays_estimates_beside_the_truth():
+    (anterior, posterior) = table2([made_up()]).to_dict("records")
+    assert anterior["patient"] == "normal_small"
+    assert (anterior["modulus"], posterior["modulus"]) == ("E_f.anterior", "E_f.posterior")
+    assert anterior["hidden truth [MPa]"] == 6.0
+    assert anterior["estimate [MPa]"] == 5.8
+    assert (anterior["95 % low [MPa]"], anterior["95 % high [MPa]"]) == pytest.approx((5.3, 6.3))
+    assert anterior["inside"]
+    assert anterior["without nuisances inside"]
+    assert not posterior["without nuisances inside"]
+    assert posterior["without nuisances [MPa]"] == 3.1
+    assert posterior["paper's filter [MPa]"] == 4.0
+    assert posterior["paper's filter ended"] == "no rounds left"
+    assert [r["paper's estimate for its patient [MPa]"] for r in (anterior, posterior)] == [
+        6.28, 2.61
+    ]  # fmt: skip
+
+
+def test_table3_says_how_much_closer_and_where_the_truth_is():
+    closed, late = table3([made_up()]).to_dict("records")
+    # 2.0 mm to 0.5 mm is three quarters; 1.0 mm to 0.8 mm a fifth.
+    assert closed["closer [%]"] == pytest.approx(75.0)
+    assert late["closer [%]"] == pytest.approx(20.0)
+    assert (closed["shown to the filter"], late["shown to the filter"]) == (True, False)
+    assert closed["registered mean [mm]"] == 1.5
+    assert closed["personalised to the truth [mm]"] == 0.25
+    # The paper's distances are of the frame that its filter was shown.
+    assert closed["paper generic [mm]"] == 1.5
+    assert pd.isna(late["paper generic [mm]"])
+
+
+def test_the_words_count_what_the_tables_hold(tmp_path):
+    other = made_up("normal_large")
+    other["unknowns"][1] = row("E_f.posterior", 4.0, 0.5)
+    other["distances"][0] = distance("closed", True, 1.0, 0.9, 1.2)
+    keep(tmp_path, [made_up(), other])
+    write_patient_tables(tmp_path)
+    second = (tmp_path / "table2.md").read_text()
+    assert "contains the truth for 3 of 4 moduli" in second
+    assert "without nuisances for 2 of 4" in second
+    assert "paper's filter for 0 of 4" in second
+    # Widths of 1 MPa over 5.8, 2.1, 5.8 and 4.0 MPa: 0.17 to 0.48, mean 0.267.
+    assert "over the estimate: 0.17 to 0.48, mean 0.27" in second
+    # (1 - 0.3/0.4 + 1 - 0.1/0.4) / 2 = 50 %, and 5 %: the most first.
+    assert "on average: pressure known by 50 %; registration known by 5 %." in second
+    assert second.count("✗") == 1 + 2 + 4
+    assert "Simulated valves" in second
+    third = (tmp_path / "table3.md").read_text()
+    # 75 % and -20 %: closer in one of two, 27.5 % on average.
+    assert "shown: personalised closer than generic in 1 of 2, by 28 % on average" in third
+    assert "laid rigidly on the closed frame in 1." in third
+    assert "not shown: personalised closer than generic in 2 of 2, by 20 % on average" in third
+    assert "laid rigidly on the closed frame in 0." in third
+
+
+def test_patients_come_in_their_order_and_others_by_name(tmp_path):
+    names = ["zebra", "prolapse", "aardvark", "normal_small", "fibroelastic"]
+    keep(tmp_path, [made_up(name) for name in names])
+    assert [r["case"]["name"] for r in read_kept(tmp_path, "patients").values()] == [
+        "normal_small", "prolapse", "fibroelastic", "aardvark", "zebra"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("records", [[failed()], [made_up(), failed()]], ids=["alone", "beside"])
+def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
+    keep(tmp_path, records)
+    write_patient_tables(tmp_path)
+    text = (tmp_path / "table2.md").read_text()
+    assert "prolapse" in text
+    assert "nan" not in text
+    assert "prolapse" in (tmp_path / "table2.csv").read_text()
+    if len(records) == 2:
+        assert "contains the truth for 2 of 2 moduli" in text
+        assert "prolapse" not in (tmp_path / "table3.md").read_text()
+    else:
+        assert "No estimation of these patients found moduli." in text
+
+
+def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
+    keep(tmp_path, [made_up(without_nuisances=None, as_in_the_paper=None)])
+    write_patient_tables(tmp_path)
+    text = (tmp_path / "table2.md").read_text()
+    assert "without nuisances for" not in text
+    mixed = made_up("prolapse")
+    mixed["as_in_the_paper"]["parameters"] = moduli(None, None)
+    keep(tmp_path, [mixed])
+    write_patient_tables(tmp_path)
+    text = (tmp_path / "table2.md").read_text()
+    assert "without nuisances for 1 of 2" in text
+    assert "paper's filter for" not in text
+
+
+def test_without_patients_there_is_nothing_to_write(tmp_path):
+    assert write_patient_tables(tmp_path) == []
+    assert write_population_tables(tmp_path) == []
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"case": 1}'])
+def test_a_damaged_record_is_named(tmp_path, text):
+    (tmp_path / "patients").mkdir()
+    (tmp_path / "patients" / "bad.json").write_text(text)
+    with pytest.raises(InputError, match=r"bad\.json is no record of a patient"):
+        write_patient_tables(tmp_path)
+
+
+def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file):
+    written = publish_patient(tmp_path, "patients-normal-small", made_up(), fields_file)
+    assert {path.name for path in written} == {
+        f"{table}.{kind}" for table in ("table2", "table3") for kind in ("csv", "md", "tex")
+    } | {"figure3.png", "figure3.pdf"}
+    kept = json.loads((tmp_path / "patients" / "patients-normal-small.json").read_text())
+    assert kept["unknowns"] == made_up()["unknowns"]
+    with np.load(tmp_path / "patients" / "patients-normal-small.npz") as stored:
+        assert set(stored.files) <= set(KEPT_ARRAYS)
+        assert "sensitivity" not in stored.files
+        assert "truth" not in stored.files
+    first = {path: path.read_bytes() for path in written}
+    again = publish_patient(tmp_path, "patients-normal-small", made_up(), fields_file)
+    assert {path: path.read_bytes() for path in again} == first
+    publish_patient(tmp_path, "patients-prolapse", made_up("prolapse"), fields_file)
+    table = pd.read_csv(tmp_path / "table2.csv", comment="#")
+    assert list(table["patient"].unique()) == ["normal_small", "prolapse"]
+
+
+def test_a_table_reads_back_as_it_was(tmp_path):
+    keep(tmp_path, [made_up(), made_up("prolapse")])
+    write_patient_tables(tmp_path)
+    back = pd.read_csv(tmp_path / "table3.csv", comment="#")
+    pd.testing.assert_frame_equal(back, table3([made_up(), made_up("prolapse")]))
+    assert (tmp_path / "table3.csv").read_text().startswith("# ")
+
+
+def test_figure3_has_one_scale_for_all(fields_file, monkeypatch):
+    fields = read_case_fields(fields_file)
+    far = copy.copy(fields)
+    object.__setattr__(far, "distance_generic", 5 * fields.distance_generic)
+    seen = []
+    true_colours = patient_tables.corner_colours
+    monkeypatch.setattr(
+        patient_tables,
+        "corner_colours",
+        lambda scale, *rest: seen.append(scale) or true_colours(scale, *rest),
+    )
+    figure = figure3({"near": fields, "far": far})
+    assert len(seen) == 4
+    assert len({id(scale) for scale in seen}) == 1
+    (norm,) = {(scale.norm.vmin, scale.norm.vmax) for scale in seen}
+    assert norm[0] == 0.0
+    closed = far.distance_generic[far.closed]
+    assert norm[1] > np.median(closed)
+    panels = [axes for axes in figure.axes if axes.get_title()]
+    assert len(panels) == 4
+    # The frame that the filter was shown, not the one that was held out.
+    assert f"{np.mean(fields.distance_fitted[0]):.2f}" in panels[2].get_title()
+    assert "five" not in figure.get_suptitle()
+    assert "(simulated)" in figure.get_suptitle()
+
+
+def test_figure3_needs_distances(fields_file):
+    fields = copy.copy(read_case_fields(fields_file))
+    object.__setattr__(fields, "distance_fitted", None)
+    with pytest.raises(InputError, match="Figure 3 needs the distances"):
+        figure3({"one": fields})
+
+
+# -- the population ------------------------------------------------------------------------------
+def population(n=20, misses=2):
+    found = []
+    for k in range(n):
+        record = made_up(f"drawn_{k}", table="population", as_in_the_paper=None)
+        record["unknowns"][0] = row("E_f.anterior", 7.0 if k < misses else 6.1 + 0.01 * k, 0.5)
+        found.append(record)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("inside", "n", "low", "high"),
+    [
+        # Clopper and Pearson's intervals as R's binom.test prints them: 7 of 20, 18 of 20.
+        (7, 20, 0.1539092, 0.5921885),
+        (18, 20, 0.6830173, 0.9876515),
+        # None and all of n: the root of 0.025, 0.025^(1/20) = 0.8315665.
+        (0, 20, 0.0, 0.1684335),
+        (20, 20, 0.8315665, 1.0),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_bounds_of_a_share(inside, n, low, high):
+    assert _clopper_pearson(inside, n) == pytest.approx((low, high), abs=1e-7)
+
+
+def test_the_population_counts_how_often_intervals_hold(tmp_path):
+    keep(tmp_path, population(), "population")
+    write_population_tables(tmp_path)
+    text = (tmp_path / "population.md").read_text()
+    line = next(x for x in text.splitlines() if "with nuisances" in x and "anterior" in x)
+    assert "18 (90 %)" in line
+    assert "68 to 99 %" in line
+    assert "20 of 20" in line
+    # Both moduli: 18 + 20 of 40, without nuisances 20 + 0 of 40.
+    assert (
+        "Both moduli, with nuisances: the 95 % interval contains the truth 38 times of 40" in text
+    )
+    assert "Both moduli, without nuisances: the 95 % interval contains the truth 20 times" in text
+    shift = next(x for x in text.splitlines() if "shift.x" in x)
+    # Errors of what may be zero are absolute: 0.1 - 0.4 mm.
+    assert "-0.30" in shift
+    scale = next(x for x in text.splitlines() if "pressure" in x)
+    # (1.02 - 1.05) / 1.05 = -2.9 %, width 0.1 / 1.05 = 9.5 %.
+    assert "-2.9 %" in scale
+    assert "9.5 %" in scale
+    table = population_frame(population())
+    assert len(table) == 20 * (4 + 2)
+    assert set(table["estimation"]) == {"with nuisances", "without nuisances"}
+
+
+def test_failures_of_the_population_are_counted_and_not_drawn(tmp_path):
+    lost = [failed("drawn_98") | {"table": "population"}]
+    keep(tmp_path, [*population(4, 1), *lost], "population")
+    write_population_tables(tmp_path)
+    text = (tmp_path / "population.md").read_text()
+    assert "4 of 5" in text
+    assert "nan" not in text
+    only = tmp_path / "only"
+    keep(only, lost, "population")
+    write_population_tables(only)
+    text = (only / "population.md").read_text()
+    assert "0 of 1" in text
+    assert "nan" not in text
+
+
+def test_the_population_s_figure_draws_every_interval():
+    figure = population_figure(population_frame(population(6, 2)))
+    assert isinstance(figure, Figure)
+    assert len(figure.axes) == 4
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert legend == ["contains the truth (4)", "does not (2)"]
+
+
+def test_only_the_tables_parts_of_a_drawn_patient_are_kept(tmp_path, fields_file):
+    record = population(1, 0)[0]
+    publish_patient(tmp_path, "population-drawn-0", record, fields_file)
+    kept = json.loads((tmp_path / "population" / "population-drawn-0.json").read_text())
+    assert not {"settings", "measurements"} & set(kept)
+    assert [path.suffix for path in (tmp_path / "population").iterdir()] == [".json"]
+
+
+def test_a_finished_case_is_told():
+    text = case_text(made_up())
+    assert text.startswith("normal_small: converged")
+    assert "5.8 (5.3 to 6.3) MPa  (hidden truth 6)" in text
+    assert "frame late (not shown to the filter): 1.00 mm generic, 0.40 registered, 0.80" in text
+    own = made_up()
+    for unknown in own["unknowns"]:
+        unknown["truth"] = None
+        unknown.pop("inside")
+    assert "truth" not in case_text(own)
+    assert case_text(failed()).startswith("prolapse: the model failed")
+
+
+def test_unknowns_of_a_case_as_a_table(tmp_path):
+    (path,) = write_case_tables(tmp_path, made_up())
+    table = pd.read_csv(path)
+    assert list(table["name"]) == list(TRUTH)
+    assert table["estimate"].tolist() == [5.8, 2.1, 1.02, 0.1]

@@ -1,0 +1,138 @@
+"""Two finite-element codes that share nothing but the problem, and the filters that use them."""
+
+import numpy as np
+import pytest
+
+from experiments.studies.models.sheet.own import OwnSheet
+from experiments.studies.models.sheet.second import LAWS, SecondSheet
+from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
+
+pytest.importorskip("skfem")
+
+TINY = Sheet(cells=(2, 2), observed=(4, 3), load_steps=2)
+M = np.array([4.0, 1.5])
+
+
+def green_to_stretch(seed):
+    """A right Cauchy-Green tensor with distinct stretches, in no special direction."""
+    rng = np.random.default_rng(seed)
+    F = np.eye(3) + 0.3 * rng.standard_normal((3, 3))
+    return F.T @ F
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("C", [green_to_stretch(1), green_to_stretch(2), np.eye(3) * 1.1**2])
+def test_stress_and_tangent_are_derivatives_of_the_energy(law, C):
+    # S = dW/dE and D = dS/dE with E = (C - I)/2, by central differences; the third C has three
+    # equal stretches, where an eigenvector formula with differences of eigenvalues divides by zero.
+    lame, mu = np.array(3.0), np.array(0.7)
+
+    def energy(C):
+        if law == "biot":
+            stretch = np.sqrt(np.linalg.eigvalsh(C))
+            return 1.5 * (stretch.sum() - 3) ** 2 + 0.7 * np.sum((stretch - 1) ** 2)
+        E = 0.5 * (C - np.eye(3))
+        return 1.5 * np.trace(E) ** 2 + 0.7 * np.sum(E * E)
+
+    S, D = LAWS[law](C, lame, mu)
+    step = 1e-5
+    for i in range(3):
+        for j in range(3):
+            d = np.zeros((3, 3))
+            d[i, j] += 0.5
+            d[j, i] += 0.5
+            # A step in E is twice as large in C.
+            slope = (energy(C + 2 * step * d) - energy(C - 2 * step * d)) / (2 * step)
+            assert np.sum(S * d) == pytest.approx(slope, rel=1e-7, abs=1e-9)
+            up, down = (LAWS[law](C + s * 2 * step * d, lame, mu)[0] for s in (1, -1))
+            change = (D @ d.ravel()).reshape(3, 3)
+            np.testing.assert_allclose(change, (up - down) / (2 * step), rtol=1e-6, atol=1e-8)
+
+
+def test_the_codes_agree_to_rounding_with_the_same_elements_and_quadrature():
+    # Same law, same triquadratic bricks, same Gauss points: one discrete problem, solved twice.
+    own, second = OwnSheet(TINY, "hex27")(M), SecondSheet(TINY, thickness_points=2)(M)
+    assert own.converged
+    assert second.converged
+    moved = np.abs(own.y.reshape(-1, 3) - TINY.points).max()
+    assert moved > 2.0  # mm: large displacements, more than the thickness twice
+    np.testing.assert_allclose(second.y, own.y, atol=1e-8)
+    np.testing.assert_allclose(second.jacobian, own.jacobian, atol=1e-7)
+
+
+def test_solid_shells_come_closer_with_layers():
+    # Two nodes through the thickness against three: the difference is one of the elements.
+    apart = []
+    for layers in (1, 2):
+        sheet = Sheet(cells=(2, 2), observed=(4, 3), load_steps=2, layers=layers)
+        apart.append(np.abs(OwnSheet(sheet)(M).y - SecondSheet(sheet)(M).y).max())
+    assert apart[0] < 0.2
+    assert apart[1] < 0.5 * apart[0]
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_second_model_s_derivatives_are_exact(law):
+    model = SecondSheet(TINY, law)
+    jacobian = model(M).jacobian
+    for k, d in enumerate(1e-4 * np.eye(2)):
+        difference = (model(M + d).y - model(M - d).y) / 2e-4
+        # Each half moves as the other becomes softer: no column is zero anywhere near by chance.
+        np.testing.assert_allclose(jacobian[:, k], difference, atol=1e-7)
+        assert np.abs(difference).max() > 0.05
+
+
+def test_the_laws_agree_for_small_strains_only():
+    # Relative difference of the displacements: about the strain, which follows the load.
+    differences = []
+    for pressure in (0.5, 1.0):
+        sheet = Sheet(cells=(2, 2), observed=(4, 3), load_steps=1, pressure_mmHg=pressure)
+        one, other = (SecondSheet(sheet, law)(M).y - sheet.points.ravel() for law in LAWS)
+        differences.append(np.abs(one - other).max() / np.abs(one).max())
+    assert differences[1] < 0.01
+    assert differences[0] < 0.7 * differences[1]
+
+
+@pytest.mark.parametrize("of", ["own", "second"])
+def test_each_model_estimates_from_the_other_s_data(of):
+    own, second = OwnSheet(TINY, "hex27"), SecondSheet(TINY, thickness_points=2)
+    y, model = (own(M).y, second) if of == "own" else (second(M).y, own)
+    prior = Gaussian(np.array([2.0, 3.0]), np.diag([9.0, 9.0]))
+    filter_ = IteratedFilter(tolerance=1e-6)
+    found = filter_(model, prior, y, 1e-8, names=PARAMETERS, transform=Log())
+    assert found.converged
+    # Noise of 1e-4 mm against a prior of 3 MPa: nothing but the data counts.
+    np.testing.assert_allclose(found.mean, M, rtol=1e-5)
+
+
+@pytest.mark.parametrize("model", [OwnSheet, SecondSheet])
+def test_inadmissible_moduli_are_a_reason(model):
+    for values in ([-1.0, 1.0], [0.0, 1.0], [np.inf, 1.0]):
+        prediction = model(TINY)(np.array(values))
+        assert not prediction.converged
+        assert "expected positive moduli" in prediction.reason
+    prior = Gaussian(np.array([-1.0, 1.5]), np.eye(2))
+    found = IteratedFilter()(model(TINY), prior, TINY.points.ravel(), 1.0)
+    assert found.reason is Reason.MODEL_FAILED
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"length": 0.0},
+        {"thickness": float("nan")},
+        {"poisson": 0.5},
+        {"pressure_mmHg": float("inf")},
+        {"cells": (3, 2)},
+        {"cells": (2, 0)},
+        {"observed": (0, 1)},
+        {"layers": 0},
+        {"load_steps": 0},
+    ],
+)
+def test_an_inadmissible_sheet_is_refused(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        Sheet(**change)
+    with pytest.raises(ConfigurationError, match="st_venant_kirchhoff"):
+        SecondSheet(TINY, "hooke")

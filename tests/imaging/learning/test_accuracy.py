@@ -1,0 +1,88 @@
+"""Errors that detectors tell: their size, how far they are alike, and what is refused."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.learning.accuracy import (
+    correlogram,
+    fitted_length,
+    matern,
+    measure_accuracy,
+    share_within,
+)
+from mvest.observation.errors import SpatialCorrelation
+
+LENGTH = 7.0
+
+
+def sheet() -> np.ndarray:
+    x, y = np.meshgrid(np.arange(0, 40, 3.0), np.arange(0, 30, 3.0))
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+
+
+def fields(count: int, std: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Errors ``(count, 2, n, 3)`` alike over LENGTH."""
+    points = sheet()
+    factor = SpatialCorrelation(points, LENGTH).factor
+    white = np.random.default_rng(seed).standard_normal((count, 2, 3, len(points)))
+    return (white @ factor.T).transpose(0, 1, 3, 2) * std[:, None]
+
+
+def test_the_correlation_is_the_one_that_estimators_take():
+    points = sheet()
+    d = np.linalg.norm(points[:, None] - points[None], axis=2)
+    assert np.allclose(matern(d, LENGTH), SpatialCorrelation(points, LENGTH).matrix(), atol=1e-9)
+
+
+def test_size_and_length_are_found_whatever_the_mean_error():
+    std = np.linspace(0.3, 1.2, len(sheet()))
+    errors = fields(30, std)
+    mean = np.random.default_rng(1).normal(0, 3, errors.shape[1:])
+    tips = np.ones((30, 2, 2, 3))
+    accuracy, found = measure_accuracy(errors + mean, tips, sheet())
+    # 174 free numbers for each: a standard error of 5 %.
+    assert np.abs(accuracy.std_mm / std - 1).max() < 0.2
+    assert np.abs(accuracy.std_mm / std - 1).mean() < 0.06
+    assert accuracy.correlation_length_mm == pytest.approx(LENGTH, rel=0.15)
+    assert accuracy.samples.shape == errors.shape
+    assert accuracy.tip_samples is tips
+    assert found.distance.max() < 30
+    assert found.pairs.sum() < len(sheet()) * (len(sheet()) - 1) / 2
+
+
+def test_of_few_samples_errors_are_not_told_too_small():
+    std = np.linspace(0.3, 1.2, len(sheet()))
+    tips = np.ones((3, 2, 2, 3))
+    few = [measure_accuracy(fields(3, std, k), tips, sheet())[0].std_mm for k in range(30)]
+    assert np.sqrt(np.mean(np.square(few), axis=0)).mean() == pytest.approx(std.mean(), rel=0.05)
+
+
+def test_independent_errors_are_alike_over_nothing():
+    white = np.random.default_rng(2).standard_normal((500, len(sheet())))
+    assert fitted_length(correlogram(white, sheet())) < 1.5
+
+
+def test_the_share_within_tells_too_small_errors():
+    std = np.full(len(sheet()), 0.7)
+    errors = fields(40, std)
+    assert share_within(errors, std) == pytest.approx(0.95, abs=0.01)
+    assert share_within(errors, 0.5 * std) == pytest.approx(0.67, abs=0.03)
+    assert share_within(errors + 5.0, std) < 0.01
+    mean = np.full(errors.shape[1:], 5.0)
+    assert share_within(errors + 5.0, std, mean) == pytest.approx(0.95, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("errors", "tips", "words"),
+    [
+        (np.ones((1, 2, 140, 3)), np.ones((1, 2, 2, 3)), "1 sequences, expected two"),
+        (np.ones((3, 2, 139, 3)), np.ones((3, 2, 2, 3)), "of 140 vertices"),
+        (np.ones((3, 2, 140, 3)), np.ones((2, 2, 2, 3)), r"\(2, 2, 2, 3\)"),
+        (np.full((3, 2, 140, 3), np.nan), np.ones((3, 2, 2, 3)), "not finite"),
+        (np.ones((3, 2, 140, 3)), np.ones((3, 2, 2, 3)), "none at some vertex"),
+    ],
+)
+def test_errors_that_tell_nothing_are_refused(errors, tips, words):
+    with pytest.raises(InputError, match=words):
+        measure_accuracy(errors, tips, sheet())

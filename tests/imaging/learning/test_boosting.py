@@ -1,0 +1,158 @@
+"""Trees: what they learn, that they come back from text, and that no bad text reaches LightGBM."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
+
+SMALL = BoostSettings(trees=12, leaves=5, rate=0.3, least=4, share_features=0.8)
+
+
+def samples(count=120, outputs=2):
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((count, 6)).astype(np.float32)
+    x[:, 4] = 3.0  # a feature that never changes
+    y = np.stack([np.sign(x[:, 0]) * (k + 1.0) + 10 * k for k in range(outputs)], axis=1)
+    return x, y
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return train_boosters(*samples(), SMALL, 3)
+
+
+def test_every_output_is_learned_by_its_own_trees(trained):
+    # Labels of the first output for all, or outputs in another order.
+    x, y = samples()
+    found = trained(x)
+    assert found.shape == y.shape
+    assert trained.outputs == 2
+    assert np.abs(found - y).mean(axis=0).max() < 0.4
+
+
+def test_training_is_the_same_with_the_same_seed_only():
+    x, y = samples()
+    again = train_boosters(x, y, SMALL, 3)
+    assert again.texts == train_boosters(x, y, SMALL, 3).texts
+    assert again.texts != train_boosters(x, y, SMALL, 4).texts
+
+
+def test_texts_and_pickles_are_the_same_trees(trained):
+    x, _ = samples(300)
+    expected = trained(x)
+    copy = Boosters(trained.texts)
+    assert copy.texts == trained.texts
+    np.testing.assert_array_equal(copy(x), expected)
+    other = pickle.loads(pickle.dumps(trained))
+    np.testing.assert_array_equal(other(x), expected)
+    assert other.texts == trained.texts
+    with pytest.raises(InputError, match="6 features, found 5"):
+        other(x[:, :5])
+
+
+def test_probabilities_lie_between_0_and_1():
+    # The sigmoid is part of what is kept: without it outputs are odds of any size.
+    x, _ = samples()
+    p = (x[:, :1] > 0) * 0.98 + 0.01
+    trees = train_boosters(x, p, replace(SMALL, trees=60), 1, "cross_entropy")
+    found = Boosters(trees.texts)(x * 10)
+    assert found.min() >= 0
+    assert found.max() <= 1
+    assert found[x[:, 0] > 0.3].mean() > 0.8
+    assert found[x[:, 0] < -0.3].mean() < 0.2
+
+
+def test_samples_count_by_their_weight():
+    x, _ = samples()
+    y = np.where(np.arange(len(x)) % 2, 1.0, -1.0)[:, None]
+    weight = np.where(np.arange(len(x)) % 2, 100.0, 1.0)
+    assert train_boosters(x, y, SMALL, 1, weight=weight)(x).mean() > 0.8
+
+
+def test_no_samples_have_no_outputs(trained):
+    assert trained(np.zeros((0, 6), np.float32)).shape == (0, 2)
+
+
+def test_other_features_than_learned_are_refused(trained):
+    with pytest.raises(InputError, match="6 features, found 5"):
+        trained(np.zeros((3, 5), np.float32))
+
+
+def test_constant_labels_give_trees_of_a_single_leaf():
+    x, _ = samples()
+    trees = train_boosters(x, np.full((len(x), 1), 7.0), SMALL, 1)
+    np.testing.assert_allclose(Boosters(trees.texts)(x), 7.0)
+
+
+def test_no_outputs_are_refused(trained):
+    with pytest.raises(InputError, match="f: trees of"):
+        Boosters((), "f")
+    x, y = samples()
+    other = train_boosters(x[:, :5], y[:, :1], SMALL, 1)
+    with pytest.raises(InputError, match=r"\[5, 6\] features"):
+        Boosters((trained.texts[0], other.texts[0]), "f")
+
+
+def spoiled(text, key, change):
+    """The text with the values of a key changed at its first place, sizes of trees put right."""
+    lines = text.split("\n")
+    at = next(k for k, line in enumerate(lines) if line.startswith(key + "="))
+    before = lines[at]
+    lines[at] = f"{key}={change(before.partition('=')[2])}"
+    grown = len(lines[at]) - len(before)
+    sizes = next(k for k, line in enumerate(lines) if line.startswith("tree_sizes="))
+    if at > sizes:
+        first, *rest = lines[sizes].partition("=")[2].split()
+        lines[sizes] = "tree_sizes=" + " ".join([str(int(first) + grown), *rest])
+    return "\n".join(lines)
+
+
+def first(value):
+    return lambda values: " ".join([value, *values.split()[1:]])
+
+
+BAD = {
+    "empty": lambda t: "",
+    "something else": lambda t: "hello\n",
+    "cut in a tree": lambda t: t[: len(t) // 2],
+    "cut in the header": lambda t: t[:200],
+    "without its end": lambda t: t.replace("end of trees\n", ""),
+    "a tree fewer": lambda t: t[: t.index("Tree=3")] + "end of trees\n",
+    "sizes of trees": lambda t: spoiled(t, "tree_sizes", first("99999")),
+    "another version": lambda t: spoiled(t, "version", lambda v: "v9"),
+    "more features": lambda t: spoiled(t, "max_feature_idx", lambda v: "900"),
+    "several classes": lambda t: spoiled(t, "num_class", lambda v: "3"),
+    "another objective": lambda t: spoiled(t, "objective", lambda v: "multiclass num_class:3"),
+    "a feature that is not there": lambda t: spoiled(t, "split_feature", first("999999")),
+    "a negative feature": lambda t: spoiled(t, "split_feature", first("-1")),
+    "a child that is not there": lambda t: spoiled(t, "left_child", first("70")),
+    "a leaf that is not there": lambda t: spoiled(t, "left_child", first("-70")),
+    "a node that is its own child": lambda t: spoiled(t, "left_child", first("0")),
+    "no number": lambda t: spoiled(t, "leaf_value", first("x")),
+    "not a number": lambda t: spoiled(t, "leaf_value", first("nan")),
+    "no whole number": lambda t: spoiled(t, "split_feature", first("0.5")),
+    "a value fewer": lambda t: spoiled(t, "threshold", lambda v: v.rpartition(" ")[0]),
+    "a value more": lambda t: spoiled(t, "leaf_value", lambda v: v + " 0"),
+    "more leaves": lambda t: spoiled(t, "num_leaves", lambda v: "1000000"),
+    "negative leaves": lambda t: spoiled(t, "num_leaves", lambda v: "-2"),
+    "categories": lambda t: spoiled(t, "num_cat", lambda v: "1"),
+    "a split by category": lambda t: spoiled(t, "decision_type", first("1")),
+    "linear leaves": lambda t: spoiled(t, "is_linear", lambda v: "1"),
+    "an unknown field": lambda t: t.replace("num_class=1", "num_class=1\nmonotone=1"),
+}
+
+
+@pytest.mark.parametrize("how", list(BAD))
+def test_a_malformed_text_is_refused_before_lightgbm_sees_it(trained, how, capfd):
+    # Several of these end the whole process in LightGBM 4, or let it read beyond its arrays.
+    bad = BAD[how](trained.texts[0])
+    assert bad != trained.texts[0]
+    with pytest.raises(InputError, match=r"^model\.npz, annulus: no trees") as told:
+        Boosters((bad,), "model.npz, annulus")
+    assert "\n" not in str(told.value)
+    assert len(str(told.value)) < 200
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,316 @@
+"""The exponential law: its derivatives, its limits and the curves that can be had by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from mvest.errors import InputError, MaterialError
+from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.law.biaxial import biaxial_stress
+from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.exponential import LARGEST_EXPONENT, ExponentialLaw, ExponentialTissue
+from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.steps import Step
+from mvest.mechanics.system import Loads, System
+from tests.mechanics.bodies import block
+
+TISSUES = (ExponentialTissue(0.06, 4.3, 900.0), ExponentialTissue(0.04, 4.8, 305.0, kappa=2.0))
+LAW = ExponentialLaw.of(TISSUES)
+RNG = np.random.default_rng(3)
+GREEN = RNG.uniform(-0.12, 0.2, (10, 3, 6))
+REGION = np.arange(10) % 2
+PREVIOUS = RNG.uniform(-0.1, 0.1, GREEN.shape)
+NONE = np.zeros_like(GREEN)
+
+
+def stress(law, green=GREEN, region=REGION, previous=NONE, rate=0.0):
+    return law.response(green, region, previous, rate)[0]
+
+
+def fourth_order(function, h):
+    """Central difference without its h^2 error: (16 D(h/4) - D(h)) / 15."""
+    coarse, fine = ((function(s) - function(-s)) / (2 * s) for s in (h, h / 4))
+    return (16 * fine - coarse) / 15
+
+
+# -- derivatives -----------------------------------------------------------------------------------
+def test_stress_is_the_derivative_of_the_energy_and_the_tangent_that_of_the_stress():
+    # Fibres in tension and in compression, and shear of every kind, are among the strains.
+    assert GREEN[..., 0].min() < -0.05 < 0.05 < GREEN[..., 0].max()
+    found, tangent = LAW.response(GREEN, REGION, NONE, 0.0)
+    for i in range(6):
+        e = np.eye(6)[i]
+        by_energy = fourth_order(lambda s, e=e: LAW.energy(GREEN + s * e, REGION), 2e-3)
+        by_stress = fourth_order(lambda s, e=e: stress(LAW, GREEN + s * e), 2e-3)
+        np.testing.assert_allclose(by_energy, found[..., i], atol=1e-7 * np.abs(found).max())
+        np.testing.assert_allclose(by_stress, tangent[..., i], atol=1e-7 * np.abs(tangent).max())
+    np.testing.assert_array_equal(tangent, np.swapaxes(tangent, 2, 3))
+
+
+def test_damping_is_in_the_tangent_and_in_the_change_of_history():
+    rate = 0.7
+    _, tangent = LAW.response(GREEN, REGION, PREVIOUS, rate)
+    direction = RNG.standard_normal(GREEN.shape)
+    by_strain = fourth_order(
+        lambda s: stress(LAW, GREEN + s * direction, REGION, PREVIOUS, rate), 2e-4
+    )
+    expected = np.einsum("eqij,eqj->eqi", tangent, direction)
+    np.testing.assert_allclose(by_strain, expected, atol=1e-7 * np.abs(expected).max())
+    # Linear in the previous strain: any step is exact.
+    by_history = stress(LAW, GREEN, REGION, PREVIOUS + direction, rate) - stress(
+        LAW, GREEN, REGION, PREVIOUS, rate
+    )
+    np.testing.assert_allclose(
+        LAW.history_stress(GREEN, REGION, direction, rate), by_history, atol=1e-12
+    )
+    np.testing.assert_array_equal(LAW.strain_change(GREEN, direction), direction)
+
+
+@pytest.mark.parametrize("kind", ["c0", "c1", "c2", "mu", "kappa"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_derivatives_by_the_coefficients(kind, which):
+    value = getattr(TISSUES[which], kind)
+
+    def at(relative):
+        tissues = list(TISSUES)
+        tissues[which] = replace(TISSUES[which], **{kind: value * (1 + relative)})
+        return stress(ExponentialLaw.of(tuple(tissues)))
+
+    exact = by_parameter(f"{kind}.leaflet", which)
+    difference = fourth_order(at, 4e-3) / value
+    np.testing.assert_allclose(difference, exact, atol=1e-8 * np.abs(exact).max())
+    assert np.all(exact[which != REGION] == 0)
+    taut = (which == REGION)[:, None] & (GREEN[..., 0] > 0)
+    assert np.abs(exact).max(axis=-1)[taut].min() > 0
+
+
+def by_parameter(name, which):
+    return LAW.partial_stress(
+        Parameter(name, 1.0), GREEN, REGION, PREVIOUS, 0.7, which=which, stress=NONE
+    )
+
+
+def test_an_unknown_coefficient_is_refused():
+    with pytest.raises(InputError, match=r"knows c0\.REGION, c1\.REGION, .* kappa"):
+        by_parameter("E_f.leaflet", 0)
+
+
+# -- limits ----------------------------------------------------------------------------------------
+def test_at_rest_there_is_no_stress_and_the_stiffness_of_ground_and_penalty():
+    # The exponential starts with the fourth power of the strain, so that mu and kappa alone are
+    # left: lambda = kappa - 2 mu / 3, as in isotropic elasticity.
+    rest = np.zeros((2, 1, 6))
+    found, tangent = LAW.response(rest, np.array([0, 1]), rest, 0.0)
+    np.testing.assert_array_equal(found, 0.0)
+    for tissue, d in zip(TISSUES, tangent[:, 0], strict=True):
+        expected = np.zeros((6, 6))
+        expected[:3, :3] = tissue.kappa - 2 * tissue.mu / 3
+        expected += tissue.mu * np.diag([2, 2, 2, 1, 1, 1])
+        np.testing.assert_allclose(d, expected, atol=1e-12)
+        assert np.linalg.eigvalsh(d).min() > 0
+
+
+def test_small_strains_feel_the_isotropic_moduli_of_the_ground():
+    # Uniaxial tension of 0.01 %: E = 9 kappa mu / (3 kappa + mu). Across the thickness the stress
+    # is zero by construction; across the fibres it is made so here by the stretch (1 - nu eps).
+    tissue = TISSUES[0]
+    young = 9 * tissue.kappa * tissue.mu / (3 * tissue.kappa + tissue.mu)
+    nu = (3 * tissue.kappa - 2 * tissue.mu) / (2 * (3 * tissue.kappa + tissue.mu))
+    small = 1e-4
+    along, across = biaxial_stress(LAW, np.array([[1 + small, 1 - nu * small]]))[0]
+    # The first neglected term is of relative size eps.
+    assert along / small == pytest.approx(young, rel=5 * small)
+    assert abs(across) < 5 * small * along
+
+
+def test_the_tangent_does_not_jump_where_fibres_go_slack():
+    # With a square in place of the fourth power it would, by 8 c0 c2 e^Q > 100 MPa.
+    green = np.zeros((2, 1, 6))
+    green[:, 0, 1] = 0.15
+    green[0, 0, 0], green[1, 0, 0] = 1e-7, -1e-7
+    tangent = LAW.response(green, np.zeros(2, dtype=int), np.zeros_like(green), 0.0)[1]
+    assert np.abs(tangent[0] - tangent[1]).max() < 1e-4
+
+
+def test_slack_fibres_bear_nothing():
+    green = np.zeros((1, 1, 6))
+    green[0, 0, 0] = -0.1
+    without = ExponentialLaw.of((replace(TISSUES[0], c2=0.0),))
+    region = np.zeros(1, dtype=int)
+    np.testing.assert_array_equal(stress(LAW, green, region), stress(without, green, region))
+
+
+def test_far_beyond_tissue_the_law_stays_finite_and_smooth():
+    # Fibres at twice their length would give e^900. Either side of the last exponent, stress and
+    # tangent are the same.
+    limit = 1 + (LARGEST_EXPONENT / 900.0) ** 0.25
+    green = np.zeros((3, 1, 6))
+    green[:, 0, 0] = 0.5 * (np.array([limit - 1e-9, limit + 1e-9, 2.0]) ** 2 - 1)
+    # The other stretches keep the isochoric invariant where its share of Q is zero: c1 = 0.
+    law = ExponentialLaw.of((ExponentialTissue(0.06, 0.0, 900.0),))
+    found, tangent = law.response(green, np.zeros(3, dtype=int), np.zeros_like(green), 0.0)
+    assert np.isfinite(found).all()
+    assert np.isfinite(tangent).all()
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+    np.testing.assert_allclose(tangent[0], tangent[1], rtol=1e-6)
+
+
+def test_turned_over_matter_is_finite_and_driven_back():
+    green = np.zeros((1, 1, 6))
+    green[0, 0, 2] = -0.6  # a squared thickness of -0.2
+    region = np.zeros(1, dtype=int)
+    found, tangent = LAW.response(green, region, np.zeros_like(green), 0.0)
+    assert np.isinf(LAW.energy(green, region)).all()
+    assert found[0, 0, 2] < -1e3
+    assert np.linalg.eigvalsh(tangent[0, 0]).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"c0": 0.0}, "c0 = 0.0 of the exponential law, expected > 0"),
+        ({"c1": -1.0}, "c1 = -1.0 .* expected >= 0"),
+        ({"c2": float("nan")}, "c2 = nan"),
+        ({"mu": 0.0}, "mu = 0.0"),
+        ({"kappa": float("inf")}, "kappa = inf"),
+        ({"viscous": -2.0}, "viscous = -2.0"),
+    ],
+)
+def test_inadmissible_coefficients_are_rejected_with_their_values(change, message):
+    with pytest.raises(MaterialError, match=message):
+        replace(TISSUES[0], **change)
+
+
+# -- curves ----------------------------------------------------------------------------------------
+def incompressible(tissue, stretches):
+    """Nominal stresses of a sheet of constant volume.
+
+    From W(l1, l2) with I1 = l1^2 + l2^2 + 1 / (l1 l2)^2: P_i = dW/dl_i, where dI1/dl1 is
+    2 (l1 - 1 / (l1^3 l2^2)), and the same with 1 and 2 exchanged.
+    """
+    l1, l2 = stretches.T
+    a = l1**2 + l2**2 + (l1 * l2) ** -2.0 - 3
+    x = np.maximum(l1 - 1, 0)
+    scale = tissue.c0 * np.exp(tissue.c1 * a**2 + tissue.c2 * x**4)
+    shared = scale * 2 * tissue.c1 * a + tissue.mu / 2
+    along = shared * 2 * (l1 - l1**-3.0 * l2**-2.0) + scale * 4 * tissue.c2 * x**3
+    return np.column_stack([along, shared * 2 * (l2 - l2**-3.0 * l1**-2.0)])
+
+
+CURVES = {
+    "along": np.array([[1.08, 1.0], [1.12, 1.0]]),
+    "across": np.array([[1.0, 1.15], [1.0, 1.25]]),
+    "both": np.array([[1.06, 1.06], [1.1, 1.1]]),
+    "slack": np.array([[0.92, 1.15]]),
+}
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_biaxial_stress_tends_to_the_formula_of_constant_volume(curve):
+    # The volume changes by about stress / kappa: ten times the penalty, a tenth of the error.
+    expected = incompressible(TISSUES[0], CURVES[curve])
+    errors = [
+        np.abs(
+            biaxial_stress(ExponentialLaw.of((replace(TISSUES[0], kappa=k),)), CURVES[curve])
+            - expected
+        ).max()
+        for k in (1e3, 1e4)
+    ]
+    assert errors[0] < 2e-3 * np.abs(expected).max()
+    assert errors[0] / errors[1] == pytest.approx(10, rel=0.05)
+
+
+def test_stiffer_along_the_fibres_and_stiffening():
+    stretches = np.column_stack([np.linspace(1.02, 1.14, 7)] * 2)
+    along, across = biaxial_stress(LAW, stretches).T
+    assert np.all(np.diff(along, 2) > 0)
+    assert np.all(along > across)
+
+
+def test_biaxial_stress_of_the_linear_law():
+    # Plane stress of the Biot law: T = Q (l - 1), Q = [[E_f, nu E_p], [nu E_p, E_p]] / (1 - nu^2
+    # E_p / E_f), and P = T where stretches lie along the axes.
+    material = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)
+    e_f, e_p, nu = material.E_f, material.E_p, material.nu_fp
+    plane = np.array([[e_f, nu * e_p], [nu * e_p, e_p]]) / (1 - nu**2 * e_p / e_f)
+    stretches = np.array([[1.05, 1.02], [0.98, 1.1]])
+    found = biaxial_stress(BiotLaw.of((material,)), stretches)
+    np.testing.assert_allclose(found, (stretches - 1) @ plane, rtol=1e-9)
+
+
+@pytest.mark.parametrize("stretches", [[[1.0, -1.0]], [1.0, 1.1], [[1.0, np.nan]]])
+def test_inadmissible_stretches(stretches):
+    with pytest.raises(InputError, match="stretches"):
+        biaxial_stress(LAW, np.array(stretches))
+
+
+# -- in a body -------------------------------------------------------------------------------------
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
+def test_a_stretched_block_bears_the_biaxial_stress(element_type):
+    # The block is stretched as a whole, in its fibre frame. On a distorted mesh inner nodes must
+    # be in equilibrium, the faces across the thickness free, and those across the two stretches
+    # bear nominal stress times area.
+    size, stretches = np.array([4.0, 3.0, 2.0]), np.array([1.1, 1.08])
+    mesh = block(element_type, (2, 2, 1), tuple(size), distortion=(0.2, 0.2, 0))
+    law = ExponentialLaw.of(TISSUES[:1])
+    expected = biaxial_stress(law, stretches[None])[0]
+    thickness = thickness_of(law, stretches)
+    solid = Solid(mesh, law)
+    x = mesh.nodes * np.array([*stretches, thickness])
+    state = solid.evaluate(x, solid.initial_strain(), 0.0)
+    forces = np.zeros_like(x)
+    np.add.at(forces, mesh.elements, solid.forces(state))
+    at = [mesh.nodes[:, axis] > size[axis] - 1e-9 for axis in range(3)]
+    scale = expected[0] * size[1] * size[2]
+    assert forces[at[0], 0].sum() == pytest.approx(expected[0] * size[1] * size[2], rel=1e-9)
+    assert forces[at[1], 1].sum() == pytest.approx(expected[1] * size[0] * size[2], rel=1e-9)
+    assert abs(forces[at[2], 2].sum()) < 1e-9 * scale
+    sides = np.zeros(len(x), dtype=bool)
+    for axis in (0, 1):
+        sides |= at[axis] | (mesh.nodes[:, axis] < 1e-9)
+    assert np.abs(forces[~sides]).max() < 1e-9 * scale
+
+
+def thickness_of(law, stretches):
+    """Stretch of the thickness at which S33 vanishes, by bisection."""
+
+    def across(thickness):
+        green = np.zeros((1, 1, 6))
+        green[0, 0, :3] = 0.5 * (np.array([*stretches, thickness]) ** 2 - 1)
+        return float(law.response(green, np.zeros(1, int), np.zeros_like(green), 0.0)[0][0, 0, 2])
+
+    return brentq(across, 0.5, 1.2, xtol=1e-15)
+
+
+def test_a_strip_of_the_default_element_does_not_lock():
+    # Clamped at one end and bent by a small pressure p, its end moves by p L^4 / (8 D), D between
+    # E t^3 / 12 (a beam) and E t^3 / (12 (1 - nu^2)) (a plate); E = 3 mu and nu = 1/2. A penalty of
+    # 100 or 1000 times mu must not matter; without the enhanced strain it does.
+    soft, hard = (ExponentialLaw.of((replace(TISSUES[0], kappa=k),)) for k in (2.0, 20.0))
+    beam = 1e-8 * 13.0**4 / (8 * 3 * TISSUES[0].mu * 1.26**3 / 12)
+    assert 0.75 * beam < bent(soft) < beam
+    assert bent(hard) == pytest.approx(bent(soft), rel=0.02)
+    assert bent(hard, enhanced=False) < 0.3 * beam
+
+
+def bent(law, enhanced=True):
+    """Deflection (mm) of the end of a clamped strip under 1e-8 MPa from below."""
+    size = (13.0, 10.0, 1.26)
+    mesh = block("hex18", (4, 3, 1), size)
+    below = np.all(mesh.nodes[mesh.pressure_faces][:, :, 2] < 1e-9, axis=1)
+    faces = mesh.pressure_faces[below]
+    fixed = np.flatnonzero(mesh.nodes[:, 0] < 1e-9)
+    system = System(
+        Solid(mesh, law, enhanced=enhanced),
+        pressure=PressureLoad(faces, mesh.reference.face),
+        fixed_nodes=fixed,
+    )
+    held = mesh.nodes[fixed]
+    result = simulate(system, lambda t: Loads(pressure=1e-8, fixed=held), [Step(1.0, static=True)])
+    assert result.converged
+    end = mesh.nodes[:, 0] > size[0] - 1e-9
+    return float((result.frames[-1] - mesh.nodes)[end, 2].mean())

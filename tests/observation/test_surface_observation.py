@@ -1,0 +1,806 @@
+"""Observations without correspondence, against distances and derivatives known by hand."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import (
+    Gaussian,
+    Identity,
+    IteratedFilter,
+    PaperFilter,
+    Prediction,
+    observation_noise,
+)
+from mvest.mechanics.settings import TissueSettings
+from mvest.observation.surfaces import (
+    MAX_CORRELATED_POINTS,
+    UNKNOWN,
+    ObservedSurface,
+    PredictedSurface,
+    SurfaceObservation,
+    mean_surface_distance,
+    surface_distance,
+)
+from mvest.problem.study import Case, estimate
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.geometry.proximity import closest_points
+
+FRAMES = ("open", "closed")
+Geometry = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def grid(columns: int, rows: int, size: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
+    """A square in the plane z = 0, its normals along z, and its triangles."""
+    x, y = np.meshgrid(np.linspace(0, size, columns), np.linspace(0, size, rows))
+    vertices = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    lower = np.column_stack([a, a + 1, a + columns + 1])
+    upper = np.column_stack([a, a + columns + 1, a + columns])
+    return vertices, np.concatenate([lower, upper])
+
+
+def rim(columns: int, rows: int) -> np.ndarray:
+    """The border of a grid as a loop."""
+    number = np.arange(columns * rows).reshape(rows, columns)
+    return np.concatenate(
+        [number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]]
+    )  # fmt: skip
+
+
+def model(geometry: Geometry, frames: int = 2) -> Callable[[np.ndarray], Prediction]:
+    """Frames that rest at the geometry of m = 0, and the last one at that of m."""
+
+    def predict(m: np.ndarray) -> Prediction:
+        rest, slope = geometry(np.zeros_like(m))
+        moved, jacobian = geometry(m)
+        still = np.zeros((slope.size // len(m) * (frames - 1), len(m)))
+        y = np.concatenate([*[rest.ravel()] * (frames - 1), moved.ravel()])
+        return Prediction(y, np.concatenate([still, jacobian.reshape(-1, len(m))]))
+
+    return predict
+
+
+def translated(vertices: np.ndarray) -> Geometry:
+    slope = np.tile(np.eye(3), (len(vertices), 1))
+    return lambda m: (vertices + m, slope)
+
+
+def plane(columns: int = 4, rows: int = 5) -> tuple[np.ndarray, PredictedSurface]:
+    vertices, triangles = grid(columns, rows)
+    loop = rim(columns, rows)
+    region = np.zeros(len(triangles), dtype=int)
+    return vertices, PredictedSurface(len(vertices), triangles, region, loop, loop)
+
+
+def seen(points: np.ndarray, region: int | np.ndarray = 0, **curves) -> ObservedSurface:
+    return ObservedSurface("closed", points, np.broadcast_to(region, len(points)), **curves)
+
+
+def scattered(n: int, z: float | np.ndarray, seed: int = 1) -> np.ndarray:
+    """Points over the inside of the square, at height z."""
+    return np.column_stack([rng(seed).uniform(1.0, 9.0, (n, 2)), np.broadcast_to(z, n)])
+
+
+def whitened(prediction: Prediction, R: object) -> np.ndarray:
+    return observation_noise(R, len(prediction.y)).whiten(prediction.jacobian)
+
+
+def information(prediction: Prediction, R: object) -> np.ndarray:
+    A = whitened(prediction, R)
+    return A.T @ A
+
+
+# --- distances ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "columns"), [(1, 3), (7, 3), (200, 3), (50, 12)])
+def test_a_plane_moved_along_its_normal_gives_the_shift_whatever_the_sampling(
+    n: int, columns: int
+) -> None:
+    vertices, surface = plane(columns)
+    observation = SurfaceObservation((seen(scattered(n, 0.7)),), surface, 0.5)
+    predict = observation.of(model(translated(vertices)))
+    for shift in (0.0, 0.7, 2.0):
+        prediction = predict(np.array([0.0, 0.0, shift]))
+        # Above the plane is positive: its normal points up.
+        np.testing.assert_allclose(observation.y - prediction.y, shift - 0.7, atol=1e-14)
+        np.testing.assert_allclose(
+            prediction.jacobian, np.tile([0.0, 0.0, -1.0], (n, 1)), atol=1e-15
+        )
+
+
+def test_points_that_slide_within_the_surface_change_nothing() -> None:
+    vertices, surface = plane()
+    height = rng(3).normal(size=60)
+    results = []
+    for seed in (1, 2):
+        points = scattered(60, height, seed)
+        predict = SurfaceObservation((seen(points),), surface, 0.5).of(model(translated(vertices)))
+        # The tissue sliding under the points does not either.
+        results += [predict(np.array([x, -0.4, 0.3])) for x in (0.0, 0.8)]
+    for result in results:
+        np.testing.assert_allclose(result.y, height - 0.3, atol=1e-14)
+        np.testing.assert_allclose(result.jacobian, [[0.0, 0.0, -1.0]] * 60, atol=1e-14)
+
+
+def roof() -> tuple[np.ndarray, PredictedSurface]:
+    """Two faces with a right angle at the ridge y = 0, z = 0, seen from above."""
+    vertices = np.array(
+        [[-5, 0, 0], [5, 0, 0], [-5, -5, -5], [5, -5, -5], [-5, 5, -5], [5, 5, -5.0]]
+    )
+    triangles = np.array([[0, 2, 3], [0, 3, 1], [0, 1, 5], [0, 5, 4]])
+    return vertices, PredictedSurface(6, triangles, np.zeros(4, dtype=int))
+
+
+@pytest.mark.parametrize(
+    ("point", "distance", "direction"),
+    [
+        # Over the ridge: straight up, and to the side but within the wedge above both faces.
+        ([0.3, 0.0, 2.0], 2.0, [0, 0, 1]),
+        ([0.3, 0.6, 0.8], 1.0, [0, 0.6, 0.8]),
+        # Over and under one face.
+        ([0.0, 3.0, -1.0], np.sqrt(2), [0, np.sqrt(0.5), np.sqrt(0.5)]),
+        ([0.0, 2.0, -4.0], -np.sqrt(2), [0, np.sqrt(0.5), np.sqrt(0.5)]),
+        # On the ridge there is no direction to it; the angle-weighted normal is up.
+        ([0.3, 0.0, 0.0], 0.0, [0, 0, 1]),
+        # Beyond the border at x = 5, above and below the plane of the face: the distance to it.
+        ([7.0, 2.5, -2.5], 2.0, [1, 0, 0]),
+        ([7.0, 2.5, -3.5], -np.sqrt(4.5), np.array([-2, 0.5, 0.5]) / np.sqrt(4.5)),
+        # At the vertex at the end of the ridge.
+        ([6.0, 0.0, 1.0], np.sqrt(2), [np.sqrt(0.5), 0, np.sqrt(0.5)]),
+    ],
+)
+def test_signed_distances_by_hand(point: list, distance: float, direction: list) -> None:
+    vertices, surface = roof()
+    observation = SurfaceObservation((seen(np.array([point], dtype=float)),), surface, 1.0)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    np.testing.assert_allclose(prediction.y, [distance], atol=1e-14)
+    np.testing.assert_allclose(-prediction.jacobian, [direction], atol=1e-14)
+
+
+def test_the_normal_at_a_vertex_is_by_angle_and_not_by_number_of_triangles() -> None:
+    # The corner of a cube, one of its three faces cut into 24 triangles. By symmetry the normal is
+    # along the diagonal; a plain sum of the triangles' normals would be almost along z.
+    n = 24
+    t = np.linspace(0, np.pi / 2, n + 1)
+    arc = np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    vertices = np.concatenate([[[0, 0, 0], [0, 0, -1.0]], arc])
+    triangles = [[0, 2 + k, 3 + k] for k in range(n)] + [[0, 1, 2], [0, n + 2, 1]]
+    surface = PredictedSurface(n + 3, np.array(triangles), np.zeros(n + 2, dtype=int))
+    observation = SurfaceObservation((seen(np.zeros((1, 3))),), surface, 1.0)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    np.testing.assert_array_equal(prediction.y, [0.0])
+    expected = np.array([[-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
+    np.testing.assert_allclose(-prediction.jacobian, expected, atol=1e-12)
+
+
+def test_a_point_belongs_to_its_own_leaflet_even_where_another_is_nearer() -> None:
+    # Two parallel leaflets 2 mm apart, facing each other; a point 0.5 mm above the lower one.
+    vertices, triangles = grid(4, 4)
+    both = np.concatenate([vertices, vertices + np.array([0, 0, 2.0])])
+    surface = PredictedSurface(
+        len(both),
+        np.concatenate([triangles, triangles[:, ::-1] + len(vertices)]),
+        np.repeat([0, 1], len(triangles)),
+    )
+    points = scattered(3, 0.5)
+    observation = SurfaceObservation((seen(points, np.array([0, 1, UNKNOWN])),), surface, 1.0)
+    prediction = observation.of(model(translated(both)))(np.zeros(3))
+    np.testing.assert_allclose(prediction.y, [0.5, 1.5, 0.5], atol=1e-14)
+    np.testing.assert_allclose(prediction.jacobian[:, 2], [-1.0, 1.0, -1.0], atol=1e-14)
+    fitted = both[None] + [0, 0, 0.1]
+    np.testing.assert_allclose(observation.distance(fitted), [0.4, 1.6, 0.4], atol=1e-14)
+
+
+def test_a_curve_is_compared_across_and_not_along() -> None:
+    # A circle of radius 4 about a predicted polygon of 400 sides, of radius 3, 1 mm below it.
+    t = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    ring = np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    vertices = np.concatenate([3 * ring, np.zeros((1, 3))])
+    triangles = np.array([[400, k, (k + 1) % 400] for k in range(400)])
+    surface = PredictedSurface(401, triangles, np.zeros(400, dtype=int), annulus=np.arange(400))
+    turn = 2 * np.pi * rng().uniform()
+    s = turn + np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    circle = np.column_stack([4 * np.cos(s), 4 * np.sin(s), np.ones(60)])
+    only = ObservedSurface("closed", np.empty((0, 3)), np.empty(0, dtype=int), annulus=circle)
+    observation = SurfaceObservation((only,), surface, 1.0, 0.1)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    assert prediction.y.shape == observation.y.shape == (120,)
+    # 1 mm outwards (and as much as a side of the polygon bulges, 3 (1 - cos(pi / 400)) = 9e-5), and
+    # 1 mm up. The two directions are any across the curve, so only the length is known.
+    np.testing.assert_allclose(
+        np.linalg.norm(prediction.y.reshape(60, 2), axis=1), np.sqrt(2), atol=1e-4
+    )
+    # Across the curve a shift counts in full in both directions, and along it not at all.
+    H = prediction.jacobian.reshape(60, 2, 3)
+    across = np.einsum("jik,jil->jkl", H, H)
+    along = np.column_stack([-np.sin(s), np.cos(s), np.zeros(60)])
+    expected = np.eye(3) - along[:, :, None] * along[:, None, :]
+    np.testing.assert_allclose(across, expected, atol=0.02)
+
+
+# --- derivatives --------------------------------------------------------------------------------
+
+
+def waves(columns: int = 8, rows: int = 8) -> tuple[Geometry, np.ndarray, np.ndarray]:
+    """A sheet that waves, bends and stretches with three parameters, none of them linearly."""
+    rest, triangles = grid(columns, rows)
+    x, y = rest[:, 0], rest[:, 1]
+
+    def geometry(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b, c = m
+        phase = 0.5 * x + b
+        z = (1.0 + a) * np.sin(phase) + 0.05 * np.exp(c) * y**2
+        moved = np.column_stack([x * np.cosh(0.2 * a), y * (1.0 + 0.1 * c**2), z])
+        slope = np.zeros((len(rest), 3, 3))
+        slope[:, 0, 0] = 0.2 * x * np.sinh(0.2 * a)
+        slope[:, 1, 2] = 0.2 * c * y
+        slope[:, 2, 0] = np.sin(phase)
+        slope[:, 2, 1] = (1.0 + a) * np.cos(phase)
+        slope[:, 2, 2] = 0.05 * np.exp(c) * y**2
+        return moved, slope
+
+    return geometry, triangles, rim(columns, rows)
+
+
+STEPS = 1e-3 * 0.5 ** np.arange(4)
+
+
+def central_difference_errors(
+    predict: Callable[[np.ndarray], Prediction], m: np.ndarray
+) -> np.ndarray:
+    """Errors ``(len(STEPS), n)`` of each observation's derivative, the worst over parameters."""
+    exact = predict(m).jacobian
+    errors = []
+    for step in STEPS:
+        columns = [
+            (predict(m + step * e).y - predict(m - step * e).y) / (2 * step) for e in np.eye(len(m))
+        ]
+        errors.append(np.abs(np.column_stack(columns) - exact).max(axis=1))
+    return np.array(errors)
+
+
+def assert_second_order(errors: np.ndarray) -> None:
+    """The largest error falls by four with each step halved."""
+    order = np.polyfit(np.log(STEPS), np.log(errors.max(axis=1)), 1)[0]
+    assert order == pytest.approx(2.0, abs=0.05), f"errors {errors.max(axis=1)}"
+
+
+def stencil(m: np.ndarray) -> list[np.ndarray]:
+    """Everywhere that the central differences look."""
+    return [m, *(m + sign * h * e for h in STEPS for sign in (-1, 1) for e in np.eye(len(m)))]
+
+
+def feature_of_surface(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> list:
+    """The vertices between which the closest point of each point lies: one, two or three."""
+    found = closest_points(points, vertices, triangles)
+    return [
+        frozenset(triangles[t][b > 0].tolist())
+        for t, b in zip(found.triangle, found.barycentric, strict=True)
+    ]
+
+
+def feature_of_curve(points: np.ndarray, loop: np.ndarray) -> list:
+    """The same on a closed polyline."""
+    step = np.roll(loop, -1, axis=0) - loop
+    s = np.einsum("jek,ek->je", points[:, None] - loop, step) / np.sum(step**2, axis=1)
+    s = np.clip(s, 0, 1)
+    edge = np.linalg.norm(points[:, None] - loop - s[..., None] * step, axis=2).argmin(axis=1)
+    return [
+        frozenset(i for i, w in ((k, 1 - s[j, k]), ((k + 1) % len(loop), s[j, k])) if w > 0)
+        for j, k in enumerate(edge)
+    ]
+
+
+def constant(features: list[list]) -> np.ndarray:
+    return np.array([len(set(of_point)) == 1 for of_point in zip(*features, strict=True)])
+
+
+def test_derivatives_on_a_moving_sheet_converge_with_second_order() -> None:
+    # Points at all distances and on both sides. The order is two where the closest point stays in
+    # one triangle, on one edge or at one vertex; elsewhere the derivative bends within the step.
+    geometry, triangles, _ = waves()
+    m = np.array([0.3, 0.2, 0.4])
+    now = geometry(m)[0]
+    points = now[rng().integers(0, len(now), 1500)] + rng(2).normal(0, 0.8, (1500, 3))
+    # Some lie exactly on it, where an unsigned distance would have no derivative.
+    points[:48] = now[triangles[::2][:48]].mean(axis=1)
+    surface = PredictedSurface(len(now), triangles, np.zeros(len(triangles), dtype=int))
+    predict = SurfaceObservation((seen(points),), surface, 0.4).of(model(geometry))
+    errors = central_difference_errors(predict, m)
+    features = [feature_of_surface(points, geometry(at)[0], triangles) for at in stencil(m)]
+    smooth = constant(features)
+    assert smooth.mean() > 0.9
+    for size in (1, 2, 3):
+        members = smooth & np.array([len(feature) == size for feature in features[0]])
+        assert members.sum() >= 10
+        assert_second_order(errors[:, members])
+    assert smooth[:48].all()
+    assert np.abs(predict(m).y[:48]).max() < 1e-14
+    assert_second_order(errors[:, :48])
+
+
+def test_derivatives_of_curves_converge_with_second_order() -> None:
+    geometry, triangles, loop = waves()
+    m = np.array([0.3, 0.2, 0.4])
+    now = geometry(m)[0]
+    curve = np.repeat(now[loop], 6, axis=0) + rng(4).normal(0, 0.3, (6 * len(loop), 3))
+    surface = PredictedSurface(len(now), triangles, np.zeros(len(triangles), dtype=int), loop)
+    observation = SurfaceObservation((seen(np.empty((0, 3)), free_edge=curve),), surface, 0.4, 0.3)
+    errors = central_difference_errors(observation.of(model(geometry)), m)
+    features = [feature_of_curve(curve, geometry(at)[0][loop]) for at in stencil(m)]
+    smooth = np.repeat(constant(features), 2)
+    assert smooth.mean() > 0.9
+    for size in (1, 2):
+        members = smooth & np.repeat([len(feature) == size for feature in features[0]], 2)
+        assert members.sum() >= 10
+        assert_second_order(errors[:, members])
+
+
+def test_the_derivative_passes_over_a_crease_without_a_jump() -> None:
+    # From over one face of the roof, through the wedge over its ridge, to over the other.
+    vertices, surface = roof()
+    turn = np.linspace(0.1, np.pi - 0.1, 2001)
+    points = np.column_stack([0.3 + 0 * turn, np.cos(turn), np.sin(turn)])
+    predict = SurfaceObservation((seen(points),), surface, 1.0).of(model(translated(vertices)))
+    H = predict(np.zeros(3)).jacobian
+    # It turns no faster than the point does about the ridge at a distance of 1 mm.
+    assert np.linalg.norm(np.diff(H, axis=0), axis=1).max() < 1.001 * np.diff(turn).max()
+    assert np.linalg.norm(H[0] - H[-1]) == pytest.approx(np.sqrt(2), rel=1e-6)
+
+
+# --- through the filters ------------------------------------------------------------------------
+
+
+def test_three_perpendicular_faces_are_textbook_least_squares() -> None:
+    # Each point of a face tells of one coordinate of a translation, linearly, so that the posterior
+    # is that of a linear model in closed form; the filters have to agree in one step.
+    vertices, triangles = grid(4, 4)
+    turns = [np.eye(3), np.roll(np.eye(3), 1, axis=1), np.roll(np.eye(3), 2, axis=1)]
+    corner = np.concatenate([vertices @ turn for turn in turns])
+    surface = PredictedSurface(
+        len(corner),
+        np.concatenate([triangles + k * len(vertices) for k in range(3)]),
+        np.repeat([0, 1, 2], len(triangles)),
+    )
+    normals = np.array([[0, 0, 1.0] @ turn for turn in turns])
+    truth, std = np.array([0.4, -0.3, 0.2]), 0.5
+    points, region = [], np.repeat([0, 1, 2], [10, 20, 30])
+    for k, count in enumerate((10, 20, 30)):
+        height = std * rng(k).normal(size=count)
+        points.append(scattered(count, height, k) @ turns[k] + truth)
+    points = np.concatenate(points)
+    prior = Gaussian.from_variance(np.array([0.1, 0.0, 0.0]), 0.2)
+    observation = SurfaceObservation((seen(points, region),), surface, std)
+    predict = observation.of(model(translated(corner)))
+    found = IteratedFilter()(predict, prior, observation.y, observation.R)
+
+    A = normals[region]
+    P = np.linalg.inv(A.T @ A / std**2 + np.eye(3) / 0.2)
+    mean = P @ (A.T @ np.einsum("qk,qk->q", A, points) / std**2 + prior.mean / 0.2)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, P, atol=1e-12)
+
+
+def test_a_plane_of_three_rigid_parameters_is_orthogonal_regression() -> None:
+    # Height and two rotations, which are not linear. Without a prior to speak of the best plane is
+    # that through the mean of the points across their direction of least variance.
+    vertices, triangles = grid(6, 6, 30.0)
+    vertices = vertices - [15, 15, 0]
+
+    def geometry(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b, height = m
+        x = vertices[:, 0]
+        along_x = np.array([np.cos(b), 0, -np.sin(b)])
+        along_y = np.array([np.sin(a) * np.sin(b), np.cos(a), np.sin(a) * np.cos(b)])
+        # R = Ry(b) Rx(a) on the plane z = 0.
+        moved = np.outer(x, along_x) + np.outer(vertices[:, 1], along_y) + [0, 0, height]
+        slope = np.zeros((len(x), 3, 3))
+        of_a = np.array([np.cos(a) * np.sin(b), -np.sin(a), np.cos(a) * np.cos(b)])
+        slope[:, :, 0] = np.outer(vertices[:, 1], of_a)
+        slope[:, :, 1] = np.outer(x, [-np.sin(b), 0, -np.cos(b)]) + np.outer(
+            vertices[:, 1], [np.sin(a) * np.cos(b), 0, -np.sin(a) * np.sin(b)]
+        )
+        slope[:, 2, 2] = 1.0
+        return moved, slope
+
+    points = scattered(200, 0.0) - [5, 5, 0]
+    points[:, 2] = 1.0 + 0.3 * points[:, 0] - 0.2 * points[:, 1] + rng(5).normal(0, 0.5, 200)
+    surface = PredictedSurface(len(vertices), triangles, np.zeros(len(triangles), dtype=int))
+    observation = SurfaceObservation((seen(points),), surface, 0.5)
+    prior = Gaussian.from_variance(np.zeros(3), 1e8)
+    found = IteratedFilter(tolerance=1e-12, objective_tolerance=1e-14)(
+        observation.of(model(geometry)), prior, observation.y, observation.R
+    )
+    assert found.converged
+    normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
+    normal *= np.sign(normal[2])
+    a, b, height = found.mean
+    fitted = [np.cos(a) * np.sin(b), -np.sin(a), np.cos(a) * np.cos(b)]
+    np.testing.assert_allclose(fitted, normal, atol=1e-8)
+    assert [0, 0, height] @ normal == pytest.approx(points.mean(axis=0) @ normal, abs=1e-8)
+
+
+def test_points_tell_no_more_than_vertices_that_are_known_again() -> None:
+    # The same points, seen exactly where the vertices are: with white noise, the distance is one of
+    # the three components, and a curve's offset two of them.
+    geometry, triangles, loop = waves()
+    m = np.array([0.3, 0.2, 0.4])
+    now, slope = geometry(m)
+    surface = PredictedSurface(len(now), triangles, np.zeros(len(triangles), dtype=int), loop)
+    A = slope.reshape(-1, 3) / 0.5
+    B = slope[loop].reshape(-1, 3) / 0.5
+    for count, curve, whole in ((len(now), None, A.T @ A), (0, now[loop], B.T @ B)):
+        observation = SurfaceObservation((seen(now[:count], free_edge=curve),), surface, 0.5, 0.5)
+        part = information(observation.of(model(geometry))(m), observation.R)
+        less = np.linalg.eigvalsh(whole - part)
+        assert less.min() > -1e-9 * less.max()
+        assert np.trace(part) < 0.99 * np.trace(whole)
+        assert np.linalg.matrix_rank(part) == 3
+
+
+def test_noise_about_a_bend_shifts_distances_by_its_curvature() -> None:
+    # A cylinder of radius 5 mm has the mean curvature 0.1 / mm: 0.5^2 x 0.1 = 0.025 mm.
+    flat, triangles = grid(81, 3, 20.0)
+    angle = np.pi * flat[:, 0] / 20.0
+    cylinder = np.column_stack([-5 * np.cos(angle), flat[:, 1], 5 * np.sin(angle)])
+    surface = PredictedSurface(len(flat), triangles, np.zeros(len(triangles), dtype=int))
+    n = 10_000
+    t = rng(1).uniform(0.8, np.pi - 0.8, n)
+    points = np.column_stack([5 * np.cos(t), rng(2).uniform(3, 17, n), 5 * np.sin(t)])
+    points += 0.5 * rng(3).normal(size=points.shape)
+    observation = SurfaceObservation((seen(points),), surface, 0.5)
+    d = observation.of(model(translated(cylinder)))(np.zeros(3)).y
+    # The standard error of the mean is 0.5 / sqrt(10000) = 0.005.
+    assert d.mean() == pytest.approx(0.025, abs=3 * 0.005)
+    # Sides of the polygon lie within the circle by up to 5 (1 - cos(pi / 160)) = 0.001 mm.
+    exact = np.hypot(points[:, 0], points[:, 2]) - 5.0
+    np.testing.assert_allclose(d, exact, atol=0.0011)
+
+
+def test_a_valve_is_its_own_surface() -> None:
+    valve = Template().valve(16, 5)
+    surface = PredictedSurface.of_valve(valve)
+    vertices = valve.surface.vertices
+    observed = ObservedSurface(
+        "closed",
+        vertices[valve.surface.triangles].mean(axis=1),
+        valve.surface.region,
+        vertices[valve.free_edge],
+        vertices[valve.annulus],
+    )
+    observation = SurfaceObservation((observed,), surface, 0.5, 0.5)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    np.testing.assert_allclose(prediction.y, 0.0, atol=1e-12)
+    # Towards the ventricle is positive: the distance of points moved there grows.
+    into = ObservedSurface("closed", observed.points + 0.1 * valve_normals(valve), observed.region)
+    y = SurfaceObservation((into,), surface, 0.5).of(model(translated(vertices)))(np.zeros(3)).y
+    assert np.median(y) == pytest.approx(0.1, abs=1e-12)
+    assert y.min() > 0.0
+
+
+def valve_normals(valve: Valve) -> np.ndarray:
+    """Unit normals of the triangles of a valve's surface."""
+    a, b, c = np.moveaxis(valve.surface.vertices[valve.surface.triangles], 1, 0)
+    normal = np.cross(b - a, c - a)
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def test_a_point_on_a_plane_says_nothing_of_sliding() -> None:
+    vertices, surface = plane()
+    observation = SurfaceObservation((seen(scattered(50, 0.3)),), surface, 0.5)
+    prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+    # 50 points of variance 0.25 along z.
+    expected = np.diag([0.0, 0.0, 50 / 0.25])
+    np.testing.assert_allclose(information(prediction, observation.R), expected, atol=1e-10)
+
+
+def test_paper_filter_takes_the_same_observation() -> None:
+    vertices, surface = plane()
+    observation = SurfaceObservation((seen(scattered(50, 0.3)),), surface, 0.1)
+    predict = observation.of(model(translated(vertices)))
+    prior = Gaussian.from_variance(np.zeros(3), 0.01)
+    found = PaperFilter(0.01)(predict, prior, observation.y, observation.R)
+    np.testing.assert_allclose(found.mean, [0.0, 0.0, 0.3], atol=1e-3)
+
+
+# --- noise --------------------------------------------------------------------------------------
+
+
+def test_errors_are_correlated_within_a_leaflet_and_a_frame_only() -> None:
+    # Two leaflets at one place and in two frames: of the four blocks, only those on the diagonal.
+    vertices, triangles = grid(4, 4)
+    both = np.concatenate([vertices, vertices])
+    surface = PredictedSurface(
+        len(both),
+        np.concatenate([triangles, triangles + len(vertices)]),
+        np.repeat([0, 1], len(triangles)),
+        annulus=rim(4, 4),
+    )
+    points, region = scattered(12, 0.0), np.repeat([0, 1], 6)
+    points[6:] = points[:6]
+    frames = tuple(
+        ObservedSurface(name, points, region, annulus=vertices[rim(4, 4)]) for name in FRAMES
+    )
+    observation = SurfaceObservation(frames, surface, 0.5, 0.2, 4.0)
+    n = observation.y.size
+    assert n == 2 * (12 + 2 * 12)
+    noise = observation_noise(observation.R, n)
+    W = noise.whiten(np.eye(n))
+    R = np.linalg.inv(W.T @ W)
+    # C(d) = (1 + sqrt(3) d / l) exp(-sqrt(3) d / l), times 0.5^2; the curve has 0.2^2.
+    d = np.sqrt(3) / 4.0 * np.linalg.norm(points[:6, None] - points[:6], axis=2)
+    expected = 0.04 * np.eye(n)
+    for start in (0, 6, 36, 42):
+        block = slice(start, start + 6)
+        expected[block, block] = 0.25 * (1 + d) * np.exp(-d)
+    np.testing.assert_allclose(R, expected, atol=1e-9)
+    assert noise.log_determinant == pytest.approx(np.linalg.slogdet(expected)[1], rel=1e-9)
+
+
+def test_correlated_errors_leave_less_information_on_a_shift() -> None:
+    vertices, surface = plane()
+    points = scattered(50, 0.3)
+    variance = []
+    for length in (0.0, 1.0, 5.0, 1e3):
+        observation = SurfaceObservation((seen(points),), surface, 0.5, None, length)
+        prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+        variance.append(1.0 / information(prediction, observation.R)[2, 2])
+    assert variance[0] == pytest.approx(0.25 / 50)
+    assert np.all(np.diff(variance) > 0)
+    # Errors that are alike everywhere leave one point's worth.
+    assert variance[-1] == pytest.approx(0.25, rel=0.02)
+
+
+@pytest.mark.parametrize("std", [0.05, 0.1, 0.5])
+def test_curves_have_as_many_degrees_of_freedom_as_noise(std: float) -> None:
+    # An annulus of 15 mm seen at 200 points, 0.47 mm apart, with noise of each coordinate.
+    # Across it are two components each; counting three would give 2/3. Where points are nearer to
+    # each other than the noise, directions between neighbours would be any, and give 2/3 again.
+    # Directions are known to 1 / (6 sqrt(2)) rad, which takes 1/72 = 0.014 off.
+    t = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    ring = 15 * np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    vertices = np.concatenate([ring, np.zeros((1, 3))])
+    triangles = np.array([[200, k, (k + 1) % 200] for k in range(200)])
+    surface = PredictedSurface(201, triangles, np.zeros(200, dtype=int), annulus=np.arange(200))
+    squares = []
+    for seed in range(40):
+        curve = ring + std * rng(seed).normal(size=ring.shape)
+        observation = SurfaceObservation((seen(np.empty((0, 3)), annulus=curve),), surface, 1, std)
+        prediction = observation.of(model(translated(vertices)))(np.zeros(3))
+        e = observation_noise(observation.R, 400).whiten(observation.y - prediction.y)
+        squares.append(e @ e / 400)
+    # 16000 squares of normal numbers have a mean of 1 with a standard error of 0.011.
+    assert np.mean(squares) == pytest.approx(1.0 - 1 / 72, abs=3 * 0.011)
+
+
+def test_points_near_the_curves_may_be_left_out() -> None:
+    vertices, _ = plane(11, 11)
+    loop = vertices[rim(11, 11)]
+    frame = seen(vertices + np.array([0, 0, 0.5]), np.arange(121) % 2 - 1, annulus=loop)
+    inner = frame.inner(1.1)
+    # Over the border are 40 of 11 x 11 points, 0.5 mm from it; the next are sqrt(1 + 0.5^2) mm
+    # from it, and those after sqrt(4 + 0.5^2).
+    assert len(inner.points) == 81
+    assert len(frame.inner(1.2).points) == 49
+    assert np.all((inner.points[:, :2] > 0.5) & (inner.points[:, :2] < 9.5))
+    kept = np.all((vertices[:, :2] > 0.5) & (vertices[:, :2] < 9.5), axis=1)
+    np.testing.assert_array_equal(inner.region, frame.region[kept])
+    np.testing.assert_array_equal(inner.annulus, loop)
+    # Without a curve nothing is known to be near it.
+    assert len(seen(vertices).inner(1.1).points) == 121
+
+
+def test_the_side_flips_beyond_the_border_and_inner_points_do_not_care() -> None:
+    # Two neighbours beyond the border, one above and one below the plane.
+    vertices, surface = plane()
+    pair = np.array([[10.5, 5.0, 0.01], [10.5, 5.0, -0.01]])
+    observation = SurfaceObservation((seen(pair),), surface, 0.5)
+    y = observation.of(model(translated(vertices)))(np.zeros(3)).y
+    np.testing.assert_allclose(y, np.hypot(0.5, 0.01) * np.array([1, -1]), atol=1e-14)
+    loop = vertices[surface.annulus]
+    assert len(seen(pair, annulus=loop).inner(3 * 0.5).points) == 0
+
+
+def test_too_many_correlated_points_are_to_be_thinned() -> None:
+    _, surface = plane()
+    points = scattered(MAX_CORRELATED_POINTS + 1, 0.0)
+    with pytest.raises(InputError, match="thin them"):
+        SurfaceObservation((seen(points),), surface, 0.5, None, 3.0)
+    assert SurfaceObservation((seen(points),), surface, 0.5).y.size == MAX_CORRELATED_POINTS + 1
+
+
+# --- frames and failures ------------------------------------------------------------------------
+
+
+def test_frames_are_chosen_by_name_out_of_any_number() -> None:
+    vertices, surface = plane()
+    names = ("open", "half", "closed")
+    last = lambda m: model(translated(vertices), frames=3)(m)  # noqa: E731
+    points = scattered(5, 1.0)
+    frames = tuple(
+        ObservedSurface(name, points, np.zeros(5, dtype=int)) for name in ("closed", "half")
+    )
+    predict = SurfaceObservation(frames, surface, 1.0).of(last, names)
+    m = np.array([0.0, 0.0, 0.4])
+    prediction = predict(m)
+    # Only the closed frame, here the first observed one, moves.
+    np.testing.assert_allclose(prediction.y, np.repeat([0.6, 1.0], 5), atol=1e-14)
+    np.testing.assert_allclose(prediction.jacobian[:, 2], np.repeat([-1.0, 0.0], 5), atol=1e-14)
+    np.testing.assert_array_equal(predict.whole(m), [vertices + m, vertices])
+    assert predict.whole(m + 1) is None
+    with pytest.raises(InputError, match="half"):
+        SurfaceObservation(frames, surface, 1.0).of(last, FRAMES)
+
+
+def test_a_model_that_fails_or_does_not_fit_says_so() -> None:
+    vertices, surface = plane()
+    observation = SurfaceObservation((seen(scattered(5, 1.0)),), surface, 1.0)
+
+    def inadmissible(m: np.ndarray) -> Prediction:
+        raise MaterialError("E_f = -1 MPa, expected > 0")
+
+    failed = observation.of(inadmissible)(np.zeros(3))
+    assert not failed.converged
+    assert "E_f = -1" in failed.reason
+    newton = Prediction.failed("Newton's method did not converge")
+    assert observation.of(lambda m: newton)(np.zeros(3)) is newton
+    with pytest.raises(InputError, match="20 vertices"):
+        observation.of(model(translated(vertices[:-1])))(np.zeros(3))
+
+
+def test_distances_to_a_leaflet_without_area_are_those_to_its_edges() -> None:
+    vertices, surface = plane()
+    points = np.array([[5.0, 3.0, 4.0], [5.0, 0.0, 0.0]])
+    line = vertices * [1, 0, 0]
+    prediction = SurfaceObservation((seen(points),), surface, 1.0).of(model(translated(line)))(
+        np.zeros(3)
+    )
+    np.testing.assert_allclose(prediction.y, [5.0, 0.0], atol=1e-14)
+    np.testing.assert_allclose(prediction.jacobian, [[0, -0.6, -0.8], [0, 0, 0]], atol=1e-14)
+
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"points": np.zeros((3, 2))}, "shape"),
+        ({"points": np.full((3, 3), np.nan)}, "finite"),
+        ({"region": np.zeros(2, dtype=int)}, "for 3 points"),
+        ({"region": np.full(3, -2)}, "expected -1"),
+        ({"region": np.zeros(3)}, "integers"),
+        ({"free_edge": SQUARE[:2]}, "three or more"),
+        ({"free_edge": SQUARE[[0, 1, 2, 0]]}, "not repeated"),
+        ({"annulus": np.full((4, 3), np.inf)}, "finite"),
+    ],
+)
+def test_wrong_points_and_curves_are_refused(change: dict, words: str) -> None:
+    given = {"points": np.zeros((3, 3)), "region": np.zeros(3, dtype=int)}
+    with pytest.raises(InputError, match=words):
+        ObservedSurface("closed", **(given | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"triangles": np.array([[0, 1, 4]])}, "0 to 3"),
+        ({"triangles": np.array([[0, 1]])}, "shape"),
+        ({"region": np.zeros(2, dtype=int)}, "shape"),
+        ({"free_edge": np.array([0, 1, 1])}, "different vertices"),
+        ({"annulus": np.array([0, 1, 7])}, "0 to 3"),
+    ],
+)
+def test_a_wrong_surface_is_refused(change: dict, words: str) -> None:
+    given = {"n_vertices": 4, "triangles": np.array([[0, 1, 2]]), "region": np.array([0])}
+    with pytest.raises(InputError, match=words):
+        PredictedSurface(**(given | change))
+
+
+@pytest.mark.parametrize(
+    ("frame", "settings", "words"),
+    [
+        ({}, {"std_mm": 0.0}, "std_mm = 0"),
+        ({}, {"correlation_length_mm": -1.0}, "correlation_length_mm"),
+        ({"region": np.array([0, 0, 3])}, {}, "region 3"),
+        ({"points": np.empty((0, 3)), "region": np.empty(0, dtype=int)}, {}, "nothing is seen"),
+        ({"annulus": SQUARE}, {}, "curve_std_mm"),
+        ({"annulus": SQUARE}, {"curve_std_mm": np.nan}, "curve_std_mm = nan"),
+        ({"free_edge": SQUARE}, {"curve_std_mm": 1.0}, "surface has none"),
+    ],
+)
+def test_an_observation_that_cannot_be_is_refused(frame: dict, settings: dict, words: str) -> None:
+    surface = PredictedSurface(4, np.array([[0, 1, 2]]), np.array([0]), annulus=np.array([0, 1, 2]))
+    of_frame = {"points": np.zeros((3, 3)), "region": np.zeros(3, dtype=int)} | frame
+    with pytest.raises(InputError, match=words):
+        SurfaceObservation(
+            (ObservedSurface("closed", **of_frame),), surface, **({"std_mm": 1.0} | settings)
+        )
+    frames = (seen(np.zeros((3, 3))),) * 2
+    with pytest.raises(InputError, match="different"):
+        SurfaceObservation(frames, surface, 1.0)
+
+
+# --- through the study --------------------------------------------------------------------------
+
+
+def test_a_study_takes_what_was_seen_without_correspondence() -> None:
+    # A half cylinder whose radius follows the compliances of two leaflets, 5 + 1 / E and 5 + 2 / E;
+    # seen are points of true cylinders, not of its vertices, and the rims of the two.
+    columns, rows = 65, 9
+    flat, triangles = grid(columns, rows)
+    angle = np.pi * flat[:, 0] / 10.0
+    around = np.column_stack([np.cos(angle), 0 * angle, np.sin(angle)])
+    side = (flat[:, 1] >= 5.0).astype(int)
+
+    def predict(m: np.ndarray) -> Prediction:
+        if np.any(m <= 0):
+            raise MaterialError(f"E_f = {m.min()} MPa, expected > 0")
+        radius = 5.0 + np.array([1.0, 2.0])[side] / m[side]
+        closed = radius[:, None] * around + flat * [0, 1, 0]
+        slope = np.zeros((*closed.shape, 2))
+        for k in range(2):
+            of_k = (side == k)[:, None] * around
+            slope[:, :, k] = -(k + 1.0) / m[k] ** 2 * of_k
+        y = np.concatenate([np.zeros(closed.size), closed.ravel()])
+        return Prediction(y, np.concatenate([0 * slope, slope]).reshape(-1, 2))
+
+    truth = np.array([2.0, 4.0])
+    t = rng(3).uniform(0.1, np.pi - 0.1, 300)
+    region = np.repeat([0, 1], 150)
+    height = np.where(region == 0, rng(4).uniform(0, 3, 300), rng(5).uniform(7, 10, 300))
+    radius = 5.0 + np.array([1.0, 2.0])[region] / truth[region]
+    points = np.column_stack([radius * np.cos(t), height, radius * np.sin(t)])
+    surface = PredictedSurface(len(flat), triangles, side[triangles].max(axis=1))
+    observation = SurfaceObservation((seen(points, region),), surface, 0.1)
+    names = ("E_f.anterior", "E_f.posterior")
+    prior = Gaussian.from_variance(np.array([3.0, 3.0]), 9.0)
+    tissue = {"anterior": TissueSettings(2.0), "posterior": TissueSettings(2.0)}
+    case = Case(names, predict, prior, IteratedFilter(), Identity(), tissue)
+    result = estimate(case, observation)
+    assert result.converged
+    assert result.estimate is not None
+    assert result.distance is not None
+    assert result.fitted is not None
+    # The polygons lie within the circle by up to R (1 - cos(pi / 128)) = 0.002 mm, which moduli
+    # that move the radius by 1 / E^2 = 0.25 and 2 / E^2 = 0.125 mm per MPa turn into 0.013 MPa.
+    np.testing.assert_allclose(result.estimate, truth, atol=0.02)
+    assert result.distance.shape == (300,)
+    assert result.distance.min() >= 0.0
+    assert result.distance.max() < 0.004
+    assert result.fitted.shape == (1, len(flat), 3)
+    # 150 points of 0.1 mm each: the bound, from slopes by hand.
+    assert result.identifiability is not None
+    np.testing.assert_allclose(
+        result.identifiability.std, 0.1 / np.sqrt(150) / np.array([0.25, 0.125]), rtol=0.03
+    )
+
+
+# --- for reporting ------------------------------------------------------------------------------
+
+
+def test_the_mean_distance_is_by_area_and_of_both_ways() -> None:
+    # A square 1 mm above a larger one. Every vertex of the small one is 1 mm away; of the large one
+    # (2 x 2 triangles, one central vertex) the corners and sides are farther.
+    small, small_triangles = grid(3, 3, 2.0)
+    large, large_triangles = grid(3, 3, 4.0)
+    small += 1.0
+    distance = surface_distance(large, small, small_triangles)
+    expected = np.sqrt([3, 2, 3, 2, 1, 2, 3, 2, 3])
+    np.testing.assert_allclose(distance, expected, atol=1e-14)
+    # Areas of the vertices in eights of the triangles' corners: two corners have two triangles and
+    # two have one, the sides three, the middle six.
+    weight = np.array([2, 3, 1, 3, 6, 3, 1, 3, 2])
+    both = 0.5 * (1.0 + np.average(expected, weights=weight))
+    found = mean_surface_distance(small, small_triangles, large, large_triangles)
+    assert found == pytest.approx(both, rel=1e-12)
+    assert mean_surface_distance(large, large_triangles, small, small_triangles) == found

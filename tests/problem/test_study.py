@@ -1,0 +1,352 @@
+"""The study's joint on an analytic model, whose answers are known by hand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mvest.closure.model import ClosedState
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
+from mvest.mechanics.settings import TissueSettings
+from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
+from mvest.problem.study import (
+    Case,
+    Observation,
+    SharedStart,
+    StudyResult,
+    Truth,
+    TwinData,
+    estimate,
+    simulate_observation,
+)
+
+NAMES = ("E_f.anterior", "E_f.posterior")
+TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
+VERTICES = 40
+TRUTH = np.array([6.23, 2.09])
+
+
+class Sheet:
+    """Points that move by A / m: stiffer means less, as in a leaflet."""
+
+    def __init__(self, factor: float = 20.0) -> None:
+        rng = np.random.default_rng(7)
+        self.open = rng.normal(size=3 * VERTICES)
+        self.A = factor * rng.normal(size=(3 * VERTICES, 2))
+        self.calls = 0
+
+    def __call__(self, m: np.ndarray) -> Prediction:
+        self.calls += 1
+        if np.any(m <= 0):
+            raise MaterialError(f"E_f = {m.min()} MPa, expected > 0")
+        closed = self.open + self.A @ (1 / m)
+        jacobian = np.concatenate([np.zeros_like(self.A), -self.A / m**2])
+        return Prediction(np.concatenate([self.open, closed]), jacobian)
+
+
+def failing(m: np.ndarray) -> Prediction:
+    return Prediction.failed("Newton's method did not converge")
+
+
+def observe(model=None, noise_mm: float = 0.0, seed: int = 1, **more) -> TwinData:
+    return simulate_observation(
+        model or Sheet(),
+        NAMES,
+        TRUTH,
+        variance=more.pop("variance", 0.01),
+        errors=(WhiteNoise(noise_mm), *more.pop("errors", ())),
+        rng=np.random.default_rng(seed),
+        **more,
+    )
+
+
+def case(model=None, filter_=None) -> Case:
+    prior = Gaussian.from_variance(np.array([5.0, 3.0]), 9.0)
+    return Case(NAMES, model or Sheet(), prior, filter_ or IteratedFilter(), Identity(), TISSUE)
+
+
+def test_paper_filter_finds_the_truth_of_a_twin() -> None:
+    data = observe()
+    assert data.observation is not None
+    result = estimate(case(filter_=PaperFilter(0.01)), data.observation).against(data.truth)
+    assert result.converged
+    np.testing.assert_allclose(result.estimate, TRUTH, rtol=1e-6)
+    np.testing.assert_allclose(result.relative_error, 0, atol=1e-6)
+    assert result.distance is not None
+    assert result.distance.shape == (VERTICES,)
+    assert result.distance.max() < 1e-6
+
+
+def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
+    # E_perp = E_f / r and G = E_f / (2 (1 + 0.488)): the errors of one leaflet are all alike.
+    data = observe(noise_mm=0.05)
+    assert data.observation is not None
+    result = estimate(case(), data.observation).against(data.truth)
+    truths = [(m.region, m.name, round(m.truth or 0, 2)) for m in result.moduli]
+    assert truths == [
+        ("anterior", "E_f", 6.23),
+        ("anterior", "E_perp", 2.35),
+        ("anterior", "G", 2.09),
+        ("posterior", "E_f", 2.09),
+        ("posterior", "E_perp", 1.89),
+        ("posterior", "G", 0.70),
+    ]
+    assert result.relative_error is not None
+    for k, error in enumerate(np.repeat(result.relative_error, 3)):
+        assert result.moduli[k].relative_error == pytest.approx(error, rel=1e-12)
+        assert abs(error) > 1e-5
+    assert result.moduli[1].std == pytest.approx(result.moduli[0].std * 2.35 / 6.23)
+
+
+def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
+    fields = {f.name for cls in (Case, Observation) for f in dataclasses.fields(cls)}
+    assert not any("truth" in name or "true" in name for name in fields)
+    data = observe()
+    assert data.observation is not None
+    assert data.truth is not None
+    # The observation is a copy: changing what it was made from changes nothing that is estimated.
+    assert not np.shares_memory(data.observation.positions, data.truth.positions)
+    result = estimate(case(), data.observation)
+    assert result.truth is None
+    assert result.relative_error is None
+    assert all(m.truth is None for m in result.moduli)
+
+
+def test_noise_has_the_stated_size_and_follows_the_seed() -> None:
+    data, again, other = observe(noise_mm=0.5), observe(noise_mm=0.5), observe(noise_mm=0.5, seed=2)
+    assert data.observation is not None
+    assert data.truth is not None
+    assert again.observation is not None
+    assert other.observation is not None
+    noise = data.observation.positions - data.truth.positions
+    # 240 numbers: the standard error of their SD is 0.5 / sqrt(480) = 0.023.
+    assert noise.std() == pytest.approx(0.5, abs=3 * 0.023)
+    np.testing.assert_array_equal(data.observation.positions, again.observation.positions)
+    assert np.abs(data.observation.positions - other.observation.positions).max() > 0.1
+
+
+def test_the_distance_to_the_truth_leaves_the_noise_out() -> None:
+    data = observe(noise_mm=0.5)
+    assert data.observation is not None
+    result = estimate(case(), data.observation).against(data.truth)
+    assert result.distance is not None
+    assert result.distance_to_truth is not None
+    # The norm of three N(0, 0.5²) numbers has the mean 0.5 · sqrt(8/π) = 0.80.
+    assert result.distance.mean() == pytest.approx(0.80, rel=0.15)
+    # Two parameters take up 2 of 120 parts of the noise's variance: 0.80 · sqrt(2/120) = 0.10.
+    assert result.distance_to_truth.mean() < 0.2
+
+
+def test_only_the_closed_frame_gives_the_same_estimate_as_both() -> None:
+    # The open frame does not depend on the moduli.
+    estimates = []
+    for frames in (("open", "closed"), ("closed",)):
+        data = observe(frames=frames, noise_mm=0.0)
+        assert data.observation is not None
+        assert data.observation.positions.shape == (len(frames), VERTICES, 3)
+        estimates.append(estimate(case(), data.observation).estimate)
+    np.testing.assert_allclose(estimates[0], estimates[1], rtol=1e-9)
+
+
+def test_each_frame_may_have_its_own_variance() -> None:
+    data = observe(variance=[0.01, 0.04])
+    assert data.observation is not None
+    R = data.observation.R
+    assert R.shape == (2 * 3 * VERTICES,)
+    np.testing.assert_array_equal(np.unique(R[: 3 * VERTICES]), [0.01])
+    np.testing.assert_array_equal(np.unique(R[3 * VERTICES :]), [0.04])
+
+
+def test_the_bound_scales_with_the_noise() -> None:
+    stds = []
+    for variance in (0.01, 0.04):
+        data = observe(variance=variance)
+        assert data.observation is not None
+        found = estimate(case(), data.observation).identifiability
+        assert found is not None
+        stds.append(found.std)
+    # The two estimates differ by the prior's pull, hence not exactly 2.
+    np.testing.assert_allclose(stds[1] / stds[0], 2.0, rtol=1e-2)
+
+
+def test_a_failing_truth_is_a_value_with_its_reason() -> None:
+    data = observe(failing)
+    assert data.observation is None
+    assert data.truth is None
+    assert "Newton" in data.reason
+    result = StudyResult.failed(case(), data.reason, 0.0)
+    assert not result.converged
+    assert result.estimate is None
+    assert result.std is None
+    assert result.moduli == ()
+    assert result.distance is None
+
+
+def test_a_failing_model_is_a_value_with_its_reason() -> None:
+    data = observe()
+    assert data.observation is not None
+    result = estimate(case(failing), data.observation).against(data.truth)
+    assert not result.converged
+    assert result.estimate is None
+    assert result.relative_error is None
+    assert "Newton" in result.detail
+
+
+def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
+    # From a start of 40 MPa the first step of Gauss-Newton on 1/m goes far below zero.
+    data = observe()
+    assert data.observation is not None
+    prior = Gaussian.from_variance(np.array([40.0, 40.0]), 1e4)
+    far = Case(NAMES, Sheet(), prior, IteratedFilter(), Identity(), TISSUE)
+    result = estimate(far, data.observation)
+    assert result.converged
+    np.testing.assert_allclose(result.estimate, TRUTH, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"noise_mm": -1.0}, "noise of -1.0 mm"),
+        ({"frames": ("shut",)}, "shut"),
+        ({"frames": ()}, "expected some of"),
+        ({"frames": ("closed", "closed")}, "expected some of"),
+        ({"variance": 0.0}, "R = 0"),
+        ({"variance": [0.1, 0.1, 0.1]}, "R has shape"),
+        ({"variance": np.nan}, "R must be finite"),
+    ],
+)
+def test_bad_input_is_refused(change: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        observe(**change)
+
+
+def test_bad_values_and_shapes_are_refused() -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(InputError, match="1 true values for the 2 parameters"):
+        simulate_observation(Sheet(), NAMES, np.array([1.0]), variance=1.0, rng=rng)
+    with pytest.raises(MaterialError, match="expected > 0"):
+        simulate_observation(Sheet(), NAMES, np.array([-1.0, 1.0]), variance=1.0, rng=rng)
+    with pytest.raises(InputError, match="shape"):
+        Observation(("closed",), np.zeros((2, 5, 3)), np.array([1.0]))
+    with pytest.raises(InputError, match="finite"):
+        Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
+    with pytest.raises(InputError, match="prior has 1"):
+        Case(
+            NAMES,
+            Sheet(),
+            Gaussian.from_variance(np.ones(1), 1.0),
+            IteratedFilter(),
+            Identity(),
+            {},
+        )
+    data = observe()
+    assert data.observation is not None
+    with pytest.raises(InputError, match="truth is of"):
+        estimate(case(), data.observation).against(Truth(("a", "b"), TRUTH, np.zeros((2, 1, 3))))
+
+
+def test_an_unseen_vertex_has_no_say() -> None:
+    # Its position is nowhere to be read, and the estimate is that of the remaining rows.
+    data = observe(noise_mm=0.2)
+    assert data.observation is not None
+    positions = data.observation.positions.copy()
+    hidden = np.arange(VERTICES) % 4 > 0
+    positions[1, hidden] = np.nan
+    masked = Observation(data.observation.frames, positions, data.observation.variance)
+    assert masked.y.shape == masked.R.shape == (3 * (VERTICES + 10),)
+    result = estimate(case(), masked).against(data.truth)
+    sheet = Sheet()
+    rows = np.repeat(np.concatenate([np.ones(VERTICES, bool), ~hidden]), 3)
+
+    def part(m: np.ndarray) -> Prediction:
+        whole = sheet(m)
+        return Prediction(whole.y[rows], whole.jacobian[rows])
+
+    by_hand = IteratedFilter()(part, case().prior, positions.ravel()[rows], 0.01)
+    np.testing.assert_allclose(result.estimate, by_hand.mean, rtol=1e-12)
+    assert np.abs(result.estimate - estimate(case(), data.observation).estimate).max() > 1e-3
+    # What was not seen is fitted all the same, and has no distance to an observation.
+    assert result.fitted is not None
+    assert result.fitted.shape == (2, VERTICES, 3)
+    np.testing.assert_array_equal(np.isnan(result.distance), hidden)
+    assert np.isfinite(result.distance_to_truth).all()
+
+
+def test_an_observation_of_nothing_is_refused() -> None:
+    with pytest.raises(InputError, match="no vertex is seen"):
+        Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
+    half = np.zeros((1, 5, 3))
+    half[0, 2, 1] = np.nan
+    with pytest.raises(InputError, match="must be finite"):
+        Observation(("closed",), half, np.array([1.0]))
+    correlation = SpatialCorrelation(np.eye(3), 5.0)
+    with pytest.raises(InputError, match="between 3 vertices, but 5"):
+        Observation(("closed",), np.zeros((1, 5, 3)), np.array([1.0]), correlation)
+
+
+def test_the_filter_may_be_told_that_errors_are_correlated() -> None:
+    # With correlated errors the white R claims too much; the correlated R is told the truth.
+    points = np.random.default_rng(3).uniform(0.0, 10.0, (VERTICES, 3))
+    correlation = SpatialCorrelation(points, 5.0)
+    errors = [CorrelatedNoise(0.5, correlation)]
+    z = {}
+    for told in (None, correlation):
+        found = []
+        for seed in range(60):
+            sheet = smooth_sheet(points)
+            data = observe(sheet, seed=seed, errors=errors, correlation=told, variance=0.25)
+            assert data.observation is not None
+            result = estimate(case(sheet), data.observation).against(data.truth)
+            found.append((result.estimate - TRUTH) / result.std)
+        z[told is None] = np.std(found)
+    # Standard error of an SD of 120 numbers: 1 / sqrt(240) = 0.065.
+    assert z[False] == pytest.approx(1.0, abs=4 * 0.065)
+    assert z[True] > 1.5
+
+
+def smooth_sheet(points: np.ndarray) -> Sheet:
+    """A sheet whose neighbours move alike, as correlated errors do."""
+    sheet = Sheet()
+    field = np.stack([points[:, 0] + 1.0, np.cos(points[:, 1] / 4.0) + 2.0], axis=-1)
+    sheet.A = np.repeat(field, 3, axis=0) * 20.0
+    return sheet
+
+
+class Wandering:
+    """A model whose predictions remember, beyond what is harmless, where it was before."""
+
+    def __init__(self) -> None:
+        self.sheet = Sheet()
+        self.closed: ClosedState | None = None
+        self.solves = 0
+
+    def restart(self, closed: ClosedState | None) -> None:
+        self.closed = closed
+
+    def __call__(self, m: np.ndarray) -> Prediction:
+        self.solves += 1
+        found = self.sheet(m)
+        memory = 0.0 if self.closed is None else 1e-6 * self.closed.at[0]
+        self.closed = ClosedState(m.copy(), np.zeros((1, 3)))
+        return Prediction(found.y + memory, found.jacobian)
+
+
+def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
+    observations = [observe(noise_mm=0.3, seed=seed).observation for seed in range(4)]
+    start = case().prior.mean
+
+    def estimates(chosen: list[int], shared: bool = True) -> list[bytes]:
+        model = Wandering()
+        used = SharedStart(model, start) if shared else model
+        results = [estimate(case(used), observations[k]) for k in chosen]
+        solves = sum(r.filtered.forward_solves for r in results)
+        assert model.solves == (solves - len(chosen) + 1 if shared else solves)
+        return [r.estimate.tobytes() + r.std.tobytes() for r in results]
+
+    together = estimates([0, 1, 2, 3])
+    assert estimates([2]) + estimates([3, 1]) + estimates([0]) == [
+        together[k] for k in (2, 3, 1, 0)
+    ]
+    # The model is one for which this is not a matter of course.
+    assert estimates([0, 1, 2], shared=False)[2] != estimates([2], shared=False)[0]

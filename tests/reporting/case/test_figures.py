@@ -1,0 +1,359 @@
+"""Pictures of one case. Fields are made up; see `tests.reporting.case.made_up_case`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+
+from mvest.errors import InputError
+from mvest.reporting.case.drawing import ATRIUM, LINE_PIECES, SIDE, quartered
+from mvest.reporting.case.fields import read_case_fields
+from mvest.reporting.case.figures import (
+    case_figure,
+    distance_top,
+    figure3_caption,
+    information_figure,
+    innovation_map_figure,
+    shapes_figure,
+)
+from mvest.reporting.case.information import columns_of, information, where_words
+from mvest.reporting.case.plots import (
+    distances_figure,
+    estimates_figure,
+    innovation_figure,
+    iterations_figure,
+    narrow_figure,
+)
+from mvest.reporting.case.view import case_view, small
+from tests.reporting.case.made_up_case import COLUMNS, NOISE_MM, made_up_case
+
+NAMES = ("anterior", "posterior")
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    return made_up_case(tmp_path_factory.mktemp("case"))
+
+
+@pytest.fixture(scope="module")
+def fields(case):
+    return read_case_fields(case[1])
+
+
+LINES = 2 * COLUMNS * LINE_PIECES
+"""Pieces of the annulus and of the free edge."""
+
+
+def faces(axes):
+    drawn = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    assert len(drawn) == 1
+    return drawn[0]
+
+
+def pieces(axes, fields, lines: int = LINES) -> int:
+    """Into how many parts each triangle is drawn."""
+    each, rest = divmod(len(faces(axes).get_paths()) - lines, len(fields.triangles))
+    assert rest == 0
+    return each
+
+
+# --- reading ------------------------------------------------------------------------------------
+
+
+def test_a_valve_is_turned_the_same_way_however_it_lies(case, fields, tmp_path) -> None:
+    turn = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    with np.load(case[1]) as stored:
+        arrays = dict(stored)
+    for name in ("rest", "observed", "generic", "registered", "fitted", "truth", "tips"):
+        arrays[name] = arrays[name] @ turn.T + [50.0, -20.0, 300.0]
+    np.savez(tmp_path / "turned.npz", **arrays)
+    turned = read_case_fields(tmp_path / "turned.npz")
+    np.testing.assert_allclose(turned.rest, fields.rest, atol=1e-9)
+    np.testing.assert_allclose(turned.observed, fields.observed, atol=1e-9)
+    np.testing.assert_allclose(turned.tips, fields.tips, atol=1e-9)
+
+
+def test_the_atrium_is_above_and_the_first_leaflet_in_front(fields) -> None:
+    assert fields.tips[..., 2].max() < fields.rest[fields.annulus][:, 2].min()
+    first = fields.rest[fields.vertex_region == 0].mean(axis=0)
+    assert first[1] > 5.0
+    assert abs(first[0]) < 0.5
+    # Not mirrored: the template's first commissure, at phi = 0, lies at positive x.
+    assert fields.rest[fields.annulus[0], 0] > 10.0
+
+
+def test_views_look_where_they_say() -> None:
+    np.testing.assert_allclose(ATRIUM.axes, np.eye(3), atol=1e-12)
+    right, up, eye = SIDE.axes.T
+    np.testing.assert_allclose(np.cross(right, up), eye, atol=1e-12)
+    assert up[2] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("seen", np.array([True]), "seen"),
+        ("fitted", np.zeros((2, 5, 3)), "fitted has the shape"),
+        ("distance_fitted", np.zeros(4), "distance_fitted has the shape"),
+        ("annulus", np.array([0, 9999]), "annulus names vertices"),
+        ("chord_tip", np.array([0, 1]), "chord_tip and chord_insertion"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(case, tmp_path, name, value, message) -> None:
+    with np.load(case[1]) as stored:
+        arrays = dict(stored) | {name: value}
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_case_fields(tmp_path / "bad.npz")
+
+
+# --- Figure 3 -----------------------------------------------------------------------------------
+
+
+def test_both_panels_of_figure_3_have_one_scale(fields) -> None:
+    """2 mm everywhere beside 1 mm: each on a scale of its own, they would look alike."""
+    two = np.full_like(fields.distance_generic, 2.0)
+    same_shape = replace(
+        fields, fitted=fields.generic, distance_generic=two, distance_fitted=two / 2
+    )
+    figure = case_figure(same_shape)
+    bars = [axes for axes in figure.axes if axes.get_ylabel().endswith("[mm]")]
+    assert [axes.get_ylim() for axes in bars] == [(0.0, 2.0)]
+    left, right = (faces(axes).get_facecolor() for axes in figure.axes[:2])
+    different = np.abs(left - right).max(axis=1) > 0.2
+    # All but the lines.
+    assert different.sum() == len(fields.triangles) * pieces(figure.axes[0], fields)
+
+
+def test_captions_tell_which_panel_is_which(case, fields) -> None:
+    generic, fitted = fields.distance_generic[0], fields.distance_fitted[0]
+    told = figure3_caption(fields)
+    left = f"Left: generic stiffness, {np.nanmean(generic):.2f} ± {np.nanstd(generic):.2f} mm"
+    right = f"Right: personalised stiffness, {np.nanmean(fitted):.2f} ± {np.nanstd(fitted):.2f} mm"
+    assert left in told
+    assert right in told
+    swapped = replace(
+        fields,
+        distance_generic=fields.distance_fitted,
+        distance_fitted=fields.distance_generic,
+    )
+    assert figure3_caption(swapped) != told
+    titles = [axes.get_title() for axes in case_figure(fields).axes[:2]]
+    assert [axes.get_title() for axes in case_figure(case[1]).axes[:2]] == titles
+    assert titles == [
+        f"generic stiffness\n{np.nanmean(generic):.2f} ± {np.nanstd(generic):.2f} mm",
+        f"personalised stiffness\n{np.nanmean(fitted):.2f} ± {np.nanstd(fitted):.2f} mm",
+    ]
+
+
+def test_unseen_triangles_are_grey_in_figure_3(fields) -> None:
+    axes = case_figure(fields).axes[0]
+    touched = np.isnan(fields.distance_generic[0])[fields.triangles].any(axis=1).sum()
+    # Lines have the same red, green and blue as well, but are darker.
+    colour = faces(axes).get_facecolor()
+    grey = (np.ptp(colour[:, :3], axis=1) < 1e-9) & (colour[:, 0] > 0.3)
+    assert touched > 0
+    assert grey.sum() == touched * pieces(axes, fields)
+
+
+def test_figure_3_draws_the_frame_that_was_shown_to_the_filter(fields) -> None:
+    late = replace(fields, seen=np.array([False, True]))
+    assert "“late”" in figure3_caption(late)
+    mean = np.nanmean(fields.distance_generic[1])
+    assert f"{mean:.2f}" in case_figure(late).axes[0].get_title()
+
+
+def test_figure_3_needs_its_fields(fields) -> None:
+    with pytest.raises(InputError, match="needs the generic"):
+        case_figure(replace(fields, fitted=None))
+    with pytest.raises(InputError, match="needs the distances"):
+        case_figure(replace(fields, distance_fitted=None))
+
+
+@pytest.mark.parametrize(("largest", "top"), [(2.1, 2.5), (0.31, 0.35), (5.0, 5.0), (0.0, 1e-3)])
+def test_scales_end_at_a_round_number(largest, top) -> None:
+    assert distance_top(np.full(9, largest)) == pytest.approx(top)
+
+
+def test_one_outlier_does_not_hide_the_rest() -> None:
+    values = np.full(1000, 0.9)
+    values[3] = 50.0
+    # The 0.99 quantile is 0.9, eighteen steps of 0.05.
+    assert distance_top(values) == pytest.approx(0.9)
+
+
+# --- information --------------------------------------------------------------------------------
+
+
+def parameters(count: int) -> list[dict]:
+    return [
+        {
+            "name": f"p{k}",
+            "label": f"p{k}",
+            "kind": "modulus" if k == 0 else "nuisance",
+            "treatment": "estimated",
+            "estimate": 2.0,
+            "prior_std": 0.5,
+        }
+        for k in range(count)
+    ]
+
+
+def test_information_of_a_modulus_alone_by_hand(fields) -> None:
+    # One vertex moves by 0.3 mm per unit; m = 2, sigma = 0.5: (2 x 0.3 / 0.5)^2 = 1.44.
+    S = np.zeros((len(fields.rest), 3, 1))
+    S[100, 1, 0] = 0.3
+    found = information(replace(fields, sensitivity=S), parameters(1), 0.5)[0]
+    assert found.raw[100] == pytest.approx(1.44)
+    assert np.nansum(found.raw) == pytest.approx(1.44)
+    assert found.kept == pytest.approx(1.0)
+    # What was not seen informs of nothing.
+    assert np.isnan(found.raw[0])
+
+
+@pytest.mark.parametrize("std", [None, 0.4])
+def test_what_remains_is_the_schur_complement_of_the_information(fields, std) -> None:
+    S = np.random.default_rng(3).normal(size=(len(fields.rest), 3, 3))
+    found = information(replace(fields, sensitivity=S), parameters(3), std)[0]
+    seen = np.isfinite(fields.distance_fitted[0])
+    A = S[seen].reshape(-1, 3) / (std or 1.0)
+    # On log m, m = 2; nuisances with prior precision 1 / 0.5^2 where the noise is known.
+    F = A.T @ A + np.diag([0.0, 4.0, 4.0]) * (std is not None)
+    schur = F[0, 0] - F[0, 1:] @ np.linalg.solve(F[1:, 1:], F[1:, 0])
+    assert found.kept == pytest.approx(schur / F[0, 0], rel=1e-10)
+
+
+def test_a_nuisance_that_moves_everything_alike_leaves_nothing(fields) -> None:
+    own = np.random.default_rng(3).normal(size=(len(fields.rest), 3))
+    S = np.stack([own, -3.0 * own], axis=-1)
+    found = information(replace(fields, sensitivity=S), parameters(2), None)[0]
+    assert found.kept == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_modulus_is_found_where_it_acts(case, fields) -> None:
+    found = information(fields, case[0]["parameters"], NOISE_MM)
+    assert [one.name for one in found] == ["E_f.anterior", "E_f.posterior"]
+    for one, leaflet in zip(found, NAMES, strict=True):
+        place, share = where_words(fields, one.raw, NAMES)[0]
+        # The made-up belly rises most in the middle of its leaflet.
+        assert place == f"belly of the {leaflet} leaflet"
+        assert share > 0.5
+
+
+def test_columns_belong_to_the_parameters_that_fit(case) -> None:
+    all_of_them = case[0]["parameters"]
+    assert [p["name"] for p in columns_of(all_of_them, 3)] == [p["name"] for p in all_of_them[:3]]
+    assert len(columns_of(all_of_them, 4)) == 4
+    assert columns_of(all_of_them, 2) == []
+
+
+def test_both_maps_of_a_modulus_have_one_scale(case, fields) -> None:
+    found = information(fields, case[0]["parameters"], NOISE_MM)
+    figure = information_figure(fields, found)
+    bars = [axes for axes in figure.axes if axes.get_xlabel() == "information per point"]
+    assert [axes.get_xlim()[1] for axes in bars] == pytest.approx(
+        [np.nanmax(one.raw) for one in found]
+    )
+
+
+# --- the other pictures -------------------------------------------------------------------------
+
+
+def test_a_valve_with_holes_is_drawn_without_them(fields) -> None:
+    figure = shapes_figure(fields, NAMES)
+    titles = [axes.get_title() for axes in figure.axes[:3]]
+    assert titles == ["open (reference)", "closed, observed", "closed, personalised model"]
+    counts = [len(faces(axes).get_paths()) for axes in figure.axes[:3]]
+    lost = np.isnan(fields.observed[0]).any(axis=1)[fields.triangles].any(axis=1).sum()
+    assert lost > 0
+    assert counts[0] == counts[2] > counts[1] + lost
+
+
+def test_triangles_are_split_where_leaflets_are_close() -> None:
+    """Four triangles for one, of the same area and with its colours between the corners."""
+    corner = np.array([[[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]])
+    parts = quartered(corner)
+    area = np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0])[:, 2] / 2
+    np.testing.assert_allclose(area, 2.0)
+    np.testing.assert_allclose(parts.mean(axis=(0, 1)), corner.mean(axis=(0, 1)))
+
+
+def test_panels_of_a_view_have_one_scale_in_mm(fields) -> None:
+    panels = shapes_figure(fields, NAMES).axes
+    for row in (panels[:3], panels[3:]):
+        assert len({axes.get_xlim() for axes in row}) == 1
+        assert len({axes.get_ylim() for axes in row}) == 1
+        assert all(axes.get_aspect() == 1.0 for axes in row)
+
+
+def test_intervals_are_where_the_record_has_them(case) -> None:
+    axes = estimates_figure(case[0]).axes[0]
+    lines = [line for line in axes.lines if len(line.get_xdata()) == 2]
+    ends = {tuple(np.round(line.get_xdata(), 3)) for line in lines}
+    # Prior 4 ± 1.96 x 2 and estimate 5.8 ± 1.96 x 0.8.
+    assert (0.08, 7.92) in ends
+    assert (4.232, 7.368) in ends
+    crosses = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "x"]
+    assert crosses == [6.2, 2.1]
+
+
+def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
+    axes = estimates_figure(case[0]).axes[1]
+    dots = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"]
+    # Slack 0.026 over 0.02; the pressure is only considered and has no estimate.
+    assert dots == pytest.approx([1.3])
+
+
+def test_iterations_that_fit_no_parameters_are_refused(case) -> None:
+    with pytest.raises(InputError, match="fit no choice"):
+        iterations_figure(case[0] | {"iterates": [[1.0, 2.0]]})
+    titles = [axes.get_title() for axes in iterations_figure(case[0]).axes]
+    assert len(titles) == 3
+
+
+def test_the_histogram_is_of_the_innovation(fields) -> None:
+    values = np.full_like(fields.innovation, 1.1)
+    left = innovation_figure(replace(fields, innovation=values)).axes[0]
+    highest = max(left.patches, key=lambda bar: bar.get_height())
+    assert highest.get_x() <= 1.1 <= highest.get_x() + highest.get_width()
+    assert sum(bar.get_height() * bar.get_width() for bar in left.patches) == pytest.approx(1.0)
+
+
+def test_the_map_of_the_innovation_is_its_rms(fields) -> None:
+    large = replace(fields, innovation=np.full_like(fields.innovation, 4.0))
+    figure = innovation_map_figure(large, NAMES)
+    assert figure.axes[-1].get_ylim()[1] == pytest.approx(4.0)
+
+
+def test_bars_of_distances_are_in_the_order_of_the_legend(case) -> None:
+    figure = distances_figure(case[0]["distances"])
+    axes = figure.axes[0]
+    heights = [[bar.get_height() for bar in group] for group in axes.containers if len(group) == 2]
+    expected = [
+        [d[name]["mean"] for d in case[0]["distances"]]
+        for name in ("generic", "registered", "personalised")
+    ]
+    assert heights[:3] == expected
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == ["closed\n(shown to the filter)", "late\n(held out)"]
+
+
+def test_what_narrows_most_is_on_top(case) -> None:
+    axes = narrow_figure(case[0]["narrow"]).axes[0]
+    widths = [bar.get_width() for bar in axes.patches]
+    # 0.71 and 0.5 over 0.8, in per cent; bars are counted from below.
+    assert widths == pytest.approx([88.75, 62.5])
+
+
+def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> None:
+    values = small(np.array([1.23456789, -0.004]))
+    assert values.dtype == np.float32
+    np.testing.assert_allclose(values, [1.23, 0.0], atol=1e-7)
+    # Without plotly's script, 480 vertices and 880 triangles in a dozen meshes.
+    markup = str(case_view(fields, NAMES).markup)
+    own = markup[markup.rindex("Plotly.newPlot") :]
+    assert '"f4"' in own
+    assert '"f8"' not in own
+    assert len(own) < 400_000

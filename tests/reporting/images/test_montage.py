@@ -1,0 +1,190 @@
+"""Slices with the valve drawn on: where the planes lie, and what is drawn where."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+
+from mvest.errors import GeometryError, InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.reporting.images.montage import LEAFLETS, chosen_frames, montage_figure
+from mvest.reporting.images.planes import (
+    COLUMNS,
+    leaflet_contours,
+    near,
+    resample,
+    valve_planes,
+)
+from tests import made_up_sequence
+
+
+@pytest.fixture(scope="module")
+def valve():
+    return made_up_sequence.sequence((1.0, 0.0), ValveLayout(64, 15))
+
+
+@pytest.fixture(scope="module")
+def volume(valve):
+    return made_up_sequence.volume(valve, spacing=1.2)
+
+
+def own_axes(points):
+    turn, place = made_up_sequence.pose()
+    return (points - place) @ turn
+
+
+def test_planes_are_right_handed_and_hold_what_they_are_named_for(valve):
+    planes = valve_planes(valve, 1)
+    assert tuple(planes) == COLUMNS
+    for plane in planes.values():
+        assert np.linalg.det(np.stack([plane.right, plane.up, plane.normal])) == pytest.approx(1)
+    layout, x = valve.layout, valve.vertices[1]
+    pair = x[[layout.vertex(0, 0), layout.vertex(180, 0)]]
+    middle = valve.tips[1].mean(axis=0)
+    for point in (*pair, middle):
+        assert abs(planes["commissural"].coordinates(point)[2]) < 1e-9
+    front_and_back = x[[layout.vertex(90, 0), layout.vertex(270, 0)]]
+    np.testing.assert_allclose(
+        planes["anteroposterior"].coordinates(front_and_back)[:, 2], 0, atol=1e-9
+    )
+    # phi = 0 and the anterior side are to the right and up, the atrium above, the tips below.
+    turn, _ = made_up_sequence.pose()
+    for name in COLUMNS[2:]:
+        assert planes[name].right @ turn[:, 0] > 0.99
+        assert planes[name].up @ turn[:, 1] > 0.99
+    assert planes["commissural"].right @ turn[:, 0] > 0.99
+    assert planes["anteroposterior"].right @ turn[:, 1] > 0.99
+    for name in COLUMNS[:2]:
+        assert planes[name].up @ turn[:, 2] > 0.9
+        assert planes[name].coordinates(middle)[1] < -15
+
+
+def test_the_lowest_slice_cuts_both_leaflets(valve):
+    for frame in (0, 1):
+        plane = valve_planes(valve, frame)["at the free edge"]
+        first, second = leaflet_contours(valve, frame, plane)
+        assert len(first) > 5
+        assert len(second) > 5
+        # The anterior leaflet is the upper one.
+        assert first[..., 1].mean() > second[..., 1].mean()
+
+
+def test_contours_lie_on_the_leaflets_and_the_volume_is_bright_there(valve, volume):
+    for name, plane in valve_planes(valve, 1).items():
+        extent = (-30.0, 30.0, -30.0, 30.0)
+        image = resample(volume, 1, plane, extent, step=0.5)
+        assert image.shape == (120, 120)
+        for segments in leaflet_contours(valve, 1, plane):
+            places = segments.mean(axis=1)
+            column = ((places[:, 0] + 30) / 0.5).astype(int)
+            row = ((places[:, 1] + 30) / 0.5).astype(int)
+            assert np.nanmedian(image[row, column]) > 3 * np.nanmedian(image), name
+
+
+def test_a_slice_shows_a_known_gradient(volume):
+    plane = valve_planes(made_up_sequence.sequence((1.0,)), 0)["at the annulus"]
+    count = np.array(volume.frames.shape[1:])
+    i = np.arange(count[0], dtype=np.float32)[:, None, None] * np.ones(count[1:], np.float32)
+    ramp = dataclasses.replace(volume, frames=i[None], times=volume.times[:1])
+    image = resample(ramp, 0, plane, (-4.0, 4.0, -3.0, 3.0), step=1.0)
+    assert image.shape == (6, 8)
+    for row, column in ((0, 0), (4, 6)):
+        at = plane.points(np.array(-3.5 + column), np.array(-2.5 + row))
+        assert image[row, column] == pytest.approx(volume.index(at)[0], rel=1e-5)
+    beyond = resample(ramp, 0, plane, (500.0, 504.0, 0.0, 4.0), step=1.0)
+    assert np.isnan(beyond).all()
+
+
+def test_near_the_plane(valve):
+    plane = valve_planes(valve, 0)["at the annulus"]
+    places, close = near(plane, plane.origin + np.outer([2.9, -2.9, 3.1], plane.normal), 3.0)
+    np.testing.assert_allclose(places, 0, atol=1e-9)
+    assert close.tolist() == [True, True, False]
+
+
+def test_positions_that_are_no_numbers_have_no_planes():
+    valve = made_up_sequence.sequence((1.0,), ValveLayout(16, 5))
+    valve.tips[0, 1] = np.nan
+    with pytest.raises(GeometryError, match="frame 0"):
+        valve_planes(valve, 0)
+
+
+def panel(figure, row, column):
+    return figure.axes[row * len(COLUMNS) + column]
+
+
+def drawn(axes, label):
+    return next(line for line in axes.lines if line.get_label() == label)
+
+
+def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volume):
+    valve = dataclasses.replace(valve, frame_confidence=np.array([0.9, 0.2]))
+    figure = montage_figure(volume, valve, title="made up", closed=0)
+    assert len(figure.axes) == 2 * len(COLUMNS)
+    assert [panel(figure, 0, k).get_title().split("\n")[0] for k in range(4)] == list(COLUMNS)
+    words = [panel(figure, row, 0).get_ylabel() for row in (0, 1)]
+    assert words[0] == "frame 0, 0 ms, closed\nconfidence 0.90"
+    assert words[1] == "frame 1, 40 ms\nconfidence 0.20\nLOW CONFIDENCE"
+    assert any("Confidence below 0.5 in 1 of 2 frames: 1." in t.get_text() for t in figure.texts)
+    axes = panel(figure, 1, 1)
+    # The open anterior leaflet in the middle section begins at its annulus, half of 28 mm away
+    # but for the flattening, and hangs down by most of its length.
+    lines = [c for c in axes.collections if isinstance(c, LineCollection)]
+    assert [line.get_label() for line in lines] == ["anterior", "posterior"]
+    places = np.concatenate(lines[0].get_segments())
+    assert places[:, 0].max() == pytest.approx(0.5 * (2 - 0.08) * 14, abs=0.3)
+    assert np.ptp(places[:, 1]) > 20
+    assert len({tuple(line.get_color()[0]) for line in lines}) == len(LEAFLETS)
+    assert len(axes.images) == 1
+    assert axes.images[0].get_extent() == [*axes.get_xlim(), *axes.get_ylim()]
+    tips = panel(figure, 1, 0)
+    assert len(drawn(tips, "tips").get_xdata()) == 2
+    assert len(drawn(axes, "tips").get_xdata()) == 0
+    # A saddle 6.5 mm high: most of the annulus is within 3 mm of its plane.
+    assert len(drawn(panel(figure, 1, 2), "annulus").get_xdata()) > 40
+    for column in range(4):
+        assert np.ptp(drawn(panel(figure, 0, column), "scale").get_xdata()) == pytest.approx(10.0)
+    # One scale in all panels of a column.
+    for column in range(4):
+        assert panel(figure, 0, column).get_xlim() == panel(figure, 1, column).get_xlim()
+
+
+def test_all_panels_have_one_scale(valve, volume):
+    figure = montage_figure(volume, valve, title="made up")
+    figure.draw_without_rendering()
+    per_mm = [axes.get_window_extent().width / np.ptp(axes.get_xlim()) for axes in figure.axes]
+    assert max(per_mm) / min(per_mm) < 1.03
+
+
+def test_a_frame_without_a_valve_keeps_its_row(volume):
+    valve = made_up_sequence.sequence((1.0, 0.0))
+    valve.vertices[1, 3] = np.nan
+    figure = montage_figure(volume, valve, title="made up")
+    assert len(figure.axes) == 2 * len(COLUMNS)
+    assert [t.get_text() for t in panel(figure, 1, 2).texts] == ["no valve"]
+    assert not panel(figure, 1, 2).images
+
+
+@pytest.mark.parametrize(
+    ("count", "closed", "expected"),
+    [
+        (1, None, [0]),
+        (4, None, [0, 1, 2, 3]),
+        (11, None, [0, 2, 4, 6, 8, 10]),
+        (11, 7, [0, 2, 4, 7, 8, 10]),
+        (11, 0, [0, 2, 4, 6, 8, 10]),
+        (101, 1, [0, 1, 40, 60, 80, 100]),
+    ],
+)
+def test_frames_are_even_and_hold_the_first_and_the_closed(count, closed, expected):
+    assert chosen_frames(count, closed) == expected
+
+
+def test_impossible_frames_are_refused(valve, volume):
+    for arguments in ((0, None), (3, 3), (3, -1), (3, None, 1)):
+        with pytest.raises(InputError, match="montage of"):
+            chosen_frames(*arguments)
+    other = dataclasses.replace(valve, times=np.array([0.0, 0.05]))
+    with pytest.raises(InputError, match="same times"):
+        montage_figure(volume, other, title="made up")

@@ -1,0 +1,217 @@
+"""A scenario at the estimate and at samples: statistics on a made-up valve, and a real one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import Gaussian, Identity, IteratedFilter, Prediction, observation_noise
+from mvest.mechanics.steps import Reason
+from mvest.scenarios import (
+    Clip,
+    Scenario,
+    measure_closed,
+    model_under,
+    posterior_samples,
+    predict,
+    predict_scenario,
+)
+from mvest.scenarios.measures import MEASURES, meaning_of
+from tests.scenarios.valves import NAMES, model
+
+SLOPE = np.array([[3.0, -1.0], [0.5, 2.0]])
+
+
+def estimated():
+    """N([6, 2], P) of two correlated parameters, whose model is linear."""
+    h = np.array([[1.0, 0.5], [0.0, 1.0]])
+    return IteratedFilter(1e-9)(
+        lambda m: Prediction(h @ m, h),
+        Gaussian.from_variance(np.array([6.0, 2.0]), np.array([100.0, 100.0])),
+        h @ np.array([6.0, 2.0]),
+        observation_noise(np.array([0.04, 0.01]), 2),
+        names=NAMES,
+        transform=Identity(),
+    )
+
+
+class Linear:
+    """A model whose one node moves linearly with the parameters."""
+
+    names = NAMES
+
+    def __init__(self, refuse=lambda m: None):
+        self.refuse = refuse
+        self.closed = "closed at the estimate"
+        self.starts = []
+
+    def restart(self, closed):
+        self.starts.append(closed)
+
+    def observed(self, x):
+        return x
+
+    def close(self, m, *, sensitivities):
+        reason = self.refuse(m)
+        if isinstance(reason, Exception):
+            raise reason
+        x = np.append(SLOPE @ m, 0.0)[None]
+        simulation = SimpleNamespace(
+            converged=reason is None,
+            reason=reason or Reason.COMPLETED,
+            frames=[x],
+            sensitivities=[np.concatenate([SLOPE.T, np.zeros((2, 1))], axis=1)[:, None]],
+        )
+        return SimpleNamespace(system="system", simulation=simulation)
+
+
+@pytest.fixture
+def linear(monkeypatch):
+    def measured(model, system, x, changes=None):
+        extra = sum((changes or {}).values())
+        return {"sum_mm": float(x.sum()), "first_mm": float(x[0, 0]), "load": 7.0 + extra}
+
+    monkeypatch.setattr(predict, "measure_closed", measured)
+    return Linear()
+
+
+def test_first_order_and_samples_agree_where_all_is_linear(linear):
+    estimate = estimated()
+    samples = posterior_samples(estimate, 512, 3)
+    found = predict_scenario(linear, estimate, samples)
+    P = estimate.covariance
+    for name, a in (("first_mm", SLOPE[0]), ("sum_mm", SLOPE.sum(axis=0)), ("load", np.ones(2))):
+        exact = float(np.sqrt(a @ P @ a))
+        assert found.first_order[name] == pytest.approx(exact, rel=1e-9)
+        if name != "load":
+            assert found.spread(name).std == pytest.approx(exact, rel=0.02)
+            # 512 points of a Sobol sequence: the mean is off by about 1/512 standard deviations.
+            centre = found.at_estimate.measures[name]
+            assert found.spread(name).mean == pytest.approx(centre, abs=0.01 * exact)
+    assert found.failures == ()
+    np.testing.assert_allclose(found.shape[0, :2], SLOPE @ estimate.mean)
+    # Every sample starts from the valve at the estimate and not from the sample before.
+    assert linear.starts == ["closed at the estimate"] * 512
+
+
+def test_failed_samples_are_told_and_not_dropped(linear):
+    estimate = estimated()
+    samples = posterior_samples(estimate, 16, 3)
+    order = np.sort(samples[:, 0])
+
+    def refuse(m):
+        if m[0] == order[-1]:
+            return MaterialError("E_f = -1 MPa, expected > 0")
+        return Reason.NO_CONVERGENCE if m[0] >= order[-3] else None
+
+    linear.refuse = refuse
+    found = predict_scenario(linear, estimate, samples)
+    assert len(found.samples) == 16
+    assert found.spread("sum_mm").count == 13
+    assert sorted(found.failures) == [
+        "E_f = -1 MPa, expected > 0",
+        Reason.NO_CONVERGENCE.value,
+        Reason.NO_CONVERGENCE.value,
+    ]
+    assert [s.failed for s in found.samples].count(True) == 3
+
+
+class Finer(Linear):
+    """The same, moved by 0.5 mm along x."""
+
+    def observed(self, x):
+        return x
+
+    def close(self, m, *, sensitivities):
+        result = super().close(m, sensitivities=sensitivities)
+        result.simulation.frames[0][0, 0] += 0.5
+        return result
+
+
+def test_intervals_carry_the_error_of_the_mesh(linear):
+    estimate = estimated()
+    samples = posterior_samples(estimate, 64, 3)
+    plain = predict_scenario(linear, estimate, samples)
+    assert np.isnan(plain.mesh_error("sum_mm"))
+    assert np.all(np.isnan(plain.interval("sum_mm")))
+    found = predict_scenario(linear, estimate, samples, finer=Finer())
+    assert found.mesh_error("first_mm") == pytest.approx(0.5)
+    centre, spread = found.at_estimate.measures["first_mm"], found.spread("first_mm")
+    low, high = found.interval("first_mm")
+    assert centre - low == pytest.approx(np.hypot(centre - spread.low, 1.96 * 0.5), rel=1e-4)
+    assert high - centre == pytest.approx(np.hypot(spread.high - centre, 1.96 * 0.5), rel=1e-4)
+    # Where the meshes agree, nothing is added: a load is 7 on both.
+    assert found.interval("load") == (7.0, 7.0)
+
+
+def test_only_measures_that_are_never_negative_have_no_negative_interval(linear, monkeypatch):
+    def measured(model, system, x, changes=None):
+        return {"gap_mm2": abs(x[0, 0] - 16), "tenting_height_mm": abs(x[0, 0] - 16)}
+
+    monkeypatch.setattr(predict, "measure_closed", measured)
+    estimate = estimated()
+    found = predict_scenario(linear, estimate, posterior_samples(estimate, 16, 3), finer=Finer())
+    assert found.mesh_error("gap_mm2") == pytest.approx(0.5)
+    assert found.interval("gap_mm2")[0] == 0.0
+    # Leaflets above the annulus have a negative tenting height.
+    assert found.interval("tenting_height_mm")[0] < 0
+    assert found.interval("gap_mm2")[1] == found.interval("tenting_height_mm")[1]
+
+
+def test_a_finer_mesh_that_does_not_close_leaves_the_error_unknown(linear):
+    estimate = estimated()
+    finer = Finer(lambda m: Reason.SINGULAR)
+    found = predict_scenario(linear, estimate, posterior_samples(estimate, 4, 3), finer=finer)
+    assert found.finer.reason == Reason.SINGULAR.value
+    assert np.all(np.isnan(found.interval("sum_mm")))
+
+
+def test_a_valve_that_does_not_close_at_the_estimate_is_a_result(linear):
+    linear.refuse = lambda m: Reason.SINGULAR
+    found = predict_scenario(linear, estimated(), posterior_samples(estimated(), 2, 1))
+    assert found.at_estimate.failed
+    assert found.at_estimate.reason == Reason.SINGULAR.value
+    assert found.shape is None
+    assert found.first_order == {}
+    assert len(found.failures) == 2
+
+
+def test_an_estimate_of_other_parameters_is_refused(linear):
+    linear.names = ("E_f.anterior", "chord_rest_length")
+    with pytest.raises(InputError, match="chord_rest_length"):
+        predict_scenario(linear, estimated(), np.zeros((2, 2)))
+
+
+@pytest.fixture(scope="module")
+def closed():
+    """The default anatomy, closed on a coarse mesh: without and with a clip."""
+    whole = model((24, 3), (64, 15), (96, 20))
+    found = {}
+    for scenario in (Scenario("as observed"), Scenario("clip", clip=Clip())):
+        changed = model_under(whole, scenario)
+        result = changed.close(np.array([6.23, 2.09]), sensitivities=True)
+        assert result.simulation.converged
+        found[scenario.title] = changed, result
+    return found
+
+
+def test_a_competent_valve_has_no_gap(closed):
+    changed, result = closed["as observed"]
+    measures = measure_closed(changed, result.system, result.simulation.frames[-1])
+    assert measures["gap_mm2"] == 0.0
+    assert measures["coaptation_length_mm"] > 2.0
+    assert 0 < measures["stress_p95_anterior_mpa"] < measures["stress_p99_anterior_mpa"]
+    assert measures["stress_p99_anterior_mpa"] < measures["stress_max_anterior_mpa"]
+    named = {name for name in MEASURES if "{}" not in name}
+    assert named < set(measures)
+    assert all(meaning_of(name) for name in measures)
+
+
+def test_a_clip_holds_the_leaflets_at_its_distance(closed):
+    changed, result = closed["clip"]
+    ties, x = result.system.ties, result.simulation.frames[-1]
+    # As stiff as it is, the clip gives way by less than a twentieth of a mm.
+    assert np.all(np.abs(ties.lengths(x) - changed.ties.length) < 0.05)
+    without = closed["as observed"][1].simulation.frames[-1]
+    assert np.any(ties.lengths(without) - changed.ties.length > 0.1)

@@ -1,0 +1,91 @@
+"""Peak stress against stresses that are known by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
+from mvest.mechanics.solid import Solid
+from mvest.mechanics.system import Parameter, System
+from mvest.scenarios.stress import _peaks, peak_stress, principal_cauchy
+from tests.mechanics.bodies import MATERIALS, block, rotation
+
+E, NU, STRAIN = 2.0, 0.3, 0.08
+SIZE = (4.0, 3.0, 2.0)
+
+
+def six(tensor, shear=1.0):
+    t = tensor
+    return np.array([t[0, 0], t[1, 1], t[2, 2], shear * t[1, 2], shear * t[0, 2], shear * t[0, 1]])
+
+
+def test_principal_stress_is_that_of_the_push_forward():
+    rng = np.random.default_rng(4)
+    f = np.eye(3) + 0.3 * rng.uniform(-1, 1, (3, 3))
+    s = rng.uniform(-1, 1, (3, 3))
+    s = s + s.T
+    cauchy = f @ s @ f.T / np.linalg.det(f)
+    green = 0.5 * (f.T @ f - np.eye(3))
+    found = principal_cauchy(six(green, 2.0)[None], six(s)[None])
+    np.testing.assert_allclose(found, [np.linalg.eigvalsh(cauchy)[-1]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
+def test_a_box_under_a_uniform_load_carries_load_over_current_area(element_type):
+    # Pulled along x: U = diag(1 + e, 1 - nu e, 1 - nu e), so the cross section is
+    # 3 * 2 * (1 - nu e)^2 mm^2 and carries N = E e * 6 mm^2 (Biot stress times area at rest).
+    # Turned, the peak is the same.
+    mesh = block(element_type, (2, 2, 1), SIZE)
+    law = BiotLaw.of((TransverselyIsotropic.isotropic(E, NU),))
+    system = System(Solid(mesh, law))
+    stretch = np.array([1 + STRAIN, 1 - NU * STRAIN, 1 - NU * STRAIN])
+    x = mesh.nodes * stretch @ rotation((1, 2, 3), 0.7).T
+    load = E * STRAIN * SIZE[1] * SIZE[2]
+    area = SIZE[1] * SIZE[2] * (1 - NU * STRAIN) ** 2
+    peak = peak_stress(system, x)["tissue"]
+    for value in (peak.p95, peak.p99, peak.largest):
+        assert value == pytest.approx(load / area, rel=1e-9)
+    # The load is what the box's end carries: the internal forces of its nodes add up to it.
+    state = system.solid.evaluate(x, system.solid.initial_strain(), 0.0)
+    forces = np.zeros_like(x)
+    np.add.at(forces, mesh.elements, system.solid.forces(state))
+    end = mesh.nodes[:, 0] > SIZE[0] - 1e-9
+    assert np.linalg.norm(forces[end].sum(axis=0)) == pytest.approx(load, rel=1e-9)
+
+
+def test_percentiles_are_of_the_volume_and_not_of_points():
+    # 94, 97 and 99.5 % of the volume lie below or at 1, 2 and 3 MPa.
+    values, volumes = np.array([3.0, 1.0, 4.0, 2.0]), np.array([2.5, 94.0, 0.5, 3.0])
+    peak = _peaks(values, volumes)
+    assert (peak.p95, peak.p99, peak.largest) == (2.0, 3.0, 4.0)
+
+
+def test_a_changed_modulus_changes_the_stress_as_the_law_does():
+    mesh = block("hex18", (2, 1, 1))
+    x = mesh.nodes * [1.05, 0.97, 0.99]
+    one = System(Solid(mesh, BiotLaw.of((MATERIALS["A"],))))
+    stiffer = System(Solid(mesh, BiotLaw(1.1 * one.solid.law.stiffness)))
+    by_change = peak_stress(one, x, {Parameter("E_f.tissue", 6.23): 0.623})
+    assert by_change["tissue"].p99 == pytest.approx(peak_stress(stiffer, x)["tissue"].p99)
+    assert by_change["tissue"].p99 > 1.05 * peak_stress(one, x)["tissue"].p99
+
+
+def test_a_small_part_under_high_stress_counts_by_its_volume():
+    # Two cells in a row, 39 and 1 of 40 parts of the volume, stretched by 1 % and 10 %: without
+    # lateral contraction the stresses are E e = 0.02 and 0.2 MPa. Half of the points lie in the
+    # small cell, but only 2.5 % of the volume.
+    mesh = block("hex18", (2, 1, 1), SIZE)
+    wide, half = 3.9, 0.5 * SIZE[0]
+    share = mesh.nodes[:, 0] / half
+    graded = np.where(share <= 1, wide * share, wide + (SIZE[0] - wide) * (share - 1))
+    nodes = np.column_stack([graded, mesh.nodes[:, 1:]])
+    system = System(
+        Solid(replace(mesh, nodes=nodes), BiotLaw.of((TransverselyIsotropic.isotropic(E, 0.0),)))
+    )
+    x = nodes.copy()
+    x[:, 0] = np.where(graded <= wide, 1.01 * graded, 1.01 * wide + 1.1 * (graded - wide))
+    peak = peak_stress(system, x)["tissue"]
+    assert peak.p95 == pytest.approx(0.01 * E, rel=1e-6)
+    assert peak.p99 == pytest.approx(0.1 * E, rel=1e-6)
+    assert peak.largest == pytest.approx(0.1 * E, rel=1e-6)

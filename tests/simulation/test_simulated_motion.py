@@ -1,0 +1,554 @@
+"""Simulated valves in motion: what closes, what is drawn, what is refused, and the file of them."""
+
+import pickle
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import GeometryError, InputError
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.problem.registration import REGISTRATION
+from mvest.simulation.motion import (
+    MotionLimits,
+    MotionSettings,
+    Population,
+    PopulationSettings,
+    Refusal,
+    RefusedError,
+    close_in_motion,
+    closing,
+    draw_population,
+    load_population,
+    population,
+    population_hash,
+    save_population,
+    simulate_imaged_patient,
+)
+from mvest.simulation.motion import patient as patients
+from mvest.simulation.motion.closing import ClosingFrames, frames_along, with_tip_motion
+from mvest.simulation.motion.refusal import check_motion
+from mvest.simulation.virtual_patient import Simulation
+from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
+from tests import made_up_closure
+from tests.made_up_closure import MadeUpClosure
+
+TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
+MECHANICS = MechanicsSettings(TISSUE, ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04))
+VALUES = {"E_f.anterior": 6.0, "E_f.posterior": 4.0, "pressure_scale": 1.1}
+SMALL = MotionSettings(
+    columns=32,
+    rows=9,
+    mesh_columns=16,
+    mesh_rows=2,
+    contact_columns=60,
+    contact_rows=16,
+    steps=6,
+    frames=5,
+    held_pressure=(0.8, 0.6),
+    held_relaxation=(0.1, 0.3),
+)
+TEMPLATE = Template()
+LAYOUT = ValveLayout(32, 9)
+TIP_MOTION = np.array([[0.5, -1.0, 1.5], [0.0, 1.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def valve():
+    """A valve that is closed in seconds."""
+    return close_in_motion("small", TEMPLATE, VALUES, SMALL, MECHANICS, TIP_MOTION)
+
+
+def still(name="still", vertices=None, layout=LAYOUT, frames=2):
+    """A valve that does not move, or in which the later frames are as given."""
+    rest = TEMPLATE.valve(layout.columns, layout.rows).surface.vertices
+    later = rest if vertices is None else vertices
+    tips = np.tile(TEMPLATE.papillary_tips, (frames, 1, 1))
+    return MovingValve(
+        name,
+        layout,
+        0.1 * np.arange(frames),
+        np.stack([rest, *[later] * (frames - 1)]),
+        tips,
+        np.ones(layout.size),
+        np.array([10.0, 200.0]),
+        np.array([0.5, 1.0]),
+        np.array([0, 1]),
+    )
+
+
+# --- closing ------------------------------------------------------------------------------------
+
+
+def test_a_motion_goes_from_the_open_valve_over_the_closed_one(valve):
+    assert valve.vertices.shape == (7, 288, 3)
+    np.testing.assert_allclose(valve.times, 0.35 * np.arange(7) / 6)
+    seen = TEMPLATE.valve(32, 9)
+    np.testing.assert_allclose(valve.vertices[0], seen.surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(valve.thickness, seen.surface.thickness)
+    middle = valve.vertices[:, [LAYOUT.vertex(phi, -1) for phi in (90, 270)]]
+    gap = np.linalg.norm(middle[:, 0] - middle[:, 1], axis=1)
+    # Free edges are 17 mm apart in the open valve; the closed one coapts.
+    assert gap[0] > 15
+    assert gap[4] < 6
+    # The annulus follows its boundary: closed, and a tenth of its way back.
+    start, end = seen.motion.annulus
+    for frame, back in ((4, 0.0), (5, 0.1), (6, 0.3)):
+        ring = valve.vertices[frame][LAYOUT.annulus]
+        # The hinge holds the annulus of a coarse mesh, whose edges are not those that are seen.
+        np.testing.assert_allclose(ring[::2], (end + back * (start - end))[::2], atol=0.15)
+
+
+def test_valves_lie_in_their_own_axes(valve):
+    ring = valve.vertices[0][LAYOUT.annulus]
+    assert abs(ring[:, 2].mean()) < 1.0
+    assert ring[LAYOUT.column(90), 1] > 10 > -10 > ring[LAYOUT.column(270), 1]
+    assert ring[LAYOUT.column(0), 0] > 10
+    assert valve.tips[0, 0, 0] > 10
+    assert valve.tips[..., 2].max() < -20
+    a, b, c = valve.vertices[0][LAYOUT.triangles].transpose(1, 0, 2)
+    # Out of the lumen and down: open leaflets hang like a funnel.
+    outward = np.cross(b - a, c - a)[:, :2] * (a[:, :2] - ring[:, :2].mean(axis=0))
+    assert (outward.sum(axis=1) > 0).mean() > 0.9
+
+
+def test_tips_move_while_the_valve_closes_and_return_with_it(valve):
+    closed = TEMPLATE.papillary_tips
+    np.testing.assert_allclose(valve.tips[0], closed + TIP_MOTION)
+    np.testing.assert_allclose(valve.tips[4], closed)
+    np.testing.assert_allclose(valve.tips[5], closed + 0.1 * TIP_MOTION)
+    np.testing.assert_allclose(valve.tips[6], closed + 0.3 * TIP_MOTION)
+    way = np.linalg.norm(valve.tips[:5] - valve.tips[4], axis=2)
+    assert np.all(np.diff(way, axis=0) <= 0)
+
+
+def test_chordae_are_where_those_of_the_template_are():
+    # One is absent, so that numbers beyond it shift.
+    parameters = TemplateParameters(chordae=ChordLayout(absent=((250.0, 256.0),)))
+    template = Template(parameters)
+    chordae = template.chordae()
+    phi, s, family, tip = template.chord_places()
+    assert len(phi) == len(TEMPLATE.chordae()) - 1
+    np.testing.assert_array_equal(template.position(phi, s), chordae.insertion)
+    np.testing.assert_array_equal(tip, chordae.tip)
+    np.testing.assert_array_equal(family, chordae.family)
+
+
+def test_chordae_of_a_motion_have_angles_of_the_layout(valve):
+    phi, s, _, tip = TEMPLATE.chord_places()
+    assert phi.min() < 0
+    assert valve.chord_phi.min() >= 0
+    assert valve.chord_phi.max() < 360
+    np.testing.assert_allclose(
+        TEMPLATE.position(valve.chord_phi, valve.chord_s), TEMPLATE.position(phi, s), atol=1e-9
+    )
+    np.testing.assert_array_equal(valve.chord_tip, tip)
+
+
+def test_a_valve_that_does_not_close_is_refused(monkeypatch):
+    monkeypatch.setattr(closing, "GIVE_UP", {"max_iterations": 1, "max_halvings": 0})
+    with pytest.raises(RefusedError, match="simulated valve soft: the closure") as refused:
+        close_in_motion("soft", TEMPLATE, VALUES, SMALL, MECHANICS)
+    assert refused.value.reason is Refusal.NOT_CLOSED
+
+
+def test_frames_are_chosen_evenly_along_the_way():
+    x = np.array([0.0, 0.1, 0.2, 5.0, 5.2, 9.0, 9.9, 10.0])
+    points = x[:, None, None] * np.ones((1, 4, 3))
+    np.testing.assert_array_equal(frames_along(points, 3), [0, 3, 7])
+    np.testing.assert_array_equal(frames_along(points, 2), [0, 7])
+    np.testing.assert_array_equal(frames_along(points, 8), np.arange(8))
+    # Every frame once, also where the nearest would be one that is taken.
+    snap = np.array([0.0, 9.0, 9.1, 9.2, 10.0])[:, None, None] * np.ones((1, 4, 3))
+    np.testing.assert_array_equal(frames_along(snap, 4), [0, 1, 2, 4])
+
+
+def test_tips_keep_where_they_end():
+    seen = TEMPLATE.valve(16, 3)
+    moved = with_tip_motion(seen, TIP_MOTION)
+    np.testing.assert_allclose(moved.motion.papillary_tips[-1], seen.papillary_tips)
+    np.testing.assert_allclose(moved.motion.papillary_tips[0], seen.papillary_tips + TIP_MOTION)
+    np.testing.assert_array_equal(moved.motion.papillary_tips[0], moved.papillary_tips)
+    with pytest.raises(InputError, match=r"shape \(3,\), expected \(2, 3\)"):
+        with_tip_motion(seen, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"held_pressure": (0.5,)}, "expected as many"),
+        ({"frames": 9}, "frames = 9 to the closed one, expected 2 to 8"),
+        ({"frames": 1}, "frames = 1"),
+        ({"duration": 0.0}, "duration of a motion = 0.0 s"),
+        ({"tolerance": -1.0}, "tolerance of a motion"),
+    ],
+)
+def test_settings_of_a_motion_are_checked(change, message):
+    with pytest.raises(InputError, match=message):
+        replace(SMALL, **change)
+
+
+# --- refusals -----------------------------------------------------------------------------------
+
+
+def reason_of(valve, limits):
+    with pytest.raises(RefusedError) as refused:
+        check_motion(valve, 1, limits)
+    assert str(refused.value).startswith(f"simulated valve still: {refused.value.reason.value} (")
+    return refused.value.reason
+
+
+def test_a_closed_valve_passes(valve):
+    check_motion(valve, 4, MotionLimits())
+
+
+def test_a_valve_that_stays_open_leaks():
+    assert reason_of(still(), MotionLimits()) is Refusal.LEAKS
+
+
+def test_free_edges_that_do_not_lie_at_each_other_are_apart():
+    assert reason_of(still(), MotionLimits(orifice=2.0)) is Refusal.APART
+
+
+def test_a_free_edge_above_the_annulus_flails():
+    rest = still().vertices[0]
+    up = rest * np.array([1, 1, -1.0])
+    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
+    assert reason_of(still(vertices=up), limits) is Refusal.FLAILS
+    check_motion(still(), 1, limits)
+
+
+def test_a_leaflet_that_is_much_longer_is_stretched():
+    rest = still().vertices[0]
+    assert (
+        reason_of(still(vertices=1.7 * rest), MotionLimits(orifice=5.0, edge_gap=50.0))
+        is Refusal.STRETCHED
+    )
+    check_motion(still(vertices=1.5 * rest), 1, MotionLimits(orifice=5.0, edge_gap=50.0))
+
+
+def test_leaflets_that_have_changed_sides_have_crossed():
+    x = still().vertices[0].copy()
+    s = LAYOUT.s[:, None]
+    # Free edges beyond the opposite ones.
+    x[:, 1:2] -= 2.0 * s * (x[:, 1:2] - 1.8)
+    limits = MotionLimits(orifice=2.0, edge_gap=50.0, stretch=10.0)
+    assert reason_of(still(vertices=x), limits) is Refusal.CROSSED
+
+
+@pytest.mark.parametrize(
+    "change", [{"orifice": 0.0}, {"edge_gap": 0.0}, {"stretch": 1.0}, {"crossings": -1}]
+)
+def test_limits_are_checked(change):
+    with pytest.raises(InputError, match="limits of a motion"):
+        MotionLimits(**change)
+
+
+# --- populations --------------------------------------------------------------------------------
+
+BASES = {"one": TemplateParameters(), "other": TemplateParameters(half_ap=15.0)}
+
+
+@pytest.fixture
+def closings(monkeypatch):
+    """What valves would be closed with; every third of the anatomy ``other`` is refused."""
+    calls = []
+
+    def close(name, template, values, settings, mechanics, tip_motion):
+        calls.append((name, template, values, settings, tip_motion))
+        if name.startswith("other") and len(calls) % 3 == 0:
+            raise RefusedError(name, Refusal.LEAKS, "a test")
+        found = still(name)
+        # Something by which valves can be told apart.
+        return replace(found, vertices=found.vertices * values["E_f.anterior"])
+
+    monkeypatch.setattr(population, "close_in_motion", close)
+    return calls
+
+
+def same_shape(one, other):
+    return [
+        np.array_equal(a.vertices, b.vertices)
+        for a, b in zip(one.valves, other.valves, strict=True)
+    ]
+
+
+def test_a_population_is_drawn_by_its_seed(closings):
+    def draw(seed, count=6):
+        return draw_population(count, seed, BASES, PopulationSettings(), MECHANICS)
+
+    one, same, other = draw(1), draw(1), draw(2)
+    assert [v.name for v in one.valves] == [v.name for v in same.valves]
+    assert sum(v.name.startswith("one") for v in one.valves) == 3
+    assert len({v.name for v in (*one.valves, *other.valves)}) == 12
+    assert one.settings_hash == same.settings_hash != other.settings_hash
+    alike = [
+        np.array_equal(a.vertices, b.vertices) for a, b in zip(one.valves, same.valves, strict=True)
+    ]
+    # What another valve is refused for does not change a valve.
+    not_refused = [v.name.startswith("one") for v in one.valves]
+    assert all(a for a, free in zip(alike, not_refused, strict=True) if free)
+    assert not any(same_shape(one, other))
+
+
+def test_refused_valves_are_drawn_again_and_counted(closings):
+    seen = []
+    drawn = draw_population(
+        6, 1, BASES, PopulationSettings(), MECHANICS, progress=lambda k, v: seen.append((k, v.name))
+    )
+    assert seen == list(enumerate(v.name for v in drawn.valves))
+    assert drawn.refused == {Refusal.LEAKS.value: len(closings) - 6}
+    assert len(closings) > 6
+    again = [k for k in range(1, len(closings)) if closings[k][0] == closings[k - 1][0]]
+    assert again
+    for k in again:
+        assert closings[k][1].parameters != closings[k - 1][1].parameters
+        assert closings[k][2] != closings[k - 1][2]
+
+
+def test_a_valve_that_is_always_refused_is_an_error(monkeypatch):
+    def refuse(name, *_):
+        raise RefusedError(name, Refusal.FLAILS, "a test")
+
+    monkeypatch.setattr(population, "close_in_motion", refuse)
+    with pytest.raises(GeometryError, match="one_1_000: refused 20 times"):
+        draw_population(1, 1, {"one": BASES["one"]}, PopulationSettings(), MECHANICS)
+
+
+def test_what_is_drawn_spreads_as_it_is_told(closings):
+    settings = PopulationSettings(tip_motion=(1.0, 3.0))
+    draw_population(60, 4, {"one": BASES["one"]}, settings, MECHANICS)
+    assert len(closings) == 60
+    for name, median, spread in (
+        ("E_f.anterior", 6.23, 0.35),
+        ("E_f.posterior", 2.09, 0.35),
+        ("pressure_scale", 1.0, 0.12),
+        ("chord_rest_length", 1.0, 0.015),
+    ):
+        found = np.log([values[name] / median for _, _, values, _, _ in closings])
+        # Four standard errors of a mean, and of a spread.
+        assert abs(found.mean()) < 4 * spread / np.sqrt(60)
+        assert found.std() == pytest.approx(spread, rel=4 / np.sqrt(120))
+    durations = np.log([motion.duration / 0.35 for _, _, _, motion, _ in closings])
+    assert durations.std() == pytest.approx(0.15, rel=4 / np.sqrt(120))
+    reach = np.linalg.norm([tips for *_, tips in closings], axis=2)
+    assert 1.0 <= reach.min() < 1.3
+    assert 2.7 < reach.max() <= 3.0
+    for _, template, _, _, tips in closings:
+        # Open tips are nearer to where their chordae insert.
+        chordae, closed = template.chordae(), template.papillary_tips
+        for k in range(2):
+            towards = (chordae.insertion[chordae.tip == k] - closed[k]).mean(axis=0)
+            assert tips[k] @ towards > 0
+
+
+def test_processes_change_nothing(monkeypatch):
+    def close(name, template, values, *_):
+        if values["E_f.anterior"] > 7:
+            raise RefusedError(name, Refusal.LEAKS, "a test")
+        # The first valve of two is the last to be ready.
+        time.sleep(0.05 * name.endswith("0"))
+        return replace(still(name), vertices=still().vertices * values["E_f.anterior"])
+
+    monkeypatch.setattr(population, "close_in_motion", close)
+    config = population.joblib.parallel_config
+    # Threads, as what is replaced here is not replaced in other processes.
+    monkeypatch.setattr(
+        population.joblib, "parallel_config", lambda **_: config(backend="threading")
+    )
+    one, two = (
+        draw_population(8, 3, BASES, PopulationSettings(), MECHANICS, processes=processes)
+        for processes in (1, 2)
+    )
+    assert one.refused == two.refused != {}
+    for a, b in zip(one.valves, two.valves, strict=True):
+        assert a.name == b.name
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+
+
+def test_what_goes_to_another_process_arrives_there(valve):
+    for sent in (BASES["one"], PopulationSettings(SMALL), MECHANICS):
+        assert pickle.loads(pickle.dumps(sent)) == sent
+    back = pickle.loads(pickle.dumps(valve))
+    np.testing.assert_array_equal(back.vertices, valve.vertices)
+    assert back.layout == valve.layout
+
+
+def test_the_hash_knows_everything_that_is_drawn_from():
+    known = population_hash(2, 1, BASES, PopulationSettings(), MECHANICS)
+    others = [
+        population_hash(3, 1, BASES, PopulationSettings(), MECHANICS),
+        population_hash(2, 2, BASES, PopulationSettings(), MECHANICS),
+        population_hash(2, 1, {"one": BASES["one"]}, PopulationSettings(), MECHANICS),
+        population_hash(2, 1, BASES, PopulationSettings(SMALL), MECHANICS),
+        population_hash(2, 1, BASES, PopulationSettings(), replace(MECHANICS, patch_radius=2.1)),
+    ]
+    assert len({known, *others}) == 6
+
+
+@pytest.mark.parametrize(
+    ("count", "bases", "processes"), [(0, BASES, 1), (1, {}, 1), (1, BASES, 0)]
+)
+def test_a_population_of_nothing_is_an_error(count, bases, processes):
+    with pytest.raises(InputError, match="expected at least one of each"):
+        draw_population(count, 1, bases, PopulationSettings(), MECHANICS, processes=processes)
+
+
+@pytest.mark.parametrize(
+    "change", [{"scale": (1.5, 1.0)}, {"tip_motion": (-1.0, 1.0)}, {"moduli_spread": -0.1}]
+)
+def test_settings_of_a_population_are_checked(change):
+    with pytest.raises(InputError, match=f"population {next(iter(change))}"):
+        PopulationSettings(**change)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drawn():
+    first = replace(still("first"), chord_phi=np.array([1.0]), chord_s=np.ones(1),
+                    chord_tip=np.array([1]))  # fmt: skip
+    return Population((first, still("second", frames=4)), {"leaks": 3}, "abc")
+
+
+def test_a_population_is_the_same_after_its_file(drawn, tmp_path):
+    path = tmp_path / "population.npz"
+    save_population(path, drawn)
+    assert [file.name for file in tmp_path.iterdir()] == ["population.npz"]
+    back = load_population(path)
+    assert back.refused == drawn.refused
+    assert back.settings_hash == "abc"
+    for a, b in zip(drawn.valves, back.valves, strict=True):
+        assert a.name == b.name
+        assert a.layout == b.layout
+        for part in ("times", "vertices", "tips", "thickness", "chord_phi", "chord_s"):
+            np.testing.assert_allclose(getattr(a, part), getattr(b, part), rtol=1e-6)
+            assert getattr(b, part).dtype == np.float64
+        np.testing.assert_array_equal(a.chord_tip, b.chord_tip)
+
+
+def test_valves_of_one_file_have_one_layout(drawn, tmp_path):
+    other = still(layout=ValveLayout(16, 3))
+    for valves, message in (((*drawn.valves, other), "2 layouts"), ((), "0 layouts")):
+        with pytest.raises(InputError, match=message):
+            save_population(tmp_path / "p.npz", replace(drawn, valves=valves))
+    named = still(layout=ValveLayout(16, 3, ("left", "right")))
+    with pytest.raises(InputError, match="regions left, right, expected anterior, posterior"):
+        save_population(tmp_path / "p.npz", replace(drawn, valves=(named,)))
+
+
+def test_a_file_that_cannot_be_written_is_said(drawn, tmp_path):
+    with pytest.raises(InputError, match="cannot write"):
+        save_population(tmp_path / "none" / "p.npz", drawn)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": np.array(99)}, "version: 99, expected 1"),
+        ({"names": np.array(["a", "a"])}, "names: 2 names, expected different ones"),
+        ({"layout": np.array([32, 9, 1])}, r"layout: shape \(3,\)"),
+        ({"frames": np.array([2, 3])}, r"times: shape \(6,\), expected \(5,\)"),
+        ({"frames": np.array([7, -1])}, "frames: expected a number for each of 2 valves"),
+        ({"chord_tip": np.array([0, 2, 1])}, "chord_tip: expected 0 and 1 only"),
+        ({"thickness": np.ones(3, np.float32)}, r"thickness: shape \(3,\)"),
+        ({"thickness": np.full(576, np.nan, np.float32)}, "thickness: not finite"),
+        ({"times": np.zeros(6, np.float32)}, "moving valve first: times"),
+        ({"times": np.zeros(6, int)}, "times: numbers of kind int64, expected f"),
+        ({"more": np.zeros(1)}, "holds .*more"),
+    ],
+)
+def test_a_file_that_is_not_as_it_must_be_is_refused(drawn, tmp_path, change, message):
+    path = tmp_path / "p.npz"
+    save_population(path, drawn)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(path, **{**arrays, **change})
+    with pytest.raises(InputError, match=message) as refused:
+        load_population(path)
+    assert str(path) in str(refused.value)
+
+
+def test_a_file_of_something_else_is_refused(drawn, tmp_path):
+    path = tmp_path / "p.npz"
+    with pytest.raises(InputError, match="no such file"):
+        load_population(path)
+    for content in (b"", b"nothing", pickle.dumps([1, 2])):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="not a readable"):
+            load_population(path)
+    save_population(path, drawn)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(InputError, match="not a readable"):
+        load_population(path)
+    np.savez(path, **{name: np.array([None]) for name in ("times",)})
+    with pytest.raises(InputError, match="holds times"):
+        load_population(path)
+
+
+# --- patients -----------------------------------------------------------------------------------
+
+SIMULATION = Simulation(
+    held_pressure_mmHg=(80.0,), held_relaxation=(0.2,), held_tips=(0.0, 0.0, 0.0)
+)
+HIDDEN = {**VALUES, "chord_stiffness": 0.9, "chord_rest_length": 1.01}
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """A patient whose fine closure is a formula and whose closing frames are halfway to it."""
+    closure = MadeUpClosure(tuple(HIDDEN))
+    rest = made_up_closure.VALVE.surface.vertices
+
+    def close(name, template, values, settings, mechanics, tip_motion):
+        assert values == HIDDEN
+        vertices = np.stack([rest * (1 - 0.01 * k) for k in range(4)])
+        tips = TEMPLATE.papillary_tips + np.linspace(1, 0, 4)[:, None, None] * tip_motion
+        return ClosingFrames(vertices, tips, closure, np.zeros(1))
+
+    def model(template, seen, contact, values, simulation, mechanics):
+        np.testing.assert_allclose(contact.motion.papillary_tips[0] - TIP_MOTION,
+                                   contact.motion.papillary_tips[1])  # fmt: skip
+        return closure
+
+    monkeypatch.setattr(patients, "closing_frames", close)
+    monkeypatch.setattr(patients, "patient_model", model)
+    wide = MotionLimits(2.0, 50.0, 50.0, 10.0, 100_000)
+    displaced = dict.fromkeys(REGISTRATION, 3.0)
+    simulation = replace(SIMULATION, contact_columns=32, contact_rows=9)
+    return simulate_imaged_patient(
+        "p", TEMPLATE, {**HIDDEN, **displaced}, simulation, replace(SMALL, limits=wide), MECHANICS,
+        TIP_MOTION,
+    )  # fmt: skip
+
+
+def test_an_imaged_patient_is_closed_as_a_patient_and_nowhere_displaced(made):
+    assert made.frames == ("open", "closing_1", "closing_2", "closed", "held_80_mmHg")
+    assert made.closed == 3
+    np.testing.assert_array_equal(made.pressure_mmHg, [0.0, np.nan, np.nan, 100.0, 80.0])
+    assert made.hidden.values == HIDDEN
+    rest = made_up_closure.VALVE.surface.vertices
+    np.testing.assert_array_equal(made.valve.vertices[0], rest)
+    np.testing.assert_array_equal(made.valve.vertices[1], 0.99 * rest)
+    # The formula, not the coarse closed frame.
+    np.testing.assert_allclose(made.valve.vertices[3], made_up_closure.shape(HIDDEN, 100.0))
+    for name, vertices in zip(made.frames, made.valve.vertices, strict=True):
+        np.testing.assert_array_equal(made.hidden.positions[name], vertices)
+
+
+def test_an_imaged_patient_has_moving_tips_and_stated_chordae(made):
+    closed = TEMPLATE.papillary_tips
+    for frame, share in ((0, 1.0), (1, 2 / 3), (2, 1 / 3), (3, 0.0), (4, 0.2)):
+        np.testing.assert_allclose(made.valve.tips[frame], closed + share * TIP_MOTION)
+    np.testing.assert_array_equal(made.stated.chordae.rest_length, TEMPLATE.chordae().rest_length)
+    assert made.stated.surface.vertices.shape == made.valve.vertices[0].shape
+
+
+def test_an_imaged_patient_is_in_equilibrium():
+    moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
+    with pytest.raises(InputError, match="equilibrium = False, expected True"):
+        simulate_imaged_patient("p", TEMPLATE, HIDDEN, SIMULATION, SMALL, moving)

@@ -1,0 +1,216 @@
+"""Virtual patients: what is drawn, what is seen, and what their case does not say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import Role
+from mvest.cases.folder import read_case
+from mvest.cases.writer import write_case
+from mvest.errors import GeometryError, InputError
+from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.mechanics.steps import NewtonSettings
+from mvest.problem.registration import REGISTRATION, displace
+from mvest.simulation import virtual_patient
+from mvest.simulation.virtual_patient import Deviations, Simulation, draw_hidden, simulate_patient
+from mvest.valve.anatomy.template import Template
+
+TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
+CLOSING = ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04, growth=2.0, end=0.4)
+MECHANICS = MechanicsSettings(TISSUE, CLOSING)
+MODULI = {"E_f.anterior": 6.0, "E_f.posterior": 4.0}
+TEMPLATE = Template()
+SMALL = Simulation(
+    columns=16,
+    rows=2,
+    dt_factor=1.0,
+    contact_columns=60,
+    contact_rows=16,
+    seen_columns=32,
+    seen_rows=9,
+    std_mm=0.4,
+    correlation_length_mm=8.0,
+    held_pressure_mmHg=(95.0,),
+    held_relaxation=(0.1,),
+)
+
+
+def make(values, simulation=SMALL, mechanics=MECHANICS, seed=3):
+    return simulate_patient(
+        "small", "d", TEMPLATE, values, simulation, mechanics, np.random.default_rng(seed)
+    )
+
+
+@pytest.fixture(scope="module")
+def values():
+    """True values with which 16 x 2 cells close in seconds."""
+    factors = {"pressure_scale": 1.03, "chord_stiffness": 1.1, "chord_rest_length": 1.01}
+    displacement = zip(REGISTRATION, (0.5, -0.2, 0.4, 1.0, -0.5, 0.5), strict=True)
+    return {**MODULI, **factors, **dict(displacement)}
+
+
+@pytest.fixture(scope="module")
+def patient(values):
+    return make(values)
+
+
+def test_what_is_hidden_is_drawn_by_the_seed():
+    one, same, other = (
+        draw_hidden(MODULI, Deviations(), np.random.default_rng(seed)) for seed in (1, 1, 2)
+    )
+    assert one == same
+    assert all(one[name] != other[name] for name in one if name not in MODULI)
+    assert {name: one[name] for name in MODULI} == MODULI
+    assert set(one) == {
+        *MODULI, "pressure_scale", "chord_stiffness", "chord_rest_length", *REGISTRATION
+    }  # fmt: skip
+
+
+def test_what_is_hidden_spreads_as_it_is_told():
+    rng = np.random.default_rng(0)
+    told = Deviations(0.1, 0.03, 0.25, 1.5, 4.0)
+    drawn = [draw_hidden(MODULI, told, rng) for _ in range(4000)]
+    stds = {
+        "pressure_scale": 0.1,
+        "chord_rest_length": 0.03,
+        "chord_stiffness": 0.25,
+        **{name: 1.5 if name.startswith("shift") else 4.0 for name in REGISTRATION},
+    }
+    columns = []
+    for name, std in stds.items():
+        found = np.array([values[name] for values in drawn])
+        # Factors are log-normal with the median one, so none is negative.
+        found = np.log(found) if name not in REGISTRATION else found
+        # Four standard errors: std / sqrt(n) of a mean, std / sqrt(2 n) of a spread.
+        assert abs(found.mean()) < 4 * std / np.sqrt(4000)
+        assert found.std() == pytest.approx(std, rel=4 / np.sqrt(8000))
+        columns.append(found)
+    # Nothing is drawn with anything else: correlations of 4000 pairs are below 4 / sqrt(4000).
+    assert np.abs(np.corrcoef(columns) - np.eye(9)).max() < 0.065
+
+
+def test_a_patient_is_seen_where_it_is_up_to_its_displacement_and_noise(patient, values):
+    case, hidden = patient.case, patient.hidden
+    assert hidden.values == values
+    assert [frame.name for frame in case.frames] == ["open", "closed", "held_95_mmHg"]
+    open_, closed, held = case.frames
+    assert [f.role for f in case.frames] == [Role.REFERENCE, Role.CLOSED, Role.HELD_OUT]
+    # The reference is exact: the model is made from it.
+    np.testing.assert_array_equal(open_.vertices, case.surface.vertices)
+    np.testing.assert_array_equal(hidden.positions["open"], case.surface.vertices)
+    # Without its displacement, the annulus of the seen valve is that of the boundary.
+    centre = closed.annulus.mean(axis=0)
+    registration = np.array([values[name] for name in REGISTRATION])
+    assert np.linalg.norm(registration[:3]) > 0.5
+    true = hidden.positions["closed"]
+    ring = true[case.annulus]
+    assert np.linalg.norm(ring - closed.annulus, axis=1).mean() > 0.3
+    undone = (ring - centre - registration[:3]) @ np.linalg.inv(turn_of(registration)).T + centre
+    # The hinge holds the annulus of a coarse mesh, whose edges are not those that are seen.
+    np.testing.assert_allclose(undone[::2], closed.annulus[::2], atol=0.15)
+    for frame in (closed, held):
+        error = frame.vertices - hidden.positions[frame.name]
+        assert 0.2 < error.std() < 0.6
+        np.testing.assert_array_equal(frame.free_edge, frame.vertices[case.free_edge])
+        assert frame.corresponds
+    assert held.time > closed.time > 0
+
+
+def turn_of(registration):
+    return displace(np.eye(3), np.array([0, 0, 0, *registration[3:]]), np.zeros(3)).T
+
+
+def test_the_boundary_is_tracked_without_the_displacement(patient):
+    open_, closed, held = patient.case.frames
+    motion = TEMPLATE.valve(32, 9).motion
+    np.testing.assert_array_equal(open_.annulus, motion.annulus[0])
+    np.testing.assert_array_equal(closed.annulus, motion.annulus[-1])
+    np.testing.assert_array_equal(closed.papillary_tips, motion.papillary_tips[-1])
+    # A tenth of the way back, and tips lifted by a tenth of 2 mm.
+    way = 0.9 * motion.annulus[-1] + 0.1 * motion.annulus[0]
+    np.testing.assert_allclose(held.annulus, way, atol=1e-12)
+    np.testing.assert_allclose(
+        held.papillary_tips, closed.papillary_tips + np.array([0.0, 0.0, 0.2])
+    )
+
+
+def test_what_a_case_states_is_not_what_is_true(patient, values):
+    open_, closed, held = patient.case.frames
+    assert (open_.pressure_mmHg, closed.pressure_mmHg, held.pressure_mmHg) == (0.0, 100.0, 95.0)
+    assert abs(values["pressure_scale"] - 1) > 0.005
+    stated = TEMPLATE.valve(32, 9).chordae
+    np.testing.assert_array_equal(patient.case.chordae.rest_length, stated.rest_length)
+    np.testing.assert_array_equal(patient.case.chordae.axial_stiffness, stated.axial_stiffness)
+    assert patient.case.simulated
+    assert patient.case.uncertainty.std_mm == 0.4
+    assert patient.case.uncertainty.correlation_length_mm == 8.0
+
+
+def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
+    # The same valve seen 60 times: closing it once is enough.
+    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    seen = TEMPLATE.valve(32, 9)
+    rng = np.random.default_rng(4)
+    errors = []
+    for _ in range(60):
+        case = virtual_patient._case("n", "d", seen, hidden, SMALL, MECHANICS, rng)
+        errors.append([frame.vertices - hidden[frame.name] for frame in case.frames[1:]])
+    errors = np.array(errors)
+    assert errors.std() == pytest.approx(0.4, rel=0.05)
+    # Frames and coordinates are independent of each other.
+    flat = errors.transpose(0, 2, 1, 3).reshape(-1, 6)
+    assert np.abs(np.corrcoef(flat.T) - np.eye(6)).max() < 0.15
+    # Neighbours are alike, vertices of other sides are not.
+    pair = errors[:, :, [0, 1, 16], :].reshape(60, 2, 3, 3)
+    alike = [np.mean(pair[:, :, 0] * pair[:, :, k]) / 0.16 for k in (1, 2)]
+    points = seen.surface.vertices
+    assert np.linalg.norm(points[0] - points[1]) < 8.0 < np.linalg.norm(points[0] - points[16]) / 3
+    assert alike[0] > 0.5
+    assert abs(alike[1]) < 0.2
+
+
+def test_a_patient_is_the_same_again(patient):
+    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    again = virtual_patient._case(
+        "small", "d", TEMPLATE.valve(32, 9), hidden, SMALL, MECHANICS, np.random.default_rng(3)
+    )
+    for one, other in zip(patient.case.frames, again.frames, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_a_patient_is_the_same_after_its_folder(patient, tmp_path):
+    case = patient.case
+    write_case(tmp_path / "case", case)
+    back = read_case(tmp_path / "case")
+    assert back.simulated
+    assert back.uncertainty.std_mm == case.uncertainty.std_mm
+    assert len(back.frames) == len(case.frames)
+    for one, other in zip(case.frames, back.frames, strict=True):
+        assert (one.name, one.role, one.corresponds) == (other.name, other.role, other.corresponds)
+        assert other.pressure_mmHg == pytest.approx(one.pressure_mmHg)
+        for part in ("vertices", "annulus", "papillary_tips"):
+            np.testing.assert_allclose(getattr(other, part), getattr(one, part), atol=1e-5)
+    np.testing.assert_allclose(back.chordae.rest_length, case.chordae.rest_length, atol=1e-6)
+    text = (tmp_path / "case" / "case.yaml").read_text()
+    for name in (*MODULI, "pressure_scale", "chord_stiffness", "shift.x"):
+        assert name not in text
+
+
+def test_a_valve_that_does_not_close_is_an_error(values):
+    newton = NewtonSettings(max_iterations=1)
+    fast = replace(CLOSING, ramp=1e-3, dt=1e-3, end=1e-3)
+    with pytest.raises(GeometryError, match="virtual patient small does not close"):
+        make(values, mechanics=MechanicsSettings(TISSUE, fast, newton=newton))
+
+
+@pytest.mark.parametrize(
+    ("pressures", "relaxations", "message"),
+    [
+        ((80.0, 60.0), (0.1,), "expected as many"),
+        ((80.0, 80.0), (0.1, 0.3), "expected different ones"),
+    ],
+)
+def test_frames_that_are_held_out_have_a_name_each(pressures, relaxations, message):
+    with pytest.raises(InputError, match=message):
+        Simulation(held_pressure_mmHg=pressures, held_relaxation=relaxations)

@@ -1,0 +1,341 @@
+"""The parametric valve: its parameters are its measurements, and its parts fit one another."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import GeometryError, InputError
+from mvest.valve.anatomy.template import (
+    ANTERIOR,
+    POSTERIOR,
+    ChordLayout,
+    Template,
+    TemplateParameters,
+)
+
+TEMPLATE = Template()
+DEFAULT = TEMPLATE.parameters
+OTHER = Template(
+    replace(DEFAULT, half_commissural=20.0, half_ap=15.5, length_anterior=27.0, saddle=4.0)
+)
+ALL_AROUND = np.arange(0.0, 360.0, 0.05)
+
+
+@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
+def test_the_annulus_has_the_diameters_and_the_height_of_the_parameters(template):
+    # Half ellipses: y from -half_ap to half_ap (1 - flattening), 14 + 12.88 = 26.88 mm by default.
+    p = template.parameters
+    x, y, z = template.annulus(ALL_AROUND).T
+    assert np.ptp(x) == pytest.approx(2 * p.half_commissural, rel=1e-5)
+    assert np.ptp(y) == pytest.approx(p.half_ap * (2 - p.flattening), rel=1e-5)
+    assert np.ptp(z) == pytest.approx(p.saddle, rel=1e-5)
+    # A saddle: its horns are the middles of the leaflets, towards the atrium.
+    middles = template.annulus(np.array([90.0, 270.0]))
+    np.testing.assert_allclose(middles[:, 2], 0.5 * p.saddle)
+    np.testing.assert_allclose(middles[:, 0], 0, atol=1e-12)
+    # The commissures are `commissure_angle` above the x axis, in the parameter of the ellipse.
+    x, y, _ = template.annulus(np.array([0.0]))[0]
+    angle = np.arctan2(y / (p.half_ap * (1 - p.flattening)), x / p.half_commissural)
+    assert np.degrees(angle) == pytest.approx(p.commissure_angle)
+
+
+def arc(template, phi):
+    """Length of a leaflet from annulus to free edge along the surface."""
+    line = template.position(np.full(4001, phi), np.linspace(0, 1, 4001))
+    return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
+def test_leaflets_have_the_length_of_the_parameters(template):
+    # A parabola of sagitta d over a chord L is L (1 + 8/3 (d/L)^2 - 32/5 (d/L)^4) long; d = 0.04 L
+    # gives 1.00425 L.
+    p = template.parameters
+    factor = 1 + 8 / 3 * p.bulge**2 - 32 / 5 * p.bulge**4
+    assert factor == pytest.approx(1.00425, abs=1e-5)
+    for phi, length in ((90.0, p.length_anterior), (270.0, p.length_posterior),
+                        (0.0, p.length_commissure), (180.0, p.length_commissure)):  # fmt: skip
+        assert arc(template, phi) == pytest.approx(factor * length, rel=1e-5)
+
+
+def test_the_open_free_edge_has_the_depths_of_the_parameters():
+    middle = TEMPLATE.position(np.array([90.0, 270.0]), np.ones(2))
+    np.testing.assert_allclose(middle[:, 1], [1.83 + 6.5, 1.83 - 10.5], atol=1e-9)
+    corner = TEMPLATE.position(np.array([0.0, 180.0]), np.ones(2))
+    np.testing.assert_allclose(corner[:, :2], [[15.5, 1.83], [-15.5, 1.83]], atol=1e-9)
+    # Vertices are spread evenly along each leaflet's edge: no segment is far from the mean.
+    for start in (0.0, 180.0):
+        edge = TEMPLATE.position(start + np.linspace(0, 180, 57), np.ones(57))[:, :2]
+        step = np.linalg.norm(np.diff(edge, axis=0), axis=1)
+        assert step.max() / step.min() < 1.05
+
+
+def test_the_default_surface_is_a_band_of_3248_vertices():
+    surface = TEMPLATE.valve().surface
+    assert surface.vertices.shape == (3248, 3)
+    assert surface.triangles.shape == (2 * 112 * 28, 3)
+    # Every edge is run through once in each direction, except along the two rims: consistently
+    # oriented and manifold. A band has Euler characteristic V - E + F = 0.
+    t = surface.triangles
+    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    undirected, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    assert set(count) == {1, 2}
+    assert 3248 - len(undirected) + len(t) == 0
+    rim = set(map(tuple, undirected[count == 1].tolist()))
+    valve = TEMPLATE.valve()
+    for loop in (valve.annulus, valve.free_edge):
+        pairs = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
+        assert set(map(tuple, pairs.tolist())) <= rim
+    assert len(rim) == 2 * 112
+    np.testing.assert_array_equal(valve.motion.annulus[0], surface.vertices[valve.annulus])
+    assert np.bincount(surface.region).tolist() == [112 * 28, 112 * 28]
+
+
+@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
+def test_normals_point_to_the_ventricle(template):
+    # The open leaflets are a funnel hanging from the annulus; blood flows through it, and the
+    # ventricle's blood is around it: outwards. The pressure of the ventricle pushes against them.
+    surface = template.valve().surface
+    axis = np.array([0.0, template.parameters.edge_y, 0.0])
+    outwards = (surface.vertices - axis) * [1, 1, 0]
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    assert np.einsum("ki,ki->k", surface.normals, outwards).min() > 0.2
+    # The smooth normals of the template are those of the triangles, and of the thickness.
+    j, i = (v.ravel() for v in np.meshgrid(np.arange(29), np.arange(112), indexing="ij"))
+    phi, s = 360 * i / 112, j / 28
+    cosine = np.einsum("ki,ki->k", template.normal(phi, s), surface.normals)
+    assert np.median(cosine) > 0.999
+    assert cosine.min() > 0.8
+    t, r = template.tangents(phi, s)
+    assert np.all(np.einsum("ki,ki->k", np.cross(r, t), template.normal(phi, s)) > 0)
+    top, bottom = template.position(phi, s, 1.0), template.position(phi, s, -1.0)
+    np.testing.assert_allclose(
+        np.linalg.norm(top - bottom, axis=1), template.thickness(phi, s), rtol=1e-12
+    )
+    assert np.all(np.einsum("ki,ki->k", top - bottom, surface.normals) > 0)
+
+
+@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
+def test_the_valve_is_its_own_mirror_image(template):
+    random = np.random.default_rng(2)
+    phi, s, zeta = (
+        random.uniform(0, 360, 300),
+        random.uniform(0, 1, 300),
+        random.uniform(-1, 1, 300),
+    )
+    here, there = template.position(phi, s, zeta), template.position(180 - phi, s, zeta)
+    np.testing.assert_allclose(there, here * [-1, 1, 1], atol=1e-10)
+    np.testing.assert_allclose(template.thickness(180 - phi, s), template.thickness(phi, s))
+    chordae = template.chordae()
+    half = len(chordae) // 2
+    np.testing.assert_allclose(
+        chordae.insertion[half:], chordae.insertion[:half] * [-1, 1, 1], atol=1e-10
+    )
+    np.testing.assert_allclose(chordae.rest_length[half:], chordae.rest_length[:half])
+    np.testing.assert_array_equal(
+        template.papillary_tips[1], template.papillary_tips[0] * [-1, 1, 1]
+    )
+
+
+def test_thickness_is_the_papers_and_tapers_to_three_quarters():
+    phi, s = np.array([90.0, 270.0, 90.0, 270.0, 90.0, 0.0]), np.array([0, 0, 1, 1, 0.75, 0.0])
+    # Half way of the taper, which begins at s = 1/2: 1 - 0.25 / 2. At a commissure: the mean.
+    expected = [1.32, 1.26, 0.75 * 1.32, 0.75 * 1.26, 0.875 * 1.32, 1.29]
+    np.testing.assert_allclose(TEMPLATE.thickness(phi, s), expected, rtol=1e-12)
+
+
+def test_fibres_are_unit_tangents_parallel_to_the_annulus():
+    j, i = (v.ravel() for v in np.meshgrid(np.arange(1, 24), np.arange(97), indexing="ij"))
+    phi, s = 180 * i / 96, j / 24
+    for region, start in ((ANTERIOR, 0.0), (POSTERIOR, 180.0)):
+        t, r = TEMPLATE.tangents(start + phi, s)
+        fibre = TEMPLATE.fibre(start + phi, s, np.full(len(phi), region))
+        normal = np.cross(r, t)
+        np.testing.assert_allclose(np.linalg.norm(fibre, axis=1), 1, atol=1e-12)
+        np.testing.assert_allclose(np.einsum("ki,ki->k", fibre, normal), 0, atol=1e-12)
+        if region == POSTERIOR:
+            np.testing.assert_allclose(np.abs(np.einsum("ki,ki->k", fibre, t)), 1, atol=1e-12)
+    # At the annulus itself, "parallel" is measurable without the template's own tangents.
+    at = np.array([200.0, 270.0, 330.0, 90.0, 70.0])
+    along = TEMPLATE.annulus(at + 0.01) - TEMPLATE.annulus(at - 0.01)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    fibre = TEMPLATE.fibre(at, np.zeros(5), np.array([1, 1, 1, 0, 0]))
+    np.testing.assert_allclose(np.abs(np.einsum("ki,ki->k", fibre, along)), 1, atol=1e-5)
+
+
+def test_anterior_fibres_turn_until_they_are_perpendicular_at_the_commissures():
+    # They turn over 0.23 x 180 = 41.4 degrees by a smooth step: 90, 45 and 0 degrees from the
+    # annulus at 0, 20.7 and 41.4 degrees from the commissure, on both sides.
+    for phi, angle in ((0.0, 90), (20.7, 45), (41.4, 0), (90.0, 0), (159.3, 45), (180.0, 90)):
+        at, s, region = np.array([phi]), np.array([0.4]), np.array([ANTERIOR])
+        t, _ = TEMPLATE.tangents(at, s)
+        cosine = abs(float((TEMPLATE.fibre(at, s, region) @ t.T)[0, 0]))
+        assert np.degrees(np.arccos(min(cosine, 1.0))) == pytest.approx(angle, abs=1e-4)
+
+
+@pytest.mark.parametrize("template", [TEMPLATE, OTHER])
+def test_chordae_are_the_same_material_points_of_every_valve(template):
+    chordae, layout = template.chordae(), template.parameters.chordae
+    assert np.bincount(chordae.family).tolist() == [28, 6]
+    assert np.bincount(chordae.tip).tolist() == [17, 17]
+    phi = np.array([*layout.marginal_phi, *(phi for phi, _ in layout.basal)])
+    s = np.array([layout.marginal_s] * 14 + [s for _, s in layout.basal])
+    np.testing.assert_allclose(
+        chordae.insertion,
+        np.concatenate([template.position(phi, s), template.position(180 - phi, s)]),
+        atol=1e-12,
+    )
+    # From the tip of their own side, and slack in the open valve by `open_slack` at least.
+    tips = template.papillary_tips[chordae.tip]
+    assert np.all(tips[:, 0] * chordae.insertion[:, 0] >= -1e-9)
+    opened = np.linalg.norm(chordae.insertion - tips, axis=1)
+    assert np.all(chordae.rest_length >= layout.open_slack * opened * (1 - 1e-12))
+    assert layout.open_slack > 1
+    np.testing.assert_array_equal(np.unique(chordae.axial_stiffness), [16.0, 20.0])
+
+
+def test_chordae_move_with_the_anatomy():
+    moved = OTHER.chordae().insertion - TEMPLATE.chordae().insertion
+    assert np.linalg.norm(moved, axis=1).max() > 1.0
+    assert (
+        len(Template(TemplateParameters(chordae=ChordLayout(basal=((50.0, 0.5),)))).chordae()) == 30
+    )
+
+
+def test_rest_lengths_lead_to_the_intended_closed_line():
+    # A marginal chord that is not kept slack has 0.985 of the distance from its tip to the point
+    # of the coaptation line; put s = 1 and take the middle of the anterior edge (x = 0):
+    # y = 1.83 - 7.19, z = -10.9, x = 0.
+    layout = ChordLayout(marginal_phi=(90.0,), basal=(), marginal_s=1.0, open_slack=0.1)
+    chordae = Template(replace(DEFAULT, chordae=layout)).chordae()
+    target = np.array([0.0, 1.83 - 7.19, -10.9])
+    expected = 0.985 * np.linalg.norm(target - np.array(DEFAULT.tips))
+    assert chordae.rest_length[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_chordae_of_a_range_are_elongated_and_those_of_no_other():
+    # Insertions on the posterior leaflet are at negative degrees of the layout (-60 is 300 of the
+    # whole valve) and, mirrored, at 180 + their angle (240): only the first is in 290 to 310.
+    layout = ChordLayout(marginal_phi=(-60.0, 50.0), basal=((-60.0, 0.5),))
+    plain = Template(replace(DEFAULT, chordae=layout)).chordae()
+    longer = replace(layout, elongated=((290.0, 310.0, 1.2), (295.0, 305.0, 1.1)))
+    chordae = Template(replace(DEFAULT, chordae=longer)).chordae()
+    # Ranges that overlap multiply: 1.2 x 1.1 = 1.32.
+    np.testing.assert_allclose(
+        chordae.rest_length / plain.rest_length, [1.32, 1, 1.32, 1, 1, 1], rtol=1e-12
+    )
+    np.testing.assert_array_equal(chordae.insertion, plain.insertion)
+    # The same range, named by other multiples of 360 degrees.
+    again = replace(layout, elongated=((-70.0, -50.0, 1.32),))
+    np.testing.assert_allclose(
+        Template(replace(DEFAULT, chordae=again)).chordae().rest_length, chordae.rest_length
+    )
+
+
+def test_absent_chordae_are_missing_and_the_others_are_as_before():
+    layout = replace(DEFAULT.chordae, absent=((235.0, 262.0),))
+    plain, chordae = TEMPLATE.chordae(), Template(replace(DEFAULT, chordae=layout)).chordae()
+    # Spacing 175 / 13 = 13.46 degrees from -87: the mirrored ones are at 180 + 87, 73.5, 60.1 and
+    # 46.6 degrees, of which 253.5 and 240.1 lie in the range, as does the basal chord at 240.
+    assert len(plain) - len(chordae) == 3
+    assert np.bincount(chordae.tip).tolist() == [17, 14]
+    kept = [k for k, at in enumerate(plain.insertion) if at.tolist() in chordae.insertion.tolist()]
+    for name in ("tip", "insertion", "family", "rest_length", "axial_stiffness"):
+        np.testing.assert_array_equal(getattr(plain, name)[kept], getattr(chordae, name))
+
+
+def test_a_valve_without_any_chord_is_refused():
+    layout = ChordLayout(marginal_phi=(10.0,), basal=(), absent=((0.0, 20.0), (160.0, 180.0)))
+    with pytest.raises(InputError, match="none is left"):
+        Template(replace(DEFAULT, chordae=layout)).chordae()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"elongated": ((225.0, 315.0),)},
+        {"elongated": ((315.0, 225.0, 1.1),)},
+        {"elongated": ((225.0, 315.0, 0.0),)},
+        {"absent": ((225.0,),)},
+        {"absent": ((315.0, 225.0),)},
+    ],
+)
+def test_ranges_of_chordae_that_mean_nothing_are_refused(wrong):
+    (name, ranges), *_ = wrong.items()
+    with pytest.raises(InputError, match=rf"{name} chordae \({ranges[0][0]}"):
+        ChordLayout(**wrong)
+
+
+def test_displaced_tips_tether_because_the_chordae_do_not_follow():
+    shift = (3.0, -1.0, -5.0)
+    plain = TEMPLATE.chordae()
+    template = Template(replace(DEFAULT, tips_displacement=shift))
+    chordae = template.chordae()
+    # Outward on both sides, and down.
+    moved_by = template.papillary_tips - TEMPLATE.papillary_tips
+    np.testing.assert_allclose(moved_by, [[3, -1, -5], [-3, -1, -5]], atol=1e-12)
+    for tips in template.valve(24, 5).motion.papillary_tips:
+        np.testing.assert_array_equal(tips, template.papillary_tips)
+    opened = np.linalg.norm(chordae.insertion - template.papillary_tips[chordae.tip], axis=1)
+    # Rest lengths are those for the tips before, unless these would be taut in the open valve ...
+    expected = np.maximum(plain.rest_length, DEFAULT.chordae.open_slack * opened)
+    np.testing.assert_allclose(chordae.rest_length, expected, rtol=1e-12)
+    # ... and so they are shorter than those made for where the tips are now.
+    moved = tuple(np.add(DEFAULT.tips, shift))
+    adapted = Template(replace(DEFAULT, tips=moved)).chordae()
+    assert np.all(chordae.rest_length <= adapted.rest_length + 1e-12)
+    assert (adapted.rest_length - chordae.rest_length).mean() > 1.0
+
+
+@pytest.mark.parametrize("name", ["tips", "tips_displacement"])
+def test_a_place_of_the_tips_needs_three_numbers(name):
+    with pytest.raises(InputError, match=rf"template {name} = \(1.0, 2.0\), expected \(x, y, z\)"):
+        TemplateParameters(**{name: (1.0, 2.0)})
+
+
+def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
+    motion = TEMPLATE.valve().motion
+    start, end = motion.annulus
+    np.testing.assert_allclose(np.ptp(end, axis=0) / np.ptp(start, axis=0), [0.992, 0.936, 1.0])
+    assert 1 - np.ptp(end[:, 1]) / np.ptp(start[:, 1]) == pytest.approx(0.064)
+    np.testing.assert_array_equal(motion.papillary_tips[0], motion.papillary_tips[1])
+    np.testing.assert_array_equal(motion.papillary_tips[0], TEMPLATE.papillary_tips)
+    assert motion.phase.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [("length_anterior", "90"), ("length_posterior", "270"), ("length_commissure", None)],
+)
+def test_a_leaflet_that_cannot_reach_its_free_edge_is_refused(name, place):
+    template = Template(replace(DEFAULT, **{name: 1.5}))
+    where = rf"at phi = {place} degrees is 1\.5" if place else "at phi = "
+    with pytest.raises(GeometryError, match=rf"{where}.* mm long and cannot reach its free edge"):
+        template.valve(24, 5)
+
+
+POSITIVE = ("half_commissural", "half_ap", "length_anterior", "length_posterior", "taper",
+            "length_commissure", "edge_half_width", "thickness_anterior", "thickness_posterior",
+            "closed_half_width")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POSITIVE)
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_inadmissible_parameters_are_refused(name, value):
+    with pytest.raises(InputError, match=rf"template {name} = {value}, expected > 0"):
+        TemplateParameters(**{name: value})
+
+
+@pytest.mark.parametrize("size", [(6, 5), (15, 5), (16, 2)])
+def test_too_coarse_a_sampling_is_refused(size):
+    with pytest.raises(InputError, match=f"template of {size[0]} x {size[1]} vertices"):
+        TEMPLATE.valve(*size)
+
+
+def test_any_sampling_is_of_the_same_valve():
+    coarse, fine = TEMPLATE.valve(56, 15), TEMPLATE.valve(112, 29)
+    every = fine.surface.vertices.reshape(29, 112, 3)[::2, ::2].reshape(-1, 3)
+    np.testing.assert_allclose(coarse.surface.vertices, every, atol=1e-12)
+    np.testing.assert_array_equal(coarse.chordae.insertion, fine.chordae.insertion)
+    np.testing.assert_array_equal(coarse.chordae.rest_length, fine.chordae.rest_length)

@@ -1,0 +1,111 @@
+"""Random anatomies are valves, of plausible sizes, and the same for the same seed."""
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
+from mvest.valve.anatomy.variation import MOST_REFUSED, draw_variation, vary
+from mvest.valve.mesh.structured import structured_mesh
+
+DEFAULT = TemplateParameters()
+DRAWN = [vary(DEFAULT, np.random.default_rng(seed)) for seed in range(200)]
+
+
+def drawn(name):
+    return np.array([getattr(p, name) for p in DRAWN])
+
+
+def test_every_seed_gives_a_valve_that_can_be_meshed():
+    for p in DRAWN:
+        assert np.all(Template(p).valve(24, 5).surface.thickness > 0)
+    for p in DRAWN[:5]:
+        structured_mesh(Template(p), "hex18", 24, 3)  # refuses elements that are inside out
+
+
+def test_annuli_are_within_the_range_of_normal_valves():
+    # Two standard deviations around the means: 24 - 2 x 3 to 30.8 + 2 x 4.4 mm between anterior
+    # and posterior, 35.1 -+ 2 x 4.9 mm between the commissures.
+    ap = drawn("half_ap") * (2 - DEFAULT.flattening)
+    commissural = 2 * drawn("half_commissural")
+    assert ap.min() > 18.0
+    assert ap.max() < 39.6
+    assert commissural.min() > 25.3
+    assert commissural.max() < 44.9
+    # About half of the reported 12 to 14 %: size 5 % and 3.5 or 3 % along a direction, their
+    # normal tails cut at two standard deviations (which leaves 0.88 of the deviation).
+    for values, own in ((ap, 0.035), (commissural, 0.03)):
+        expected = 0.88 * np.hypot(0.05, own)
+        assert np.log(values).std() == pytest.approx(expected, rel=0.2)
+
+
+def test_no_leaflet_gets_farther_than_11_percent_and_no_tip_out_of_its_range():
+    # Half of (5 + 3.5) % and 1 % of its own, at two standard deviations: 10.5 % in the logarithm.
+    for name in ("length_anterior", "length_posterior"):
+        ratio = drawn(name) / getattr(DEFAULT, name)
+        assert np.abs(np.log(ratio)).max() < 0.105
+        assert np.ptp(np.log(ratio)) > 0.105
+    x, _, z = drawn("tips").T
+    assert x.min() > 13.0
+    assert x.max() < 19.1
+    assert np.all(z < -20.0)
+    assert np.all(drawn("ap_contraction") > 0)
+
+
+def test_a_larger_annulus_has_longer_leaflets_and_a_wider_edge():
+    for one, other, least in (
+        ("half_ap", "length_anterior", 0.8),
+        ("half_ap", "edge_posterior", 0.7),
+        ("half_commissural", "edge_half_width", 0.999),
+        ("thickness_anterior", "thickness_posterior", 0.999),
+    ):
+        assert np.corrcoef(drawn(one), drawn(other))[0, 1] > least
+    assert abs(np.corrcoef(drawn("thickness_anterior"), drawn("half_ap"))[0, 1]) < 0.25
+
+
+def test_the_seed_decides_and_the_given_valve_is_the_middle():
+    assert vary(DEFAULT, np.random.default_rng(7)) == DRAWN[7]
+    assert DRAWN[7] != DRAWN[8]
+    assert vary(DEFAULT, np.random.default_rng(7), scale=0.0) == DEFAULT
+    # Seven standard errors of 200 draws of a deviation of at most 11 %.
+    for name, value in asdict(DEFAULT).items():
+        if isinstance(value, float):
+            middle = np.median(drawn(name))
+            assert middle == pytest.approx(value, rel=7 * 1.25 * 0.15 / np.sqrt(200))
+
+
+def test_twice_the_scale_is_twice_the_deviation():
+    once, twice = (
+        np.log(vary(DEFAULT, np.random.default_rng(3), scale).half_ap / DEFAULT.half_ap)
+        for scale in (1.0, 2.0)
+    )
+    assert twice == pytest.approx(2 * once)
+
+
+def test_what_is_ill_stays_ill():
+    layout = ChordLayout(elongated=((225.0, 315.0, 1.1),), absent=((250.0, 256.0),))
+    ill = replace(DEFAULT, chordae=layout, tips_displacement=(3.0, 0.0, -5.0))
+    varied = vary(ill, np.random.default_rng(1))
+    assert varied.chordae == layout
+    assert varied.tips_displacement == ill.tips_displacement
+
+
+def test_shapes_that_are_no_valve_are_drawn_again_and_counted():
+    # The posterior edge is 14 + 1.83 - 10.5 = 5.33 mm from the annulus: a leaflet of 5.5 mm reaches
+    # it barely, and about every third one that is drawn does not.
+    p = replace(DEFAULT, length_posterior=5.5)
+    counts = [draw_variation(p, np.random.default_rng(seed)).refused for seed in range(10)]
+    assert any(counts)
+    for seed in range(10):
+        Template(vary(p, np.random.default_rng(seed))).valve(24, 5)
+
+
+def test_a_scale_that_leaves_no_valve_or_none_at_all_is_refused():
+    for scale in (-1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match=f"scale of a variation = {scale}"):
+            vary(DEFAULT, np.random.default_rng(0), scale)
+    hopeless = replace(DEFAULT, length_anterior=3.0)
+    with pytest.raises(InputError, match=f"{MOST_REFUSED} shapes in a row"):
+        vary(hopeless, np.random.default_rng(0))

@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+
+from mvest.errors import GeometryError
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.surfaces import (
+    FACE_KINDS,
+    check_surface,
+    enclosed_volume,
+    smooth_vertex_normals,
+    thicken,
+)
+
+
+def leaflet(shapes, vertices, triangles, thickness=1.2):
+    n = len(vertices)
+    region = (vertices[triangles].mean(axis=1)[:, 0] > 0).astype(int)
+    names = ("posterior", "anterior")
+    fibre = np.tile([0.0, 1.0, 0.0], (n, 1))
+    return LeafletSurface(vertices, triangles, region, names, fibre, np.full(n, thickness))
+
+
+def test_good_surfaces_pass(shapes):
+    for vertices, triangles in (shapes.box(), shapes.sphere()):
+        check_surface(vertices, triangles, closed=True)
+    check_surface(*shapes.cone(15, 4, 12))
+
+
+def bow_tie(shapes):
+    # Two boxes that share one corner only.
+    vertices, triangles = shapes.box()
+    other = triangles + 8
+    both = np.concatenate([vertices, vertices + 1.0])
+    other[other == 8] = 6
+    return both, np.concatenate([triangles, other])
+
+
+def fin(shapes):
+    vertices, triangles = shapes.box()
+    return np.concatenate([vertices, [[-1.0, -1, 0]]]), np.concatenate([triangles, [[0, 4, 8]]])
+
+
+def crossed(shapes):
+    first = shapes.box()
+    second = shapes.box()
+    vertices, triangles, _ = shapes.join(first, (second[0] + [0.4, 0.3, 0.2], second[1]))
+    return vertices, triangles
+
+
+def flipped_one(shapes):
+    vertices, triangles = shapes.box()
+    triangles[5] = triangles[5, ::-1]
+    return vertices, triangles
+
+
+def with_nan(shapes):
+    vertices, triangles = shapes.box()
+    vertices[3, 1] = np.nan
+    return vertices, triangles
+
+
+def flat_triangle(shapes):
+    vertices, triangles = shapes.box()
+    vertices = np.concatenate([vertices, [[2.0, 0, 0], [3, 0, 0], [4, 0, 0]]])
+    return vertices, np.concatenate([triangles, [[8, 9, 10]]])
+
+
+BAD = {
+    "non-manifold vertex: .*vertices 6": bow_tie,
+    r"non-manifold edge: .*\[0, 4\]": fin,
+    "self-intersection: .* pairs": crossed,
+    "inconsistent orientation: .*5": flipped_one,
+    "not finite: vertices 3": with_nan,
+    "degenerate triangle: triangles 12": flat_triangle,
+    "duplicate triangle: triangles 0": lambda s: (
+        s.box()[0],
+        np.concatenate([s.box()[1], s.box()[1][:1, [1, 2, 0]]]),
+    ),
+    "open surface: 3 boundary edges": lambda s: (s.box()[0], s.box()[1][1:]),
+    "inward normals: .*-1 mm": lambda s: (s.box()[0], s.box()[1][:, ::-1]),
+    "index out of range: triangles 11": lambda s: (s.box()[0][:7], s.box()[1]),
+    "no triangles": lambda s: (s.box()[0], np.zeros((0, 3), dtype=int)),
+    r"wrong shape: vertices \(8, 2\)": lambda s: (s.box()[0][:, :2], s.box()[1]),
+    r"wrong shape: triangles \(12, 2\)": lambda s: (s.box()[0], s.box()[1][:, :2]),
+    "wrong shape: triangles .*float": lambda s: (s.box()[0], s.box()[1].astype(float)),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_each_fault_has_its_name_and_numbers(shapes, message):
+    if message.startswith("index"):
+        vertices, triangles = BAD[message](shapes)
+        triangles = np.where(triangles == 7, 0, triangles)
+        triangles[11] = [0, 1, 7]
+    else:
+        vertices, triangles = BAD[message](shapes)
+    with pytest.raises(GeometryError, match="part: " + message):
+        check_surface(vertices, triangles, closed=True, name="part")
+
+
+def test_volumes(shapes):
+    assert enclosed_volume(*shapes.box((2.0, 3.0, 4.0))) == pytest.approx(24.0)
+    vertices, triangles = shapes.sphere(2.0, 4)
+    assert enclosed_volume(vertices + 100.0, triangles) == pytest.approx(
+        4 / 3 * np.pi * 8, rel=3e-3
+    )
+
+
+def test_smoothing_keeps_the_normals_of_a_sphere_and_calms_noise(shapes):
+    vertices, triangles = shapes.sphere(1.0, 3)
+    exact = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    np.testing.assert_allclose(smooth_vertex_normals(vertices, triangles), exact, atol=0.03)
+    noise = vertices * (1 + np.random.default_rng(0).uniform(-0.03, 0.03, (len(vertices), 1)))
+    error = [
+        np.linalg.norm(smooth_vertex_normals(noise, triangles, k) - exact, axis=1).max()
+        for k in (0, 10)
+    ]
+    assert error[1] < 0.5 * error[0]
+
+
+def test_thickened_plate_is_a_box(shapes):
+    # 10 x 8 plate, 1.2 thick: volume 96, rim 2 (10 + 8) x 1.2 = 43.2.
+    vertices, triangles = shapes.plate([-5, -4, 0], [10, 0, 0], [0, 8, 0], 6)
+    closed = thicken(leaflet(shapes, vertices, triangles))
+    assert closed.volume == pytest.approx(96.0)
+    corners = closed.vertices[closed.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    by_kind = {name: area[closed.kind == i].sum() for i, name in enumerate(FACE_KINDS)}
+    assert by_kind == pytest.approx({"ventricular": 80.0, "atrial": 80.0, "rim": 43.2})
+    assert (cross[closed.kind == 0, 2] > 0).all()
+    assert (cross[closed.kind == 1, 2] < 0).all()
+    # Labels follow the midsurface triangles, on the rim too.
+    x = corners.mean(axis=1)[:, 0]
+    np.testing.assert_array_equal(closed.region, (x > 0).astype(int))
+
+
+def test_thickened_funnel_has_two_rims_and_the_volume_of_a_shell(shapes):
+    vertices, triangles = shapes.cone(15.0, 8.0, 12.0, n=90, layers=10)
+    surface = leaflet(shapes, vertices, triangles, 1.0)
+    closed = thicken(surface)
+    assert (closed.kind == 2).sum() == 2 * 2 * 90
+    # Offsetting a surface both ways by t/2 encloses area times t up to the second order in t.
+    assert closed.volume == pytest.approx(surface.areas.sum() * 1.0, rel=2e-3)
+
+
+def test_too_thick_a_leaflet_is_one_clear_error(shapes):
+    vertices, triangles = shapes.cone(3.0, 1.0, 4.0, n=24, layers=4)
+    with pytest.raises(GeometryError, match=r"self-intersection|inconsistent|inward|degenerate"):
+        thicken(leaflet(shapes, vertices, triangles, 9.0))

@@ -1,0 +1,237 @@
+"""Clinical measurements of the template, whose axes are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.errors import GeometryError
+from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.measure import clinical
+from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names
+
+CLOSURE = ("orifice_mm2", "passing_ball_mm", "coaptation_length_mm", "coaptation_area_mm2")
+
+
+AS_IT_LIES = np.eye(3)
+
+
+def measured(parameters=None, change=None, columns=80, rows=15, turn=AS_IT_LIES):
+    valve = Template(parameters or TemplateParameters()).valve(columns, rows)
+    surface = valve.surface if change is None else change(valve.surface)
+    x = surface.vertices @ turn.T
+    return clinical_measurements(x, surface, x[valve.annulus], valve.papillary_tips @ turn.T, 1.0)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Without the closure and the passing ball, which takes a second."""
+    monkeypatch.setattr(clinical, "_closure", lambda distance: lambda *arguments: {})
+    monkeypatch.setattr(clinical, "_ball", lambda *arguments: {})
+
+
+@pytest.mark.parametrize(
+    ("half_commissural", "half_ap"), [(18.0, 14.0), (22.0, 15.0), (16.0, 16.0)]
+)
+def test_diameters_are_the_axes_of_the_template(quick, half_commissural, half_ap):
+    p = replace(
+        TemplateParameters(), half_commissural=half_commissural, half_ap=half_ap, flattening=0.0
+    )
+    found = measured(p)
+    assert found["ap_diameter_mm"] == pytest.approx(2 * half_ap, rel=0.02)
+    assert found["commissural_diameter_mm"] == pytest.approx(2 * half_commissural, rel=0.02)
+    # An ellipse seen from above; a saddle in space, so longer than it.
+    assert found["annulus_area_mm2"] == pytest.approx(np.pi * half_ap * half_commissural, rel=0.02)
+    assert found["annulus_height_mm"] == pytest.approx(p.saddle, rel=0.02)
+    assert found["annulus_circumference_mm"] > 2 * np.pi * min(half_ap, half_commissural)
+
+
+def test_the_flattened_side_is_the_anterior_one(quick):
+    p = TemplateParameters()
+    # The anterior half axis is shorter by its flattening: 14 (1 - 0.08) + 14 mm.
+    expected = p.half_ap * (2 - p.flattening)
+    assert measured(p)["ap_diameter_mm"] == pytest.approx(expected, rel=0.02)
+
+
+def test_nothing_depends_on_how_the_valve_lies(quick):
+    rng = np.random.default_rng(1)
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    one, other = measured(), measured(turn=turn)
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        assert other[name] == pytest.approx(value, rel=1e-6), name
+
+
+def test_lengths_and_depths_are_those_of_the_template(quick):
+    p = TemplateParameters()
+    found = measured(p)
+    # The longest way from annulus to edge, in the middle of each leaflet.
+    assert found["anterior_length_mm"] == pytest.approx(p.length_anterior, rel=0.05)
+    assert found["posterior_length_mm"] == pytest.approx(p.length_posterior, rel=0.05)
+    surface = Template(p).valve(80, 15).surface
+    corner = surface.vertices[surface.triangles]
+    area = 0.5 * np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    for number, name in enumerate(("anterior", "posterior")):
+        own = area[surface.region == number].sum()
+        assert found[f"{name}_area_mm2"] == pytest.approx(own)
+    assert found["tip_depth_mm"] == pytest.approx(-p.tips[2], abs=0.2 * p.saddle)
+
+
+def test_the_open_valve_has_an_orifice():
+    found = measured(columns=24, rows=7)
+    assert set(CLOSURE) <= set(found)
+    assert found["orifice_mm2"] > 100
+    assert found["passing_ball_mm"] > 8
+    assert set(found) == set(clinical_names(("anterior", "posterior")))
+
+
+def three(surface):
+    region = np.where(np.arange(len(surface.region)) % 80 < 20, 2, surface.region)
+    return LeafletSurface(
+        surface.vertices, surface.triangles, region, (*surface.region_names, "septal"),
+        surface.fibre, surface.thickness,
+    )  # fmt: skip
+
+
+def test_of_three_leaflets_what_needs_two_is_not_told():
+    found = measured(change=three)
+    assert not set(CLOSURE) & set(found)
+    assert {"anterior_area_mm2", "posterior_area_mm2", "septal_area_mm2"} <= set(found)
+    assert "septal_length_mm" not in found
+    assert "tenting_volume_mm3" in found
+
+
+def test_a_shape_that_defies_a_measurement_has_the_others(monkeypatch, quick):
+    def fails(*arguments):
+        raise GeometryError("no tenting")
+
+    whole = measured()
+    monkeypatch.setattr(clinical, "measure_tenting", fails)
+    found = measured()
+    assert set(whole) - set(found) == {"tenting_height_mm", "tenting_volume_mm3"}
+    valve = Template().valve(24, 7)
+    flat = np.zeros((24, 3))
+    x = valve.surface.vertices
+    assert clinical_measurements(x, valve.surface, flat, valve.papillary_tips, 1.0) == {}
+
+
+def dome(height, rim=15.0, n=96, rings=24):
+    """Two halves of a spherical cap of a height over a circle (negative: below it)."""
+    radius = (rim**2 + height**2) / (2 * abs(height))
+    angle = np.arange(n) * 2 * np.pi / n
+    loops = []
+    for r in rim * np.linspace(1.0, 0.004, rings):
+        z = np.sign(height) * (np.sqrt(radius**2 - r**2) - (radius - abs(height)))
+        loops.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(n, z)]))
+    here = np.arange(n)
+    triangles = np.concatenate(
+        [
+            part + k * n
+            for k in range(rings - 1)
+            for part in (
+                np.stack([here, here + n, (here + 1) % n + n], 1),
+                np.stack([here, (here + 1) % n + n, (here + 1) % n], 1),
+            )
+        ]
+    )
+    vertices = np.concatenate(loops)
+    middle = vertices[triangles].mean(axis=1)
+    surface = LeafletSurface(
+        vertices, triangles, (middle[:, 1] < 0).astype(int), ("anterior", "posterior"),
+        np.tile([1.0, 0.0, 0.0], (len(vertices), 1)), np.ones(len(vertices)),
+    )  # fmt: skip
+    return vertices, surface, vertices[:n]
+
+
+TIPS = np.array([[10.0, -3.0, -25.0], [-10.0, -3.0, -23.0]])
+
+
+@pytest.mark.parametrize("height", [15.0, 5.0])
+def test_a_dome_into_the_atrium_prolapses_by_its_height_and_volume(quick, height):
+    vertices, surface, annulus = dome(height)
+    found = clinical_measurements(vertices, surface, annulus, TIPS, 1.0)
+    cap = np.pi * height * (3 * 15.0**2 + height**2) / 6
+    for name in ("prolapse", "billow"):
+        assert found[f"{name}_height_mm"] == pytest.approx(height, rel=0.01)
+        assert found[f"{name}_volume_mm3"] == pytest.approx(cap, rel=0.02)
+    assert found["tenting_volume_mm3"] == pytest.approx(-cap, rel=0.02)
+    # Both leaflets together are the cap: 2 pi R h.
+    both = found["anterior_area_mm2"] + found["posterior_area_mm2"]
+    assert both == pytest.approx(np.pi * (15.0**2 + height**2), rel=0.01)
+
+
+def test_a_dome_into_the_ventricle_tents_and_does_not_prolapse(quick):
+    vertices, surface, annulus = dome(-6.0)
+    found = clinical_measurements(vertices, surface, annulus, TIPS, 1.0)
+    assert found["tenting_height_mm"] == pytest.approx(6.0, rel=0.01)
+    cap = np.pi * 6 * (3 * 15.0**2 + 36) / 6
+    assert found["tenting_volume_mm3"] == pytest.approx(cap, rel=0.02)
+    for name in ("prolapse_height_mm", "billow_height_mm"):
+        assert found[name] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_saddle_prolapses_over_its_plane_but_does_not_billow(quick):
+    _, surface, flat = dome(-6.0)
+    angle = np.arctan2(flat[:, 1], flat[:, 0])
+    lift = -3.0 * np.cos(2 * angle)
+    # The leaflets hang 2 mm below a saddle with high points on the anterior and posterior side.
+    x = surface.vertices.copy()
+    share = np.hypot(x[:, 0], x[:, 1]) / 15.0
+    x[:, 2] = np.tile(lift, len(x) // len(flat)) * share**2 - 2.0 * (1 - share**2)
+    annulus = x[: len(flat)]
+    found = clinical_measurements(x, surface, annulus, TIPS, 1.0)
+    assert found["annulus_height_mm"] == pytest.approx(6.0, rel=0.01)
+    assert found["annulus_height_to_width_ratio"] == pytest.approx(6.0 / 30.0, rel=0.01)
+    assert found["prolapse_height_mm"] > 2.0
+    assert found["billow_height_mm"] == pytest.approx(0.0, abs=0.05)
+
+
+def test_ratios_and_tips(quick):
+    p = replace(TemplateParameters(), flattening=0.0)
+    found = measured(p)
+    assert found["annulus_sphericity_ratio"] == pytest.approx(p.half_ap / p.half_commissural, 0.02)
+    assert found["tip_separation_mm"] == pytest.approx(2 * p.tips[0])
+    vertices, surface, annulus = dome(-6.0)
+    found = clinical_measurements(
+        vertices, surface, annulus, TIPS, 1.0, tip_names=("tip_0", "tip_180")
+    )
+    assert found["tip_0_depth_mm"] == pytest.approx(25.0)
+    assert found["tip_180_depth_mm"] == pytest.approx(23.0)
+    assert found["tip_depth_mm"] == pytest.approx(24.0)
+    near = 15.0 - np.hypot(10.0, 3.0)
+    assert found["tip_0_annulus_distance_mm"] == pytest.approx(np.hypot(near, 25.0), rel=1e-3)
+    assert found["tip_separation_mm"] == pytest.approx(np.hypot(20.0, 2.0))
+
+
+def test_every_number_has_a_meaning_and_a_unit():
+    names = ("tip_0", "tip_180")
+    valve = Template().valve(24, 7)
+    x, tips = valve.surface.vertices, valve.papillary_tips
+    found = clinical_measurements(
+        x, valve.surface, x[valve.annulus], tips, 1.0, tip_names=names, passing_ball=False
+    )
+    assert set(found) == set(clinical_names(("anterior", "posterior"), names, passing_ball=False))
+    assert "passing_ball_mm" not in found
+    ending = {"mm": "_mm", "mm²": "_mm2", "mm³": "_mm3", "": "_ratio"}
+    for name in found:
+        unit, meaning = clinical_meaning(name)
+        assert name.endswith(ending[unit])
+        assert "{" not in meaning
+    assert clinical_meaning("anterior_area_mm2")[1] == "area of the anterior leaflet"
+    assert "papillary tip 0" in clinical_meaning("tip_0_depth_mm")[1]
+    with pytest.raises(KeyError):
+        clinical_meaning("colour_mm")
+
+
+def test_a_twisted_annulus_loses_its_area_in_space_and_keeps_its_length(quick):
+    vertices, surface, annulus = dome(-6.0)
+    twisted = annulus.copy()
+    twisted[[3, 4]] = twisted[[4, 3]]
+    found = clinical_measurements(vertices, surface, twisted, TIPS, 1.0)
+    assert "annulus_area_3d_mm2" not in found
+    assert "billow_height_mm" not in found
+    assert found["annulus_circumference_mm"] > 2 * np.pi * 15.0 * 0.99
