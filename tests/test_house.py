@@ -18,8 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import mvest
-
-ROOT = Path(__file__).resolve().parent.parent
+from tests.places import ROOT
 
 LEAVES = ("mvest.errors", "mvest.units", "mvest.typing", "mvest.elements")
 VALUE_OBJECTS = (

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 
@@ -10,8 +9,8 @@ from experiments.common.config import ImagedConfig, ImagingConfig
 from mvest.imaging.detection.model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 OWN, MAIN = (ROOT / "mvest" / "imaging" / "README.md", ROOT / "README.md")
 
 

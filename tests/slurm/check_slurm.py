@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 PATIENCE = 240.0
 SWEEP = (
     sys.executable, "-m", "experiments.run", "-m", "sweep=debug", "launcher=slurm",

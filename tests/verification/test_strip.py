@@ -1,7 +1,5 @@
 """Bending strips: the default element is within 5 % of the reference with one layer, tet4 locks."""
 
-from pathlib import Path
-
 import pandas as pd
 import pytest
 
@@ -17,9 +15,10 @@ from experiments.verification import (
     markdown,
     strip_table,
 )
+from tests.places import ROOT
 
 STRIP = "13x10x1.26"
-STORED = Path(__file__).resolve().parents[2] / "results" / "strip.csv"
+STORED = ROOT / "results" / "strip.csv"
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ import pytest
 from experiments.common.cases import blind
 from experiments.common.cases.blind import ESTIMATE, SECRET, estimate_blindly
 from mvest.errors import InputError
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
 
 WAYS = {
     "open": "open(secret)",

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -11,8 +9,8 @@ from experiments.common.mirror import build
 from experiments.runner.request import as_published
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
+from tests.places import CONF
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 

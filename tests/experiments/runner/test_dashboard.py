@@ -10,10 +10,9 @@ import pytest
 
 from experiments import screenshot
 from mvest.errors import InputError
+from tests.places import ROOT
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

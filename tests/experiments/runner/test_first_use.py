@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.places import ROOT
+
 SAY = "from experiments.common.progress import announce_compilation as say; say()"
 
 
@@ -12,7 +14,7 @@ def said(cache: Path, before: str = "") -> str:
     finished = subprocess.run(
         [sys.executable, "-c", before + SAY],
         env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,

@@ -17,8 +17,7 @@ from experiments.runner.job import FailedRunError
 from experiments.runner.request import Request
 from mvest.errors import ConfigurationError
 from mvest.provenance import THREAD_VARIABLES, write_json
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
 
 OBEDIENT = """
 import json, os, sys, time

@@ -15,6 +15,7 @@ import pytest
 
 from experiments.runner import comparison
 from tests.experiments.runner.test_tracking import make_config, make_job
+from tests.places import ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -89,7 +90,7 @@ def test_eight_processes_lose_nothing(server, tmp_path) -> None:
     uploads = [
         subprocess.Popen(
             [sys.executable, "-c", UPLOAD, server, str(tmp_path), *map(str, jobs[k::PROCESSES])],
-            cwd=Path(__file__).resolve().parents[2],
+            cwd=ROOT,
             stderr=subprocess.PIPE,
             text=True,
         )

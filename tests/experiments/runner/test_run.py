@@ -13,8 +13,7 @@ from experiments import tables
 from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
 
 REQUIRED = {
     "parameters": list,

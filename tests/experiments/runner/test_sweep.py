@@ -21,8 +21,8 @@ from experiments.runner.job import STUDIES
 from experiments.runner.plan import Plan, PlannedJob
 from experiments.runner.request import Request
 from mvest.provenance import write_json
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 QUICK = ("hydra/launcher=basic", "tracking.enabled=false")
 
 

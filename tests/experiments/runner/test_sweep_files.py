@@ -1,7 +1,6 @@
 """The sweeps' configurations: every job of every size composes, and says what sets it apart."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +14,8 @@ from experiments.common.build import build_filter, build_twin
 from experiments.common.config import hash_of, register
 from experiments.studies.twin.study import run_twin
 from mvest.errors import MvestError
+from tests.places import CONF
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")
 
 DEBUG = (

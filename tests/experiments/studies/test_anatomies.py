@@ -1,7 +1,5 @@
 """The configured anatomies are valves, and have what their names say."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
@@ -11,8 +9,8 @@ from experiments.common.build import template_of
 from experiments.common.config import plain, register
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
+from tests.places import CONF
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 NAMES = sorted(path.stem for path in (CONF / "valve").glob("*.yaml"))
 NORMAL = [name for name in NAMES if name.startswith("normal")]
 

@@ -17,8 +17,7 @@ from experiments.run import main
 from experiments.studies.donor.study import build_donor
 from mvest.valve.io.donor_file import CITATION, DATA_VARIABLE
 from mvest.valve.mesh.embedding import embed
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
 
 TRUTH = np.array([2.0, 1.0, 3.0])
 SMALL = [

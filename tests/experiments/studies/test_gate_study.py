@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +15,8 @@ from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, GateCase
 from mvest.estimation import Prediction
+from tests.places import CONF
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 SMALL = (
     "mesh.columns=12",
     "mesh.rows=2",

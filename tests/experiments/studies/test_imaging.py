@@ -26,8 +26,8 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection import model as detection_model
 from mvest.imaging.detection.model import STAGES, default_model, load_model
 from mvest.imaging.simulator import SMALL
+from tests.places import CONF
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 STUDY = ("experiment=imaging", "imaging=small", "tracking.enabled=false")
 
 

@@ -1,7 +1,6 @@
 """The donor reader on a small made-up recording of its form, and on the real one if present."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from mvest.valve.io.donor import (
 from mvest.valve.io.donor_file import CITATION, DATA_VARIABLE, REGION_NAMES, donor_file
 from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import remesh
+from tests.places import ROOT
 
 ROUND, DOWN = 48, 6
 
@@ -257,7 +257,7 @@ def test_the_environment_names_the_data(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def real():
-    beside = Path(__file__).resolve().parents[3] / "shared" / "data" / "trivalve"
+    beside = ROOT.parent / "shared" / "data" / "trivalve"
     try:
         return read_donor(os.environ.get(DATA_VARIABLE) or beside)
     except InputError as error:
