@@ -16,7 +16,7 @@ TEST_PROCESSES ?= 2
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: help install reproduce tables test test-all bench lint format dashboard sync screenshot slurm-check lock clean
+.PHONY: help install reproduce tables test test-all docs bench lint format dashboard sync screenshot slurm-check lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -41,6 +41,9 @@ test: $(INSTALLED) ## the tests that finish in minutes
 
 test-all: $(INSTALLED) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES)
+
+docs: $(INSTALLED) ## the documentation site, in docs/_build/html; warnings are errors
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 BENCH := $(BIN)/python -m pytest tests/benchmark -p no:xdist -o python_files='bench_*.py'
 BENCH_OF ?= not tet4-25k
@@ -80,7 +83,7 @@ slurm-check: $(INSTALLED) ## a sweep through a real Slurm, with jobs that die (t
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
 lock: $(INSTALLED) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
-	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra viz \
+	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra docs --extra viz \
 		--generate-hashes --no-annotate --custom-compile-command "make lock" $(UPGRADE) \
 		--quiet --output-file requirements.lock
 

@@ -348,7 +348,7 @@ def test_the_lock_file_fits_the_declared_dependencies(project: dict) -> None:
         for line in lines
         if (found := re.match(r"([A-Za-z0-9._-]+)==([^\s;]+)", line))
     }
-    for text in [*project["dependencies"], *extras["dev"], *extras["viz"]]:
+    for text in [*project["dependencies"], *extras["dev"], *extras["docs"], *extras["viz"]]:
         requirement = Requirement(text)
         version = locked.get(canonicalize_name(requirement.name))
         assert version is not None, f"run `make lock`: {text} is missing"

@@ -1,0 +1,203 @@
+"""One page for each study, written from what ``conf``, ``results/`` and the notes hold.
+
+A page belongs to a table of ``results/``. Its title and commands come from the experiments that
+name that table, its numbers and figures from the files of that name, included as they are. Notes in
+``docs/study_notes/NAME.md`` are optional; their header gives the page a title, a group, its place
+in it and further files (``title``, ``group``, ``order``, ``results``). No study is listed here.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import yaml
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+ELSEWHERE = ("dashboard",)
+"""Pictures that are shown on other pages."""
+
+LAST = "Further studies"
+"""The group of pages whose notes name none."""
+
+
+@dataclass
+class Experiment:
+    """What a file of ``conf/experiment`` says of itself."""
+
+    name: str
+    title: str
+    about: str
+    command: str
+
+
+@dataclass
+class Page:
+    """A page in the making."""
+
+    name: str
+    title: str = ""
+    group: str = LAST
+    order: int = 1000
+    notes: str = ""
+    adopts: tuple[str, ...] = ()
+    experiments: list[Experiment] = field(default_factory=list)
+    tables: list[str] = field(default_factory=list)
+    pictures: list[str] = field(default_factory=list)
+
+    def owns(self, stem: str) -> bool:
+        """Whether a file of ``results/`` is of this page."""
+        return any(stem == own or stem.startswith(f"{own}_") for own in (self.name, *self.adopts))
+
+
+def comment_of(text: str) -> str:
+    """The comment with which a configuration file begins."""
+    lines = text.splitlines()
+    while lines and lines[0].startswith("# @"):
+        lines.pop(0)
+    kept: list[str] = []
+    for line in lines:
+        if not line.startswith("#"):
+            break
+        kept.append(line[1:].strip())
+    return " ".join(kept)
+
+
+def read_experiments(folder: Path) -> dict[str, list[Experiment]]:
+    """Experiments or sweeps by the table that they belong to, inherited or their own."""
+    contents = {
+        path.stem: (yaml.safe_load(text), text)
+        for path in sorted(folder.glob("*.yaml"))
+        for text in [path.read_text(encoding="utf-8")]
+    }
+
+    def inherited(name: str, key: str) -> str:
+        data = contents[name][0]
+        if key in data:
+            return str(data[key])
+        bases = [b for b in data.get("defaults", []) if isinstance(b, str) and b in contents]
+        return inherited(bases[0], key) if bases else ""
+
+    found: dict[str, list[Experiment]] = {}
+    for name, (data, text) in contents.items():
+        many = "-m " if data.get("hydra", {}).get("mode") == "MULTIRUN" else ""
+        command = f"python -m experiments.run {many}{folder.name}={name}"
+        made = Experiment(name, inherited(name, "title"), comment_of(text), command)
+        found.setdefault(inherited(name, "table") or name, []).append(made)
+    return found
+
+
+def read_notes(folder: Path) -> list[Page]:
+    """Pages with notes, their headers read."""
+    pages = []
+    for path in sorted(folder.glob("*.md")):
+        head, _, body = path.read_text(encoding="utf-8").removeprefix("---\n").partition("\n---\n")
+        data = yaml.safe_load(head)
+        pages.append(
+            Page(
+                path.stem,
+                data["title"],
+                data["group"],
+                data["order"],
+                body.strip(),
+                tuple(data.get("results", ())),
+            )
+        )
+    return pages
+
+
+def all_pages(root: Path) -> list[Page]:
+    """Every page, with what belongs to it."""
+    results = root / "results"
+    tables = sorted(path.stem for path in results.glob("*.md"))
+    pictures = sorted(path.stem for path in results.glob("*.png") if path.stem not in ELSEWHERE)
+    pages = read_notes(root / "docs" / "study_notes")
+    conf = root / "conf"
+    experiments = read_experiments(conf / "sweep") | read_experiments(conf / "experiment")
+
+    def page_of(stem: str) -> Page | None:
+        owners = [page for page in pages if page.owns(stem)]
+        return max(owners, key=lambda page: page.name == stem, default=None)
+
+    for table in [*experiments, *sorted(tables, key=len)]:
+        has_results = any(t == table or t.startswith(f"{table}_") for t in tables)
+        if page_of(table) is None and has_results:
+            pages.append(Page(table))
+    for table, members in experiments.items():
+        if (page := page_of(table)) is not None:
+            page.experiments += members
+    for stem in tables:
+        if (page := page_of(stem)) is not None:
+            page.tables.append(stem)
+    for stem in pictures:
+        if (page := page_of(stem)) is not None:
+            page.pictures.append(stem)
+    for page in pages:
+        page.title = page.title or (page.experiments[0].title if page.experiments else page.name)
+    return sorted(pages, key=lambda page: (page.order, page.title))
+
+
+def table_text(path: Path) -> str:
+    """A table of ``results/`` as it is, its headings two levels deeper."""
+    text = path.read_text(encoding="utf-8").strip()
+    return re.sub(r"^(#+) ", r"##\1 ", text, flags=re.MULTILINE)
+
+
+def text_of(page: Page, results: Path) -> str:
+    """The page in Markdown."""
+    parts = [f"# {page.title}"]
+    if page.notes:
+        parts.append(page.notes)
+    else:
+        parts += [experiment.about for experiment in page.experiments[:1]]
+    if page.experiments:
+        rows = [f"    {experiment.command}" for experiment in page.experiments]
+        parts += ["## Run it", "\n".join(rows)]
+    shown = []
+    for stem in page.pictures:
+        shown.append(f"![{page.title}: {stem}](../../results/{stem}.png)")
+    parts += ["## Results", *shown]
+    parts += [table_text(results / f"{stem}.md") for stem in page.tables]
+    return "\n\n".join(parts) + "\n"
+
+
+def index_of(pages: list[Page]) -> str:
+    """The page that leads to all others, group by group."""
+    parts = [
+        "# Studies",
+        "Each page holds what a study asks, the command that repeats it, and its tables and "
+        "figures as they lie in `results/`, with the commit and the configuration they came from. "
+        "All of them on one page: <a href='../report.html'>report.html</a>. Everything is "
+        "simulated, except where a donor valve is named.",
+    ]
+    for group in dict.fromkeys(page.group for page in pages):
+        members = [page for page in pages if page.group == group]
+        listing = "\n".join(f"{page.title} <{page.name}>" for page in members)
+        parts.append(f"```{{toctree}}\n:caption: {group}\n:maxdepth: 1\n\n{listing}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+def write_study_pages(root: Path, folder: Path) -> None:
+    """Write all pages into a folder, which then holds nothing else; equal files are left alone."""
+    folder.mkdir(exist_ok=True)
+    pages = all_pages(root)
+    texts = {f"{page.name}.md": text_of(page, root / "results") for page in pages}
+    texts["index.md"] = index_of(pages)
+    for path in folder.glob("*.md"):
+        if path.name not in texts:
+            path.unlink()
+    for name, text in texts.items():
+        path = folder / name
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the pages before Sphinx looks for its sources."""
+    docs = Path(app.srcdir)
+    write_study_pages(docs.parent, docs / "studies")
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
