@@ -1,4 +1,8 @@
-"""Exactly as many bytes as a header promises, from this file or from one beside it."""
+"""Exactly as many bytes as a header promises, from this file or from one beside it.
+
+The libraries read until a file ends: what a few compressed bytes grow to has no bound there, and a
+missing end or a wrong checksum passes unseen.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +32,12 @@ def beside(path: Path, field: str, name: str) -> Path:
         A name that leads elsewhere, or no such file.
     """
     plain = name.removeprefix("./")
-    inside = "/" not in plain and "\\" not in plain and plain not in ("", ".", "..")
-    data = path.parent / plain if inside and plain.isprintable() else path
-    if data is path or data.resolve().parent != path.parent.resolve():
+    inside = plain.isprintable() and plain not in ("", ".", "..") and not set("/\\") & set(plain)
+    if not inside or (path.parent / plain).resolve().parent != path.parent.resolve():
         raise fault(path, field, repr(name), "the name of a file in the same folder")
-    if not data.is_file():
+    if not (path.parent / plain).is_file():
         raise fault(path, field, f"{name!r} does not exist", "a file in the same folder")
-    return data
+    return path.parent / plain
 
 
 def plainly(file: BinaryIO) -> Iterator[bytes]:

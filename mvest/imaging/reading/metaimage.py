@@ -1,8 +1,8 @@
 """MetaImage files (``.mha``, ``.mhd`` with its data beside it).
 
-Geometry is read by SimpleITK, whose world is LPS in mm. The fourth spacing is the time between
-frames; the format knows no unit for it. What the header leaves out, ITK would fill in; here it is
-asked for.
+The place is read by SimpleITK, whose world is LPS in mm. The fourth spacing is the time
+between frames; the format knows no unit for it. What the header leaves out, ITK would make up; here
+it is asked for.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import SimpleITK
 
 from mvest.imaging.reading.checks import check_size
 from mvest.imaging.reading.data import beside, from_zlib, plainly, read_exactly
-from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
+from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, StatedVolume, fault
 
 __all__ = ["is_metaimage", "read_metaimage"]
 
 NAMES = FieldNames("DimSize", "ElementSpacing", "TransformMatrix", "Offset", "ElementDataFile")
-LONGEST_HEADER = 2**16
-"""Bytes within which the line ElementDataFile, the last one, must come."""
+MAX_HEADER_BYTES = 2**16
+"""Within which the line ElementDataFile, the last one, must come."""
 
 TYPES = {
     "MET_CHAR": "i1",
@@ -41,6 +41,11 @@ SYNONYMS = {
     "Orientation": "TransformMatrix",
     "ElementByteOrderMSB": "BinaryDataByteOrderMSB",
 }
+SUPPORTED = {
+    "ElementNumberOfChannels": ("1", "1: one grey value, no colour or vector"),
+    "HeaderSize": ("0", "0"),
+}
+"""The only value of fields that may be left out, and what a message expects."""
 
 
 def is_metaimage(head: bytes) -> bool:
@@ -57,44 +62,35 @@ def read_metaimage(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     InputError
         A field that is missing, contradicts another or is not supported; truncated data.
     """
-    fields, start = _header(path)
-    dimension = _required(path, fields, "NDims", "3 or 4")
-    if dimension not in ("3", "4"):
-        raise fault(path, "NDims", dimension, "3 (one volume) or 4 (volumes over time)")
+    header = _header(path)
+    n = header.required("NDims", "3 or 4")
+    if n not in ("3", "4"):
+        raise fault(path, "NDims", n, "3 (one volume) or 4 (volumes over time)")
     for field in (NAMES.size, NAMES.spacing, NAMES.direction, NAMES.origin):
-        count = int(dimension) ** (2 if field == NAMES.direction else 1)
-        _check_numbers(path, field, _required(path, fields, field, f"{count} numbers"), count)
-    if fields.get("ElementNumberOfChannels", "1") != "1":
-        raise fault(
-            path,
-            "ElementNumberOfChannels",
-            fields["ElementNumberOfChannels"],
-            "1: one grey value, no colour or vector",
-        )
-    dtype = _voxel_type(path, fields)
-    sizes = [int(float(word)) for word in fields["DimSize"].split()]
-    sizes += [1] * (4 - len(sizes))
+        _check_numbers(header, field, int(n) ** (2 if field == NAMES.direction else 1))
+    for field, (value, expected) in SUPPORTED.items():
+        if header.fields.get(field, value) != value:
+            raise fault(path, field, header.fields[field], expected)
+    dtype = _voxel_type(header)
+    compressed = _flag(header, "CompressedData", "False")
+    sizes = [*map(int, header.fields[NAMES.size].split()), 1][:4]
     check_size(path, NAMES.size, [sizes[3], *sizes[:3]], dtype.itemsize)
-
-    name = fields["ElementDataFile"]
+    name = header.fields["ElementDataFile"]
     local = name.upper() == "LOCAL"
     source = path if local else beside(path, "ElementDataFile", name)
-    if fields.get("HeaderSize", "0") != "0":
-        raise fault(path, "HeaderSize", fields["HeaderSize"], "0")
-    compressed = _flag(path, fields, "CompressedData", "False")
-    size = int(np.prod(sizes, dtype=np.int64)) * dtype.itemsize
     with source.open("rb") as file:
-        file.seek(start if local else 0)
+        file.seek(header.length if local else 0)
         chunks = from_zlib(file) if compressed else plainly(file)
+        size = int(np.prod(sizes, dtype=np.int64)) * dtype.itemsize
         flat = read_exactly(path, "ElementDataFile", chunks, size)
-    frames = flat.view(dtype).reshape(sizes, order="F")
-    return _placed(path, np.moveaxis(frames, 3, 0)), (path,) if local else (path, source)
+    frames = np.moveaxis(flat.view(dtype).reshape(sizes, order="F"), 3, 0)
+    return _placed(path, frames), (path,) if local else (path, source)
 
 
-def _header(path: Path) -> tuple[dict[str, str], int]:
-    """Fields under their usual names, and where local data begin."""
+def _header(path: Path) -> Header:
+    """Words of the fields under their usual names."""
     with path.open("rb") as file:
-        head = file.read(LONGEST_HEADER)
+        head = file.read(MAX_HEADER_BYTES)
     fields: dict[str, str] = {}
     position = 0
     while "ElementDataFile" not in fields:
@@ -107,46 +103,42 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
         if fields.setdefault(name, value) != value:
             raise fault(path, name, f"{fields[name]!r} and {value!r}", "one value")
         position = end + 1 if end >= 0 else len(head)
-    return fields, position
+    return Header(path, fields, position)
 
 
-def _required(path: Path, fields: dict[str, str], field: str, expected: str) -> str:
-    if field not in fields:
-        raise fault(path, field, "not stated", expected)
-    return fields[field]
-
-
-def _flag(path: Path, fields: dict[str, str], field: str, default: str) -> bool:
-    word = fields.get(field, default)
+def _flag(header: Header, field: str, default: str) -> bool:
+    word = header.fields.get(field, default)
     if word.lower() not in FLAGS:
-        raise fault(path, field, repr(word), "True or False")
+        raise fault(header.path, field, repr(word), "True or False")
     return FLAGS[word.lower()]
 
 
-def _check_numbers(path: Path, field: str, value: str, count: int) -> None:
+def _check_numbers(header: Header, field: str, count: int) -> None:
+    """Every number is stated, as ITK would go on without."""
+    value = header.required(field, f"{count} numbers")
     try:
         numbers = [float(word) for word in value.split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
-        raise fault(path, field, repr(value), f"{count} numbers")
+        raise fault(header.path, field, repr(value), f"{count} numbers")
     if field in (NAMES.size, NAMES.spacing) and min(numbers) <= 0:
-        raise fault(path, field, value, "positive numbers")
-    if field == NAMES.size and not all(number.is_integer() for number in numbers):
-        raise fault(path, field, value, "whole numbers")
+        raise fault(header.path, field, value, "positive numbers")
+    if field == NAMES.size and not all(word.isdecimal() for word in value.split()):
+        raise fault(header.path, field, value, "whole numbers")
 
 
-def _voxel_type(path: Path, fields: dict[str, str]) -> np.dtype[np.generic]:
-    name = _required(path, fields, "ElementType", "the type of a voxel")
+def _voxel_type(header: Header) -> np.dtype[np.generic]:
+    name = header.required("ElementType", "the type of a voxel")
     if name not in TYPES:
-        raise fault(path, "ElementType", name, ", ".join(TYPES))
-    if not _flag(path, fields, "BinaryData", "True"):
-        raise fault(path, "BinaryData", fields["BinaryData"], "True: numbers in binary form")
+        raise fault(header.path, "ElementType", name, ", ".join(TYPES))
+    if not _flag(header, "BinaryData", "True"):
+        raise fault(header.path, "BinaryData", "False", "True: numbers in binary form")
     dtype = np.dtype(TYPES[name])
-    if dtype.itemsize == 1:
-        return dtype
-    _required(path, fields, "BinaryDataByteOrderMSB", "the order of bytes")
-    return dtype.newbyteorder(">" if _flag(path, fields, "BinaryDataByteOrderMSB", "") else "<")
+    if dtype.itemsize > 1:
+        header.required("BinaryDataByteOrderMSB", "the order of bytes")
+        dtype = dtype.newbyteorder(">" if _flag(header, "BinaryDataByteOrderMSB", "") else "<")
+    return dtype
 
 
 def _placed(path: Path, frames: np.ndarray) -> StatedVolume:
@@ -166,9 +158,6 @@ def _placed(path: Path, frames: np.ndarray) -> StatedVolume:
     if n == 4:
         if direction[3, :3].any() or direction[:3, 3].any() or direction[3, 3] != 1:
             raise fault(path, NAMES.direction, direction[3], "the fourth axis to be time alone")
-        times = StatedTimes(
-            np.asarray(origin[3] + spacing[3] * np.arange(len(frames)), dtype=np.float64),
-            "",
-            NAMES.spacing,
-        )
+        values = origin[3] + spacing[3] * np.arange(len(frames), dtype=np.float64)
+        times = StatedTimes(np.asarray(values), "", NAMES.spacing)
     return StatedVolume(frames, direction[:3, :3] * spacing[:3], origin[:3], times, None, NAMES)

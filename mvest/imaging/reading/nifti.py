@@ -25,7 +25,7 @@ NAMES = FieldNames("dim", "sform or qform", "sform or qform", "sform or qform", 
 GZIP = b"\x1f\x8b"
 MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 1e-3}
 TO_LPS = np.array([-1.0, -1.0, 1.0])
-LARGEST_CODE = 5
+MAX_CODE = 5
 """Of the forms of coordinates that the format knows."""
 ROUNDING = 1e-3
 """Relative difference of lengths that the header gives twice."""
@@ -97,8 +97,8 @@ def _geometry(
     path: Path, header: Any, affine: FloatArray, unit: str
 ) -> tuple[FloatArray, FloatArray]:
     for field in ("sform_code", "qform_code"):
-        if not 0 <= int(header[field]) <= LARGEST_CODE:
-            raise fault(path, field, int(header[field]), f"0 to {LARGEST_CODE}")
+        if not 0 <= int(header[field]) <= MAX_CODE:
+            raise fault(path, field, int(header[field]), f"0 to {MAX_CODE}")
     if int(header["sform_code"]) == 0 and int(header["qform_code"]) == 0:
         raise fault(path, "sform_code", "0, as is qform_code", "a direction of the axes")
     if unit not in MM_PER_UNIT:

@@ -23,7 +23,6 @@ import numpy as np
 import pydicom
 
 from mvest.imaging.reading.checks import check_size
-from mvest.imaging.reading.data import plainly, read_exactly
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 
@@ -143,27 +142,17 @@ def _pixels(path: Path, data: Any, shape: list[int]) -> np.ndarray:
     """Frames ``(T, I, J, K)``, without decoding by way of DICOM's own rows and columns."""
     if "PixelData" not in data:
         raise fault(path, "PixelData", "not stated", "the voxels")
-    element = data.get_item("PixelData", keep_deferred=True)
-    length, start = int(element.length), int(element.value_tell)
+    length = int(data.get_item("PixelData", keep_deferred=True).length)
     if length == 0xFFFFFFFF:
         raise fault(path, "PixelData", "compressed", "bytes as they are")
     size = int(np.prod(shape, dtype=np.int64))
-    available = min(length, path.stat().st_size - start)
-    if available < length or length < size:
-        raise fault(path, "PixelData", f"{available} bytes", f"{max(size, length)} bytes")
+    try:
+        content = np.frombuffer(data.PixelData, dtype=np.uint8)
+    except Exception as error:  # pydicom fails in many ways on a truncated value
+        raise fault(path, "PixelData", error, f"{max(size, length)} bytes") from error
+    if len(content) < length or length < size:
+        raise fault(path, "PixelData", f"{len(content)} bytes", f"{max(size, length)} bytes")
     # An odd number of bytes is followed by one that makes it even.
-    padding = 1 if size % 2 and length % 2 == 0 else 0
-    with path.open("rb") as file:
-        file.seek(start + length - padding - size)
-        content = read_exactly(path, "PixelData", _limited(file, size), size)
+    end = length - (1 if size % 2 and length % 2 == 0 else 0)
     t, i, j, k = shape
-    return content.reshape(t, k, j, i).transpose(0, 3, 2, 1)
-
-
-def _limited(file: Any, size: int) -> Any:
-    done = 0
-    for chunk in plainly(file):
-        yield chunk[: size - done]
-        done += len(chunk)
-        if done >= size:
-            return
+    return content[end - size : end].reshape(t, k, j, i).transpose(0, 3, 2, 1)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +14,48 @@ from mvest.errors import InputError
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray
 
-__all__ = ["FieldNames", "StatedTimes", "StatedVolume", "fault"]
+__all__ = ["FieldNames", "Header", "StatedTimes", "StatedVolume", "fault"]
 
-LONGEST_WORDS = 300
+MAX_WORDS = 300
 """Characters of a message that come from a file or from a library."""
 
 
-def fault(path: Path, field: str, found: object, expected: str) -> InputError:
+def fault(path: Path, field: str, value: object, expected: str) -> InputError:
     """What to raise where a file's field is not what it must be, in one line."""
-    words = " ".join(str(found).split())
-    if len(words) > LONGEST_WORDS:
-        words = words[:LONGEST_WORDS] + " ..."
+    words = " ".join(str(value).split())
+    if len(words) > MAX_WORDS:
+        words = words[:MAX_WORDS] + " ..."
     return InputError(f"{path}: {field}: {words}, expected {expected}")
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The fields of a file of text before its voxels.
+
+    Attributes
+    ----------
+    path : Path
+    fields : dict
+        Values by the format's own names.
+    length : int
+        Bytes up to the voxels.
+    """
+
+    path: Path
+    fields: Mapping[str, Any]
+    length: int
+
+    def required(self, field: str, expected: str) -> Any:
+        """Value of a field that must be there.
+
+        Raises
+        ------
+        InputError
+            The file does not state it.
+        """
+        if field not in self.fields:
+            raise fault(self.path, field, "not stated", expected)
+        return self.fields[field]
 
 
 @dataclass(frozen=True, slots=True)
