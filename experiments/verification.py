@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from mvest.files import write_atomically
 from mvest.mechanics import (
     NewtonSettings,
     PoissonReading,
@@ -26,7 +27,6 @@ from mvest.mechanics import (
     outer_faces,
     simulate_body,
 )
-from mvest.reporting.files import write_text
 from mvest.typing import FloatArray
 
 __all__ = ["CASES", "MATERIALS", "Bending", "Case", "bend", "main", "strip_table"]
@@ -232,8 +232,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     small = strip_table((*CASES, *FINE_CASES), loads=("small",))
     large = strip_table(CASES, loads=("large",), strips=("13x10x1.26",))
     table = pd.concat([small, large], ignore_index=True)
-    print(write_text(folder / "strip.csv", table.to_csv(index=False, float_format="%.6g")))
-    print(write_text(folder / "strip.md", markdown(table)))
+    print(write_atomically(folder / "strip.csv", table.to_csv(index=False, float_format="%.6g")))
+    print(write_atomically(folder / "strip.md", markdown(table)))
     return 0
 
 

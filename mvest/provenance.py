@@ -10,14 +10,14 @@ import math
 import os
 import platform
 import subprocess
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
+from mvest.files import write_atomically
 
 KEY_PACKAGES = (
     "mvest",
@@ -154,9 +154,6 @@ def config_hash(config: Mapping[str, Any]) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Write data as JSON, whole or not at all.
 
-    The text goes to a temporary file beside the target, which then takes the target's name in one
-    step, so that neither an interruption nor a second process ever leaves or sees half a file.
-
     Parameters
     ----------
     path : Path
@@ -170,18 +167,7 @@ def write_json(path: Path, value: Any) -> None:
         If the data has no JSON form, or the file cannot be written.
     """
     text = json.dumps(_plain(value, "value"), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        try:
-            with temporary.open("x", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    write_atomically(path, text, sync=True)
 
 
 def _plain(value: Any, where: str) -> Any:

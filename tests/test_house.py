@@ -20,7 +20,7 @@ from packaging.utils import canonicalize_name
 import mvest
 from tests.places import ROOT
 
-LEAVES = ("mvest.errors", "mvest.units", "mvest.typing", "mvest.elements")
+LEAVES = ("mvest.errors", "mvest.files", "mvest.units", "mvest.typing", "mvest.elements")
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
     "mvest.valve.mesh.solid_mesh",
@@ -32,6 +32,7 @@ VALUE_OBJECTS = (
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest": (),
     "mvest.errors": LEAVES,
+    "mvest.files": LEAVES,
     "mvest.units": LEAVES,
     "mvest.typing": LEAVES,
     "mvest.elements": LEAVES,

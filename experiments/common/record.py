@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-import uuid
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvest.errors import MvestError, cannot_write
+from mvest.errors import MvestError
+from mvest.files import write_atomically
 from mvest.problem.study import Observation, StudyResult
 from mvest.provenance import provenance
 from mvest.reporting.expectation import confounded_record
@@ -180,23 +181,15 @@ def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> No
     """
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.npz")
-    try:
-        try:
-            np.savez_compressed(
-                temporary,
-                triangles=surface.triangles.astype(np.int32),
-                region=surface.region.astype(np.int8),
-                rest=surface.vertices.astype(np.float32),
-                observed=result.observation.positions.astype(np.float32),
-                fitted=result.fitted.astype(np.float32),
-                distance=np.asarray(result.distance, dtype=np.float64),
-            )
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    arrays: dict[str, Any] = {
+        "triangles": surface.triangles.astype(np.int32),
+        "region": surface.region.astype(np.int8),
+        "rest": surface.vertices.astype(np.float32),
+        "observed": result.observation.positions.astype(np.float32),
+        "fitted": result.fitted.astype(np.float32),
+        "distance": np.asarray(result.distance, dtype=np.float64),
+    }
+    write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
 def _list(values: FloatArray | None) -> list[Any] | None:

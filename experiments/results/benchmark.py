@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from mvest.errors import InputError, MvestError
-from mvest.reporting.files import write_text, write_with
+from mvest.files import write_atomically
 
 __all__ = ["benchmark_figure", "benchmark_table", "fitted_orders", "main"]
 
@@ -174,9 +174,9 @@ def main(arguments: Sequence[str] | None = None, results: Path = Path("results")
         if peers:
             parts += ["## The same pressurised sheet elsewhere", _readable(pd.DataFrame(peers))]
         written = [
-            write_with(results / "benchmark.csv", lambda p: table.to_csv(p, index=False)),
-            write_text(results / "benchmark.md", "\n\n".join(parts) + "\n"),
-            write_with(
+            write_atomically(results / "benchmark.csv", lambda p: table.to_csv(p, index=False)),
+            write_atomically(results / "benchmark.md", "\n\n".join(parts) + "\n"),
+            write_atomically(
                 results / "benchmark.png", lambda p: benchmark_figure(table).savefig(p, dpi=150)
             ),
         ]

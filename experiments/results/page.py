@@ -27,7 +27,7 @@ from experiments.sweeps.rows import (
     sweep_line,
 )
 from experiments.sweeps.tables import failure_rows, summary, table_note
-from mvest.reporting.files import write_text
+from mvest.files import write_atomically
 from mvest.reporting.pictures import embedded
 
 __all__ = ["REPORT", "write_report"]
@@ -147,7 +147,7 @@ def write_report(results: Path) -> Path:
             if (results / f"{name}.md").is_file()
         ],
     )
-    return write_text(results / REPORT, page)
+    return write_atomically(results / REPORT, page)
 
 
 def _place(sweep: Sweep) -> tuple[int, str]:

@@ -15,6 +15,7 @@ from filelock import FileLock
 
 from experiments.runner.request import Request, model_settings
 from mvest.errors import InputError
+from mvest.files import remove_parts
 from mvest.provenance import provenance, write_json
 
 __all__ = [
@@ -107,10 +108,7 @@ def clear(folder: Path) -> None:
     """Take away what an earlier attempt left, its marker first."""
     for name in (DONE, RESULT):
         (folder / name).unlink(missing_ok=True)
-    # Files are written under such names and then take their own: these never did.
-    for place in folder.glob(".*.*"):
-        if place.suffix in (".tmp", ".npz", ".png", ".pdf", ".csv", ".md", ".tex"):
-            place.unlink(missing_ok=True)
+    remove_parts(folder)
 
 
 def require_writable(folder: Path) -> None:

@@ -36,8 +36,8 @@ from experiments.sweeps.setting_figures import (
 from experiments.sweeps.start_figures import basin_figure, paths_figure
 from experiments.sweeps.tables import summary, table_note
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.files import write_text
 from mvest.reporting.markup import latex_rows, latex_text, markdown_rows, markdown_text
 
 __all__ = ["COST", "SWEEPS", "Picture", "pictures_of", "read_sweeps", "write_sweep"]
@@ -157,7 +157,7 @@ def _write_tables(base: Path, sweep: Sweep) -> list[Path]:
         "_table.tex": _latex(sweep, reading, line),
         "_cost.csv": _csv(cost, [*factors, "run", "job"], notes),
     }
-    return [write_text(base.with_name(base.name + end), text) for end, text in texts.items()]
+    return [write_atomically(base.with_name(base.name + end), text) for end, text in texts.items()]
 
 
 def _csv(rows: list[dict[str, Any]], otherwise: list[str], notes: tuple[str, ...]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,8 @@ from mvest.cases.error_file import write_error_samples
 from mvest.cases.paths import CASE_FILE
 from mvest.cases.schema import VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.valve.io.surface_files import write_surface
 
 __all__ = ["write_case"]
@@ -48,17 +47,7 @@ def write_case(folder: Path | str, case: ValveCase) -> Path:
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
     _check_reference(case)
-    try:
-        temporary = Path(tempfile.mkdtemp(dir=target.parent, prefix=".part-"))
-        try:
-            _write_files(temporary, case)
-            temporary.chmod(0o755)
-            temporary.replace(target)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-    except OSError as fault:
-        raise cannot_write(target, fault) from fault
-    return target
+    return write_atomically(target, lambda part: _write_files(part, case))
 
 
 def _check_reference(case: ValveCase) -> None:
@@ -78,6 +67,7 @@ def _check_reference(case: ValveCase) -> None:
 
 
 def _write_files(folder: Path, case: ValveCase) -> None:
+    folder.mkdir()
     chordae = case.chordae
     document: dict[str, Any] = {
         "version": VERSION,

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.imaging.reading.stated import fault
-from mvest.imaging.writing.files import checked_path, write_whole
+from mvest.imaging.writing.files import checked_path
 from mvest.typing import FloatArray
 
 __all__ = ["PointList", "read_markups", "write_markups"]
@@ -120,8 +121,7 @@ def write_markups(path: Path | str, lists: Mapping[str, PointList]) -> Path:
         ],
     }
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_whole(target, lambda file: file.write_bytes(text.encode()))
-    return target
+    return write_atomically(target, text)
 
 
 def read_markups(path: Path | str) -> dict[str, PointList]:

@@ -17,7 +17,8 @@ from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 
 from mvest.errors import InputError
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.files import write_atomically
+from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["iterates_figure", "save_figure", "save_figure_with", "valve_figure", "write_study"]
@@ -126,8 +127,8 @@ def write_study(
     base = folder / record["experiment"]
     text = f"# {record['title']}\n\n{words}\n\n{provenance_line(record)}\n"
     return [
-        write_with(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
-        write_text(base.with_suffix(".md"), text),
+        write_atomically(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
+        write_atomically(base.with_suffix(".md"), text),
         *save_figure(base, figure, record),
     ]
 
@@ -158,7 +159,7 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     for suffix, entries in metadata.items():
         path = base.with_name(base.name + suffix)
         written.append(
-            write_with(
+            write_atomically(
                 path,
                 lambda file, entries=entries: figure.savefig(file, dpi=DPI, metadata=entries),  # type: ignore[misc]
             )

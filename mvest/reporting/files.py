@@ -1,16 +1,15 @@
-"""Writing result files whole or not at all, each saying where it came from."""
+"""Result files, each saying where it came from."""
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mvest.errors import cannot_write
 from mvest.provenance import write_json
 
-__all__ = ["keep_record", "provenance_line", "write_text", "write_with"]
+__all__ = ["keep_record", "provenance_line"]
 
 HASH_DIGITS = 12
 
@@ -25,35 +24,6 @@ def provenance_line(record: Mapping[str, Any]) -> str:
         f"configuration {source['config_hash'][:HASH_DIGITS]}, "
         f"mesh {source['mesh_hash'][:HASH_DIGITS]}, seed {source['seed']}"
     )
-
-
-def write_with(path: Path, write: Callable[[Path], None]) -> Path:
-    """Let ``write`` make a temporary file beside ``path``, which then takes its name in one step.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    temporary = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")
-    try:
-        try:
-            write(temporary)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    return path
-
-
-def write_text(path: Path, text: str) -> Path:
-    """Write UTF-8 text, whole or not at all."""
-    return write_with(path, lambda temporary: _write(temporary, text))
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
 
 
 def keep_record(results: Path, record: Mapping[str, Any]) -> None:

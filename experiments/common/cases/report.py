@@ -19,8 +19,8 @@ from experiments.common.cases.tables import (
 )
 from experiments.studies.patient.population import write_population_tables
 from mvest.errors import cannot_write
+from mvest.files import write_atomically
 from mvest.provenance import write_json
-from mvest.reporting.files import write_text
 from mvest.reporting.markup import number
 
 __all__ = ["case_text", "publish_patient", "write_case_tables"]
@@ -56,7 +56,7 @@ def _truth(row: Mapping[str, Any]) -> str:
 def write_case_tables(folder: Path, record: Record) -> list[Path]:
     """``unknowns.csv`` of one case."""
     rows = [{key: row.get(key) for key in UNKNOWN_COLUMNS} for row in record["unknowns"]]
-    return [write_text(folder / "unknowns.csv", pd.DataFrame(rows).to_csv(index=False))]
+    return [write_atomically(folder / "unknowns.csv", pd.DataFrame(rows).to_csv(index=False))]
 
 
 UNKNOWN_COLUMNS = (

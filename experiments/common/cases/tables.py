@@ -18,11 +18,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, same_scale
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.figures import corner_colours, distance_top, spread
 from mvest.reporting.figures import DISTANCE_MAP, save_figure
-from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
 
 __all__ = [
@@ -379,8 +380,9 @@ def write_table(
     """Write a table as CSV, Markdown and LaTeX, with notes and provenance; returns the paths."""
     words = "\n\n".join(notes)
     comment = "".join(f"% {note}\n" for note in [*notes, line])
+    text = f"{markdown_rows(readable)}\n\n{words}\n\n{line}\n"
     return [
-        write_text(base.with_suffix(".csv"), f"# {line}\n" + table.to_csv(index=False)),
-        write_text(base.with_suffix(".md"), f"{markdown_rows(readable)}\n\n{words}\n\n{line}\n"),
-        write_text(base.with_suffix(".tex"), comment + latex_rows(readable)),
+        write_atomically(base.with_suffix(".csv"), f"# {line}\n" + table.to_csv(index=False)),
+        write_atomically(base.with_suffix(".md"), text),
+        write_atomically(base.with_suffix(".tex"), comment + latex_rows(readable)),
     ]

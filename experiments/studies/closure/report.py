@@ -11,8 +11,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import keep_record, provenance_line, write_text, write_with
+from mvest.reporting.files import keep_record, provenance_line
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["closure_figure", "closure_text", "publish_closure", "write_closure_tables"]
@@ -122,8 +123,8 @@ def write_closure_tables(folder: Path, record: Record) -> list[Path]:
     table = pd.DataFrame(record["rows"])
     text = f"# {record['title']}\n\n{_summary(record)}\n\n{provenance_line(record)}\n"
     return [
-        write_with(folder / "closure.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "closure.md", text),
+        write_atomically(folder / "closure.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "closure.md", text),
     ]
 
 

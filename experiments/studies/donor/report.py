@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
-from mvest.reporting.files import keep_record, provenance_line, write_text
+from mvest.reporting.files import keep_record, provenance_line
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["donor_figure", "donor_text", "publish_donor", "write_donor_tables"]
@@ -208,8 +209,8 @@ def write_donor_tables(folder: Path, record: Record) -> list[Path]:
     text = f"{title}\n\n{_readable(record)}\n\n<sub>{line}</sub>\n"
     note = f"# {record['claim']}\n# data: {record['data']['citation']}\n# {line}\n"
     return [
-        write_text(folder / "donor.csv", note + table),
-        write_text(folder / "donor.md", text),
+        write_atomically(folder / "donor.csv", note + table),
+        write_atomically(folder / "donor.md", text),
     ]
 
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import pandas as pd
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import iterates_figure, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, markdown_rows, with_std
 
 __all__ = ["external_text", "write_external_tables"]
@@ -89,8 +90,8 @@ def write_external_tables(folder: Path, record: Record) -> list[Path]:
         f"{provenance_line(record)}\n"
     )
     written = [
-        write_with(folder / "external.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "external.md", text),
+        write_atomically(folder / "external.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "external.md", text),
     ]
     if record["iterates"]:
         written += save_figure(folder / "iterates", iterates_figure(record), record)

@@ -26,8 +26,8 @@ from mvest.estimation import (
 )
 from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
 from mvest.estimation.transform import to_filter
+from mvest.files import write_atomically
 from mvest.observation.vertices import ObservedFrames
-from mvest.reporting.files import write_with
 from mvest.typing import FloatArray
 
 __all__ = ["Problem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
@@ -254,7 +254,7 @@ def _run_all(problem: Problem, points: FloatArray, store: Path) -> None:
         prediction = problem.model(m)
         scale = m * log_prior.std if prediction.converged else 1.0
         write = partial(np.savez, y=prediction.y, by_x=prediction.jacobian * scale)
-        write_with(store / f"{k}.npz", write)
+        write_atomically(store / f"{k}.npz", write)
 
 
 def _read(store: Path, number: int) -> tuple[FloatArray, FloatArray]:

@@ -12,8 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -289,8 +290,8 @@ def write_filter_tables(folder: Path, record: Record) -> list[Path]:
     table = pd.DataFrame(_rows(record))
     text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
     return [
-        write_with(folder / "filters.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "filters.md", text),
+        write_atomically(folder / "filters.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "filters.md", text),
     ]
 
 

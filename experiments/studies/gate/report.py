@@ -8,7 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.files import write_atomically
+from mvest.reporting.files import provenance_line
 
 __all__ = ["gate_text", "write_gate_tables"]
 
@@ -57,6 +58,6 @@ def write_gate_tables(folder: Path, record: Record) -> list[Path]:
     table = _frame(record)
     text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
     return [
-        write_with(folder / "gate.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "gate.md", text),
+        write_atomically(folder / "gate.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "gate.md", text),
     ]

@@ -11,8 +11,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.studies.identifiability.figures import write_identifiability_figures
+from mvest.files import write_atomically
 from mvest.reporting.expectation import alike_words
-from mvest.reporting.files import provenance_line, write_text
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
 
 __all__ = [
@@ -239,9 +240,9 @@ def write_identifiability_tables(folder: Path, record: Record) -> list[Path]:
     text = "\n".join([f"# {record['title']}", "", *_readable(record), "", f"<sub>{line}</sub>", ""])
     tex = f"% {line}\n{latex_rows(_design_rows(record))}"
     return [
-        write_text(folder / "identifiability.csv", csv),
-        write_text(folder / "identifiability.md", text),
-        write_text(folder / "identifiability.tex", tex),
+        write_atomically(folder / "identifiability.csv", csv),
+        write_atomically(folder / "identifiability.md", text),
+        write_atomically(folder / "identifiability.tex", tex),
     ]
 
 

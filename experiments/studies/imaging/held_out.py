@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from experiments.common.mirror import build
 from experiments.common.progress import PartBar
 from experiments.studies.imaging.parallel import in_processes
-from experiments.studies.imaging.store import ImagingStore, write_arrays
+from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.trials import (
     SEQUENCES,
     VOLUMES,
@@ -22,6 +23,7 @@ from experiments.studies.imaging.trials import (
     try_sequence,
     try_volume,
 )
+from mvest.files import write_atomically
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.moving_valve import MovingValve
 from mvest.typing import FloatArray
@@ -134,7 +136,8 @@ def _volumes(
         done = in_processes(try_volume, calls(), store.processes)
         for (_, places), (found, _) in zip(left, done, strict=True):
             for size, place in places.items():
-                write_arrays(place, {"row": np.array(json.dumps(found[str(size)]))})
+                row = np.array(json.dumps(found[str(size)]))
+                write_atomically(place, partial(np.savez, row=row))
             bar.step()
     rows: dict[int, list[dict[str, Any]]] = {}
     for _, places in jobs:
@@ -167,7 +170,7 @@ def _sequences(
         with PartBar(f"volumes over time, {title}", len(left), "volume") as bar:
             done = in_processes(try_sequence, calls, store.processes)
             for place, (found, _) in zip(left.values(), done, strict=True):
-                write_arrays(place, found)
+                write_atomically(place, partial(np.savez, **found))
                 bar.step()
     return [_read(place) for place in places.values()]
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import resource
 import time
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from experiments.common.progress import PartBar
 from experiments.common.truth import truth_key
 from experiments.studies.imaging.parallel import in_processes
 from mvest.errors import cannot_write
+from mvest.files import write_atomically
 from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.learning.boosting import Boosters
@@ -349,26 +350,6 @@ class ImagingStore:
             yield
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write an ``.npz`` file, whole or not at all.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.tmp")
-    try:
-        try:
-            with part.open("xb") as stream:
-                np.savez(stream, **arrays)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
 def _cpu_s() -> float:
     """CPU seconds of this process and of those that it started and that have ended."""
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
@@ -379,7 +360,7 @@ def _write_samples(path: Path, samples: Samples, cpu_s: float) -> None:
     arrays: dict[str, Any] = {"cpu_s": np.array(cpu_s)}
     for name, (x, y) in samples.items():
         arrays |= {f"{name}.x": x, f"{name}.y": y}
-    write_arrays(path, arrays)
+    write_atomically(path, partial(np.savez, **arrays))
 
 
 def _spent(path: Path) -> Spent:

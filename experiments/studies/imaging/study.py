@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -19,6 +18,7 @@ from experiments.studies.imaging.record import imaging_record
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.tables import imaging_table, imaging_words
 from mvest.errors import ConfigurationError, InputError, cannot_write
+from mvest.files import write_atomically
 from mvest.imaging.detection.model import (
     MODEL_FILE,
     Accuracy,
@@ -130,11 +130,9 @@ def publish_model(config: Values, record: Values, folder: Path) -> None:
         )
     try:
         MODEL_FILE.parent.mkdir(parents=True, exist_ok=True)
-        part = MODEL_FILE.with_name(f".{MODEL_FILE.name}.tmp")
-        shutil.copyfile(source, part)
-        part.replace(MODEL_FILE)
     except OSError as error:
         raise cannot_write(MODEL_FILE, error) from error
+    write_atomically(MODEL_FILE, source.read_bytes())
     print(f"Detectors in {MODEL_FILE}")
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import COLOURS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import provenance_line
 
 __all__ = ["biaxial_figure", "curves_figure", "law_text", "write_law_tables"]
 
@@ -211,8 +212,8 @@ def write_law_tables(folder: Path, record: Record) -> list[Path]:
     table = _frame(record)
     parts = [f"# {record['title']}", _readable(record), _excised(record), provenance_line(record)]
     return [
-        write_with(folder / "law.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "law.md", "\n\n".join(parts) + "\n"),
+        write_atomically(folder / "law.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "law.md", "\n\n".join(parts) + "\n"),
         *(save_figure(folder / "law", curves_figure(record), record) if record["curves"] else []),
         *save_figure(folder / "law_biaxial", biaxial_figure(record), record),
     ]

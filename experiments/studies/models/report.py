@@ -11,8 +11,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
-from mvest.reporting.files import provenance_line, write_text, write_with
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, markdown_rows, number
 from mvest.typing import FloatArray
 
@@ -225,8 +226,8 @@ def write_models_tables(folder: Path, record: Record) -> list[Path]:
     )
     text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
     written = [
-        write_with(folder / "models.csv", lambda path: table.to_csv(path, index=False)),
-        write_text(folder / "models.md", text),
+        write_atomically(folder / "models.csv", lambda path: table.to_csv(path, index=False)),
+        write_atomically(folder / "models.md", text),
     ]
     if record["rows"]:
         written += save_figure(folder / "models", models_figure(record), record)

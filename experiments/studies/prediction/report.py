@@ -8,8 +8,9 @@ from typing import Any
 
 import pandas as pd
 
+from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import keep_record, provenance_line, write_text
+from mvest.reporting.files import keep_record, provenance_line
 from mvest.reporting.markup import MISSING, markdown_rows, number
 
 __all__ = [
@@ -292,8 +293,8 @@ def write_prediction_tables(folder: Path, record: Record) -> list[Path]:
     table = _frame(record).to_csv(index=False, float_format="%.6g")
     text = f"# {record['title']}\n\n{prediction_text(record)}\n\n<sub>{line}</sub>\n"
     return [
-        write_text(folder / "prediction.csv", table),
-        write_text(folder / "prediction.md", text),
+        write_atomically(folder / "prediction.csv", table),
+        write_atomically(folder / "prediction.md", text),
     ]
 
 

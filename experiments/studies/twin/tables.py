@@ -12,7 +12,8 @@ from typing import Any
 
 import pandas as pd
 
-from mvest.reporting.files import provenance_line, write_text
+from mvest.files import write_atomically
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std
 
 __all__ = ["frame", "readable", "text_table", "write_tables"]
@@ -131,9 +132,9 @@ def write_tables(folder: Path, name: str, records: Sequence[Record]) -> list[Pat
     markdown = f"# {records[0]['title']}\n\n{table}\n\n{_truth(records)}\n\n{notes}\n"
     tex = "".join(f"% {line}\n" for line in lines) + _latex(reading)
     return [
-        write_text(folder / f"{name}.csv", csv),
-        write_text(folder / f"{name}.md", markdown),
-        write_text(folder / f"{name}.tex", tex),
+        write_atomically(folder / f"{name}.csv", csv),
+        write_atomically(folder / f"{name}.md", markdown),
+        write_atomically(folder / f"{name}.tex", tex),
     ]
 
 

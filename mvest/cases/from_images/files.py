@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.imaging.landmarks import landmarks
 from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing import voxelise_leaflets, write_segmentation
-from mvest.valve.io.surface_files import region_arrays, write_surface, write_whole
+from mvest.valve.io.surface_files import region_arrays, write_surface
 
 __all__ = ["write_for_slicer", "write_landmarks", "write_surfaces"]
 
@@ -41,13 +42,7 @@ def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -
         write_surface(file, sequence.vertices[t], layout.triangles, points, cells)
         files.append({"name": file.name, "time": float(time)})
     text = json.dumps({"file-series-version": "1.0", "files": files}, indent=1)
-    index = folder / f"{name}.vtp.series"
-    write_whole(index, lambda file: _write(file, text + "\n"))
-    return index
-
-
-def _write(file: Path, text: str) -> None:
-    file.write_text(text, encoding="utf-8")
+    return write_atomically(folder / f"{name}.vtp.series", text + "\n")
 
 
 def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:

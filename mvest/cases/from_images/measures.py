@@ -12,10 +12,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.io.surface_files import write_whole
 from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names
 
 __all__ = [
@@ -195,14 +195,8 @@ def write_measures(folder: Path, rows: Sequence[Row], name: str = "measures") ->
         key: dict(zip(("unit", "meaning"), measure_meaning(key), strict=True)) for key in rows[0]
     }
     text = json.dumps({"measures": meanings, "frames": list(rows)}, indent=1, allow_nan=False)
-    write_whole(table, write_csv)
-    write_whole(document, lambda file: _write_text(file, text + "\n"))
-    return [table, document]
+    return [write_atomically(table, write_csv), write_atomically(document, text + "\n")]
 
 
 def _cell(value: float | None) -> str:
     return "" if value is None else f"{value:.7g}"
-
-
-def _write_text(file: Path, text: str) -> None:
-    file.write_text(text, encoding="utf-8")

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.imaging.detection.boundary import BoundaryDetector
 from mvest.imaging.detection.landmark_detector import LandmarkDetector
 from mvest.imaging.detection.pose_search import REFINEMENTS, PoseSearch
@@ -173,15 +174,9 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         arrays["accuracy.correlation_length_mm"] = np.array(told.correlation_length_mm)
         arrays["accuracy.samples"] = told.samples.astype(np.float32)
         arrays["accuracy.tip_samples"] = told.tip_samples.astype(np.float32)
-    target = Path(path)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
-    try:
-        part = target.with_name(f".part-{target.name}")
-        part.write_bytes(buffer.getvalue())
-        part.replace(target)
-    except OSError as fault:
-        raise cannot_write(target, fault) from fault
+    write_atomically(path, buffer.getvalue())
 
 
 def load_model(path: Path | str) -> DetectionModel:

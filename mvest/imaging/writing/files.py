@@ -1,11 +1,9 @@
-"""How files of the image step are put in place: whole or not at all."""
+"""What the writers of the image step have in common."""
 
 from __future__ import annotations
 
 import io
-import os
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
 
-__all__ = ["checked_path", "write_nrrd", "write_whole"]
+__all__ = ["checked_path", "write_nrrd"]
 
 
 def checked_path(path: Path | str, suffix: str) -> Path:
@@ -24,28 +23,6 @@ def checked_path(path: Path | str, suffix: str) -> Path:
     if not target.name.endswith(suffix) or target.name == suffix:
         raise InputError(f"{target}: name {target.name!r}, expected one that ends in {suffix}")
     return target
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then give it that name.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist or cannot be written.
-    """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        try:
-            write(temporary)
-            temporary.chmod(0o644)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror or fault}") from fault
 
 
 def write_nrrd(path: Path, data: NDArray[np.generic], header: Mapping[str, Any]) -> None:
@@ -59,16 +36,9 @@ def write_nrrd(path: Path, data: NDArray[np.generic], header: Mapping[str, Any])
     content = io.BytesIO()
     nrrd.write(content, data, dict(header), compression_level=1)
     content.seek(0)
-    lines = []
+    lines: list[bytes] = []
     while (line := content.readline()) != b"\n":
         # pynrrd's comments hold the time of writing.
         if not line.startswith(b"#"):
             lines.append(line)
-    start = content.tell()
-
-    def write(file: Path) -> None:
-        with file.open("wb") as stream, content.getbuffer() as bytes_:
-            stream.writelines([*lines, b"\n"])
-            stream.write(bytes_[start:])
-
-    write_whole(path, write)
+    write_atomically(path, b"".join([*lines, b"\n", content.read()]))

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from mvest.errors import InputError, cannot_write
+from mvest.files import write_atomically
 from mvest.reporting.case import words
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.figures import (
@@ -36,7 +37,6 @@ from mvest.reporting.case.plots import (
 )
 from mvest.reporting.case.view import case_view
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.files import write_text
 from mvest.reporting.pictures import embedded
 
 __all__ = ["REPORT", "write_case_report"]
@@ -111,7 +111,7 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         files=[path.name for path in written],
         **_content(record, shapes, names, found),
     )
-    return [write_text(folder / REPORT, page), *written]
+    return [write_atomically(folder / REPORT, page), *written]
 
 
 def _figures(

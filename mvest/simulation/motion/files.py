@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import uuid
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
+from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.simulation.motion.population import Population
@@ -65,16 +66,7 @@ def save_population(path: Path, population: Population) -> None:
             for name in ("times", "vertices", "tips", "thickness", "chord_phi", "chord_s")
         },
     }
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        try:
-            with temporary.open("xb") as stream:
-                np.savez_compressed(stream, **arrays)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    write_atomically(path, partial(np.savez_compressed, **arrays))
 
 
 def load_population(path: Path) -> Population:

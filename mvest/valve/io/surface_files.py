@@ -6,11 +6,9 @@ file appears under its name only once it is complete.
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import GeometryError, InputError
+from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.io.vtp import PolyData, read_vtp, write_vtp
@@ -93,28 +92,6 @@ def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
-
-
-def write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a temporary file beside `path`, then give it that name.
-
-    Raises
-    ------
-    InputError
-        The folder does not exist or cannot be written.
-    """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        try:
-            write(temporary)
-            temporary.chmod(0o644)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be written: {fault.strerror or fault}") from fault
 
 
 def read_mesh(path: Path | str) -> meshio.Mesh:
@@ -223,10 +200,10 @@ def write_surface(
             raise InputError(f"{target}: {suffix[1:].upper()} holds no data; write .vtu or .vtp")
         # PLY knows no 64-bit integers.
         mesh = meshio.Mesh(points, [("triangle", faces.astype(np.int32))])
-        write_whole(target, lambda file: _WRITERS[suffix](str(file), mesh))
+        write_atomically(target, lambda file: _WRITERS[suffix](str(file), mesh))
     elif suffix == ".vtp":
         content = PolyData(points, faces, at_points, at_cells)
-        write_whole(target, lambda file: write_vtp(file, content))
+        write_atomically(target, lambda file: write_vtp(file, content))
     else:
         write_cells(target, points, [("triangle", faces)], at_points, cell_arrays([at_cells]))
     return target
@@ -258,7 +235,7 @@ def write_cells(
 ) -> None:
     """Write blocks of cells (in VTK's node order) as compressed VTU."""
     mesh = meshio.Mesh(points, cells, point_data=dict(point_data), cell_data=dict(cell_data))
-    write_whole(
+    write_atomically(
         path, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
     )
 
@@ -391,5 +368,5 @@ def write_series(
         write_cells(state, frames[number], cells, checked, cell_data or {})
         ET.SubElement(collection, "DataSet", timestep=repr(float(time)), file=state.name)
     tree = ET.ElementTree(root)
-    write_whole(index, lambda file: tree.write(file, xml_declaration=True, encoding="utf-8"))
+    write_atomically(index, lambda file: tree.write(file, xml_declaration=True, encoding="utf-8"))
     return index

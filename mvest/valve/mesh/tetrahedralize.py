@@ -15,11 +15,14 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
+from mvest.errors import ConfigurationError, GeometryError, MeshingError, cannot_write
+from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
@@ -292,18 +295,10 @@ def _checked(
 def _save(path: Path, mesh: TetrahedralMesh) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file, nodes=mesh.nodes, tetrahedra=mesh.tetrahedra, sha256=mesh.sha256
-                )
-            Path(temporary).replace(path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-    except OSError as fault:
-        raise InputError(f"{path}: the mesh cannot be stored: {fault}") from fault
+    except OSError as error:
+        raise cannot_write(path.parent, error) from error
+    arrays: dict[str, Any] = {"nodes": mesh.nodes, "tetrahedra": mesh.tetrahedra}
+    write_atomically(path, partial(np.savez_compressed, **arrays, sha256=mesh.sha256))
 
 
 def _load(path: Path) -> tuple[FloatArray, IntArray]:

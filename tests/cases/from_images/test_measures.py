@@ -97,7 +97,7 @@ def test_the_table_has_a_row_per_frame_and_empty_cells(tmp_path, rows):
 def test_nothing_to_write_and_nowhere_to_write_are_refused(tmp_path, rows):
     with pytest.raises(InputError, match="no frames"):
         write_measures(tmp_path, [])
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot write"):
         write_measures(tmp_path / "none", rows)
 
 

@@ -78,6 +78,6 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
         write_sequence_nrrd(tmp_path / "a.nrrd", v.sequence())
     with pytest.raises(InputError, match="frames of type float64, expected uint8"):
         write_sequence_nrrd(tmp_path / "a.seq.nrrd", v.sequence("float64"))
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot write"):
         write_sequence_nrrd(tmp_path / "missing" / "a.seq.nrrd", v.sequence())
     assert list(tmp_path.iterdir()) == []

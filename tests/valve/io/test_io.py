@@ -239,7 +239,7 @@ def box_with(shapes, **change):
     ("name", "change", "message"),
     [
         ("a.off", {}, "extension"),
-        ("no/where/a.vtu", {}, "cannot be written"),
+        ("no/where/a.vtu", {}, "cannot write"),
         ("a.vtu", {"vertices": np.zeros((8, 2))}, "shape"),
         ("a.vtu", {"vertices": np.full((8, 3), np.nan)}, "not finite"),
         ("a.vtp", {"triangles": np.zeros((0, 3), int)}, "shape"),

@@ -130,7 +130,7 @@ def test_bad_settings_are_one_clear_error(change, message):
 def test_an_unwritable_store_is_one_clear_error(shapes, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_mesh", lambda *_: (np.array(CUBE[0], float), np.array(CUBE[1])))
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be stored"):
+    with pytest.raises(InputError, match="cannot write"):
         tetrahedralize(*shapes.box(), COARSE, tmp_path / "file")
 
 

@@ -1,0 +1,98 @@
+"""Files and folders are there whole, or as they were before."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from mvest.errors import InputError
+from mvest.files import remove_parts, write_atomically
+
+
+@pytest.mark.parametrize("sync", [False, True])
+@pytest.mark.parametrize(
+    "content",
+    ["\u00e5b\n", "\u00e5b\n".encode(), lambda part: part.write_bytes("\u00e5b\n".encode())],
+)
+def test_text_bytes_and_what_a_function_writes_take_the_name(tmp_path, content, sync):
+    path = tmp_path / "table.seq.csv"
+    path.write_text("before")
+    assert write_atomically(str(path), content, sync=sync) == path
+    assert path.read_bytes() == b"\xc3\xa5b\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_function_is_given_a_hidden_name_with_the_same_ending_beside_the_file(tmp_path):
+    given = []
+    write_atomically(tmp_path / "a.seq.nrrd", lambda part: (given.append(part), part.touch()))
+    assert given[0].parent == tmp_path
+    assert given[0].name.startswith(".part-")
+    assert given[0].name.endswith("-a.seq.nrrd")
+
+
+def test_a_folder_takes_the_place_of_the_one_before_it(tmp_path):
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "old").touch()
+
+    def fill(part: Path) -> None:
+        part.mkdir()
+        (part / "new").touch()
+        assert (folder / "old").exists()
+
+    write_atomically(folder, fill)
+    assert [path.name for path in folder.iterdir()] == ["new"]
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_an_interruption_leaves_what_was_there(tmp_path, error, kind):
+    path = tmp_path / "result"
+    path.write_text("before")
+
+    def fill(part: Path) -> None:
+        if kind == "folder":
+            part.mkdir()
+            part = part / "one"
+        part.write_text("half")
+        raise error
+
+    with pytest.raises(error):
+        write_atomically(path, fill)
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name_where_that_is_asked_for(
+    tmp_path, monkeypatch
+):
+    path, synced = tmp_path / "result", []
+    monkeypatch.setattr(os, "fsync", lambda _descriptor: synced.append(path.exists()))
+    write_atomically(path, "a")
+    assert synced == []
+    path.unlink()
+    write_atomically(path, "a", sync=True)
+    assert synced == [False]
+
+
+def test_what_cannot_be_written_is_one_line_of_the_family(tmp_path):
+    with pytest.raises(InputError, match=r"^cannot write .*absent.a: No such .*must exist"):
+        write_atomically(tmp_path / "absent" / "a", "")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(InputError, match=r"cannot write .*taken"):
+        write_atomically(tmp_path / "taken", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
+    for name in ("a.npz", ".part-01-a.npz", ".part-02-b.npz", ".part-03-aa.npz", ".lock"):
+        (tmp_path / name).touch()
+    (tmp_path / ".part-04-a.npz").mkdir()
+    (tmp_path / ".part-04-a.npz" / "half").touch()
+    remove_parts(tmp_path, "a.npz")
+    left = {"a.npz", ".part-02-b.npz", ".part-03-aa.npz", ".lock"}
+    assert {path.name for path in tmp_path.iterdir()} == left
+    remove_parts(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.npz", ".lock"}
+    remove_parts(tmp_path / "absent")
