@@ -19,14 +19,10 @@ import numpy as np
 import pandas as pd
 
 from mvest.files import write_atomically
-from mvest.mechanics import (
-    NewtonSettings,
-    PoissonReading,
-    TransverselyIsotropic,
-    box,
-    outer_faces,
-    simulate_body,
-)
+from mvest.mechanics.blocks import box, outer_faces
+from mvest.mechanics.body import simulate_body
+from mvest.mechanics.law.biot import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.steps import NewtonSettings
 from mvest.typing import FloatArray
 
 __all__ = ["CASES", "MATERIALS", "Bending", "Case", "bend", "main", "strip_table"]

@@ -1,11 +1,29 @@
 """Patient-specific mitral leaflet stiffness, estimated from how the valve is seen to move.
 
+The front door: what a user needs first, each loaded when it is asked for. What they are made of,
+and all the rest, is in the rooms.
+
+* A valve: `Template`, `TemplateParameters`, `Valve`; `structured_mesh` fills its leaflets.
+* A closed valve from moduli: `ClosureModel` with `MechanicsSettings` and `TissueSettings`;
+  `run_gate` asks whether it can be trusted.
+* Moduli from a closed valve: `simulate_observation`, `estimate`; a filter (`PaperFilter`,
+  `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`, `MonteCarloFilter`) from
+  a `Gaussian` prior, for any model that returns a `Prediction`; `identifiability`.
+* A patient: `read_case`, `write_case`, `ValveCase`; `personalise_case` with `PersonaliseSettings`.
+* Images: `read_volume` with its `Modality`, `detect_valve` with the `default_model`.
+* Mechanics without a valve: `simulate_body`, `TransverselyIsotropic`.
+* `MvestError`, the family of all errors that a user can cause; `units`.
+
 Data flows one way, and the packages are its stations: `imaging` turns volumes into a `valve`,
-`mechanics` moves the valve under pressure, `estimation` finds the parameters whose motion is the
-observed one, and `reporting` turns estimates into tables and figures. `model` and `study` join
-them.
+`mechanics` moves the valve under pressure (`closure`), `estimation` finds the parameters whose
+motion is the observed one (`problem`, `personalise`), and `reporting` turns estimates into tables
+and figures.
 
 Inside the library lengths are mm, times s, masses tonne, forces N and stresses MPa.
 """
 
+import lazy_loader
+
 __version__ = "0.1.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

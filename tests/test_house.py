@@ -230,8 +230,11 @@ def test_conf_is_data() -> None:
         ("mvest.problem.study", "from experiments.run import main"),
         ("mvest.problem.study", "import tests.test_house"),
         ("experiments.run", "from tests.valve import shapes"),
-        # The package's face stays empty, and a new station has to be given its place.
+        # The package's face imports lazily, nothing here imports the face, and a new station has to
+        # be given its place.
         ("mvest", "from mvest.errors import MvestError"),
+        ("mvest.problem.study", "import mvest"),
+        ("mvest.problem.study", "from mvest import Gaussian"),
         ("mvest.helpers", "import math"),
     ],
 )  # fmt: skip
@@ -280,6 +283,48 @@ def test_relative_imports_are_resolved(
     module: str, is_package: bool, source: str, expected: str
 ) -> None:
     assert [found.name for found in imports(source, module, is_package)] == [expected]
+
+
+def through_faces(source: str, module: str, faces: dict[str, set[str]]) -> list[str]:
+    """Names that a module takes from a lazy face instead of the module that defines them."""
+    return [
+        f"{module}:{line} imports {name}"
+        for line, name, _ in imports(source, module)
+        if name.rpartition(".")[2] in faces.get(name.rpartition(".")[0], ())
+    ]
+
+
+def test_nothing_in_the_house_goes_through_a_lazy_face() -> None:
+    # What a module depends on is read from its imports, and a face would hide it.
+    faces = {
+        ".".join(stub.relative_to(ROOT).parent.parts): {
+            alias.name
+            for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+            if isinstance(node, ast.ImportFrom) and node.module
+            for alias in node.names
+        }
+        for stub in (ROOT / "mvest").rglob("__init__.pyi")
+    }
+    assert "Gaussian" in faces["mvest"] & faces["mvest.estimation"]
+    hidden = [
+        message
+        for module, path in modules("mvest", "experiments")
+        for message in through_faces(path.read_text(encoding="utf-8"), module, faces)
+    ]
+    assert hidden == []
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("from mvest.estimation import Gaussian, filters", 1),
+        ("def f():\n    from mvest.estimation import Gaussian", 1),
+        ("from mvest.estimation.gaussian import Gaussian", 0),
+        ("import mvest.estimation", 0),
+    ],
+)
+def test_a_name_from_a_face_is_seen(source: str, count: int) -> None:
+    assert len(through_faces(source, "mvest.x", {"mvest.estimation": {"Gaussian"}})) == count
 
 
 # --- dependencies -------------------------------------------------------------------------------

@@ -13,20 +13,16 @@ from experiments.common.mirror import build
 from experiments.common.truth import StoredModel, truth_key
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import (
-    EnsembleFilter,
-    ExtendedFilter,
-    Filter,
-    Gaussian,
-    Identity,
-    IteratedFilter,
-    Log,
-    MonteCarloFilter,
-    PaperFilter,
-    Transform,
-    UnscentedFilter,
-    observation_noise,
-)
+from mvest.estimation.estimate import Filter
+from mvest.estimation.filters.ensemble import EnsembleFilter
+from mvest.estimation.filters.extended import ExtendedFilter
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.filters.monte_carlo import MonteCarloFilter
+from mvest.estimation.filters.paper import PaperFilter
+from mvest.estimation.filters.unscented import UnscentedFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import observation_noise
+from mvest.estimation.transform import Identity, Log, Transform
 from mvest.mechanics.parameters import is_positive, kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver

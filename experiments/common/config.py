@@ -16,16 +16,18 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from experiments.common.mirror import schema
 from experiments.studies.models.sheet.sheet import Sheet
-from mvest.closure.cycle import CycleProtocol
-from mvest.estimation import EnsembleFilter, MonteCarloFilter, SamplerSettings
+from mvest.closure.cycle.protocol import CycleProtocol
+from mvest.estimation.filters.ensemble import EnsembleFilter
+from mvest.estimation.filters.monte_carlo import MonteCarloFilter
+from mvest.estimation.filters.sampler import SamplerSettings
 from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
-from mvest.personalise import CaseMesh, PaperSettings
+from mvest.personalise.settings import CaseMesh, PaperSettings
 from mvest.provenance import config_hash
-from mvest.scenarios import Scenario
-from mvest.simulation.motion import PopulationSettings
+from mvest.scenarios.scenario import Scenario
+from mvest.simulation.motion.population import PopulationSettings
 from mvest.simulation.virtual_patient import Deviations, Simulation
 from mvest.valve.anatomy.template import TemplateParameters
 

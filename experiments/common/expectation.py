@@ -14,8 +14,8 @@ from experiments.common.cases.own_case import read_configured, settings_of
 from experiments.common.progress import SolveBar
 from experiments.common.whole_cycle import cycle_model, stored_cycle
 from experiments.studies.patient.study import make_patient
-from mvest.estimation import Prediction
-from mvest.personalise import foresee_case
+from mvest.estimation.prediction import Prediction
+from mvest.personalise.chain import foresee_case
 from mvest.problem.expectation import Foresight, foresee, foresee_model
 from mvest.problem.study import SharedStart, simulate_observation
 from mvest.provenance import config_hash

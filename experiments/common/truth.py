@@ -22,7 +22,7 @@ from filelock import FileLock
 
 import mvest
 from mvest.errors import InputError, cannot_write
-from mvest.estimation import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray
 

@@ -12,17 +12,16 @@ import numpy as np
 from experiments.common.forward import model_of
 from experiments.common.mirror import build
 from experiments.common.truth import StoredModel, truth_key
-from mvest.closure.cycle import CycleModel, CycleObservation, CycleProtocol
+from mvest.closure.cycle.model import CycleModel
+from mvest.closure.cycle.observation import CycleObservation
+from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.closure.robustness import GateCase
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import (
-    Estimate,
-    Gaussian,
-    Identifiability,
-    ObservationModel,
-    Prediction,
-    shift_by_model_error,
-)
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.identifiability import Identifiability
+from mvest.estimation.information.model_error import shift_by_model_error
+from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 

@@ -12,7 +12,7 @@ from experiments.runner.job import require_study
 from experiments.runner.tracking import require_no_password
 from experiments.studies.imaging.study import require_imaging
 from mvest.errors import ConfigurationError, InputError, MvestError
-from mvest.estimation import observation_noise
+from mvest.estimation.noise import observation_noise
 
 __all__ = ["require_admissible"]
 

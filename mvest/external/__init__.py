@@ -6,31 +6,6 @@ as an observation model of :mod:`mvest.estimation`. ``README.md`` beside this fi
 for those who write the program.
 """
 
-from mvest.external.contract import (
-    Answer,
-    Request,
-    read_answer,
-    read_points,
-    read_request,
-    write_answer,
-    write_points,
-    write_request,
-)
-from mvest.external.differences import Differences
-from mvest.external.model import ProcessModel
-from mvest.external.process import Command, Ending
+import lazy_loader
 
-__all__ = [
-    "Answer",
-    "Command",
-    "Differences",
-    "Ending",
-    "ProcessModel",
-    "Request",
-    "read_answer",
-    "read_points",
-    "read_request",
-    "write_answer",
-    "write_points",
-    "write_request",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,7 +16,7 @@ What is here, in the order data flows:
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
   time steps, Newton's method, sensitivities;
-* ``box``: blocks of cells and outer faces; ``body``: all of it without a valve.
+* ``blocks``: boxes of cells and outer faces; ``body``: all of it without a valve.
 
 A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):
 
@@ -37,31 +37,6 @@ A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at 
 ('completed', (5, 243, 3))
 """
 
-from mvest.mechanics.body import simulate_body
-from mvest.mechanics.box import box, outer_faces
-from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
-from mvest.mechanics.law.field import ModulusField, StiffPatch
-from mvest.mechanics.steps import Damping, NewtonSettings, Reason, Simulation, Step
-from mvest.mechanics.system import Factors, Loads, Parameter, System
+import lazy_loader
 
-__all__ = [
-    "BiotLaw",
-    "Damping",
-    "Factors",
-    "Loads",
-    "ModulusField",
-    "NewtonSettings",
-    "Parameter",
-    "PoissonReading",
-    "Reason",
-    "Simulation",
-    "Step",
-    "StiffPatch",
-    "System",
-    "TransverselyIsotropic",
-    "box",
-    "outer_faces",
-    "simulate",
-    "simulate_body",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

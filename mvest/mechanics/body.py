@@ -60,7 +60,7 @@ def simulate_body(
         ``(s,)`` s, end times of the steps, increasing, > 0.
     pressure_faces : array_like, optional
         ``(f, kf)`` nodes of the faces pressed on, normals out of the solid
-        (:func:`mvest.mechanics.box.outer_faces` finds all faces).
+        (:func:`mvest.mechanics.blocks.outer_faces` finds all faces).
     pressure : float, callable or array_like
         MPa, positive pushes against the normal: a constant, a function of the time (s), or a table
         ``(t, 2)`` of times and pressures, linear between its rows and constant outside.

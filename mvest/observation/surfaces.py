@@ -37,13 +37,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mvest.errors import InputError, MaterialError
-from mvest.estimation import ObservationModel, Prediction
 from mvest.estimation.noise import (
     NoiseCovariance,
     observation_noise,
     scaled_noise,
     stacked_noise,
 )
+from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import FRAMES
 from mvest.typing import BoolArray, FloatArray, IntArray

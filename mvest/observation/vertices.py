@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvest.errors import InputError, MaterialError
-from mvest.estimation import ObservationModel, Prediction
 from mvest.estimation.noise import NoiseCovariance, scaled_noise, stacked_noise
-from mvest.estimation.prediction import require_finite
+from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
 from mvest.observation.errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
 

@@ -7,26 +7,6 @@ considered, or left fixed, as each unknown says. Frames that are held out are pr
 shown.
 """
 
-from mvest.personalise.chain import foresee_case, personalise
-from mvest.personalise.model import build_model
-from mvest.personalise.result import FrameDistance, Personalised
-from mvest.personalise.settings import (
-    CaseMesh,
-    PaperSettings,
-    PersonaliseSettings,
-    Treatment,
-    Unknown,
-)
+import lazy_loader
 
-__all__ = [
-    "CaseMesh",
-    "FrameDistance",
-    "PaperSettings",
-    "PersonaliseSettings",
-    "Personalised",
-    "Treatment",
-    "Unknown",
-    "build_model",
-    "foresee_case",
-    "personalise",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,20 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.errors import GeometryError
-from mvest.estimation import (
-    Estimate,
-    Filter,
-    Gaussian,
-    IteratedFilter,
-    Log,
-    PaperFilter,
-    Prediction,
-    SchmidtFilter,
-    kalman_update,
-    observation_noise,
-)
+from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.filters.considered import SchmidtFilter
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.filters.paper import PaperFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import observation_noise
+from mvest.estimation.prediction import Prediction
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
-from mvest.estimation.transform import to_filter
+from mvest.estimation.transform import Log, to_filter
+from mvest.estimation.update import kalman_update
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.surfaces import (
@@ -51,7 +47,7 @@ from mvest.problem.study import Case, Observed, SharedStart, StudyResult, estima
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.band import Band
 
-__all__ = ["foresee_case", "personalise"]
+__all__ = ["foresee_case", "personalise_case"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
@@ -63,7 +59,7 @@ nothing new, and their correlation is factorised."""
 OnStep = Callable[[float, int], None]
 
 
-def personalise(
+def personalise_case(
     case: ValveCase,
     settings: PersonaliseSettings,
     *,

@@ -20,8 +20,8 @@ from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.displaced import displaced_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import MvestError
-from mvest.estimation import ObservationModel, Prediction
 from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalise.model import build_coarse

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mvest.cases.case import ValveCase
-from mvest.estimation import Gaussian
+from mvest.estimation.gaussian import Gaussian
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
 from mvest.problem.study import StudyResult

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.estimation import IteratedFilter
+from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.problem.registration import REGISTRATION

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from mvest.estimation import Gaussian, Identifiability, Transform, identifiability
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel
-from mvest.estimation.transform import to_filter
+from mvest.estimation.transform import Transform, to_filter
 from mvest.problem.study import Case, Observed
 from mvest.typing import FloatArray
 

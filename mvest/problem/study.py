@@ -16,19 +16,12 @@ import numpy as np
 
 from mvest.closure.model import ClosedState
 from mvest.errors import InputError
-from mvest.estimation import (
-    Estimate,
-    Filter,
-    Gaussian,
-    Identifiability,
-    ObservationModel,
-    Prediction,
-    Transform,
-    identifiability,
-)
-from mvest.estimation.estimate import OnIterate
+from mvest.estimation.estimate import Estimate, Filter, OnIterate
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import require_finite
+from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
+from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import ObservationError, SpatialCorrelation, observe
 from mvest.observation.vertices import (

@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from mvest.estimation import Confounded, Gaussian, Identifiability, Transform
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.identifiability import Confounded, Identifiability
+from mvest.estimation.transform import Transform
 from mvest.reporting.markup import MISSING, number
 from mvest.typing import FloatArray
 

@@ -10,27 +10,6 @@ comes with the uncertainty of the estimate.
 * ``predict``: all of it together.
 """
 
-from mvest.scenarios.measures import MEASURES, Measured, measure_closed
-from mvest.scenarios.posterior import Spread, posterior_samples, spread_of
-from mvest.scenarios.predict import PredictedScenario, Sample, predict_scenario
-from mvest.scenarios.scenario import Annuloplasty, Clip, Scenario, model_under
-from mvest.scenarios.stress import PeakStress, peak_stress, principal_cauchy
+import lazy_loader
 
-__all__ = [
-    "MEASURES",
-    "Annuloplasty",
-    "Clip",
-    "Measured",
-    "PeakStress",
-    "PredictedScenario",
-    "Sample",
-    "Scenario",
-    "Spread",
-    "measure_closed",
-    "model_under",
-    "peak_stress",
-    "posterior_samples",
-    "predict_scenario",
-    "principal_cauchy",
-    "spread_of",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from mvest.errors import InputError
-from mvest.estimation import Estimate
+from mvest.estimation.estimate import Estimate
 from mvest.typing import FloatArray
 
 __all__ = ["Spread", "posterior_samples", "spread_of"]

@@ -9,7 +9,8 @@ import numpy as np
 
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
-from mvest.estimation import Estimate, Gaussian
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.gaussian import Gaussian
 from mvest.mechanics.system import Parameter, System
 from mvest.scenarios.measures import NEVER_NEGATIVE, Measured, measure_closed
 from mvest.scenarios.posterior import Spread, spread_of

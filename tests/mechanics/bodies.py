@@ -3,7 +3,7 @@
 import numpy as np
 
 from mvest.elements import ELEMENTS
-from mvest.mechanics.box import box, outer_faces
+from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact, ContactSettings
 from mvest.mechanics.forces.pressure import PressureLoad

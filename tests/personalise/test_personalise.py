@@ -19,7 +19,7 @@ from mvest.personalise import (
     Treatment,
     Unknown,
     build_model,
-    personalise,
+    personalise_case,
 )
 from mvest.personalise.chain import _Chain, _thinned
 from mvest.problem.registration import REGISTRATION, RegisteredModel
@@ -58,7 +58,7 @@ def std_of(found, name):
 
 def test_a_twin_without_noise_gives_back_the_moduli_and_what_was_hidden(monkeypatch):
     use(monkeypatch)
-    found = personalise(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
+    found = personalise_case(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
     assert found.result.converged
     assert found.names == tuple(PRIORS)
     np.testing.assert_allclose(found.result.estimate, true_of(found), rtol=1e-4, atol=1e-4)
@@ -78,7 +78,7 @@ def test_noise_is_covered_by_the_intervals(monkeypatch):
     squares = []
     for _ in range(12):
         case = made_up_case(std_mm=0.3, noise=rng, displaced=False)
-        found = personalise(case, settings(*right_nuisances()))
+        found = personalise_case(case, settings(*right_nuisances()))
         error = np.log(found.result.estimate / true_of(found))
         squares.append((error / found.result.filtered.transformed.std) ** 2)
     assert 0.38 < np.mean(squares) < 1.95
@@ -87,8 +87,8 @@ def test_noise_is_covered_by_the_intervals(monkeypatch):
 def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    whole = personalise(case, settings(moduli_only=True))
-    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
+    whole = personalise_case(case, settings(moduli_only=True))
+    fixed = personalise_case(case, settings(*unknowns(Treatment.FIXED)))
     assert fixed.names == MODULI
     assert whole.moduli_only.parameters == MODULI
     np.testing.assert_array_equal(fixed.result.estimate, whole.moduli_only.estimate)
@@ -98,15 +98,15 @@ def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch)
 def test_doubt_that_is_considered_widens_the_interval_and_moves_nothing_else(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
-    considered = personalise(case, settings(*unknowns(Treatment.CONSIDERED)))
+    fixed = personalise_case(case, settings(*unknowns(Treatment.FIXED)))
+    considered = personalise_case(case, settings(*unknowns(Treatment.CONSIDERED)))
     assert considered.result.converged
     for name in MODULI:
         assert std_of(considered, name) > 1.2 * std_of(fixed, name)
     own = np.isin(considered.names, NUISANCES)
     np.testing.assert_allclose(considered.result.estimate[own], considered.prior.mean[own])
     # To first order considering is estimating: one step of the linear model is the same.
-    estimated = personalise(case, settings())
+    estimated = personalise_case(case, settings())
     for name in MODULI:
         assert std_of(considered, name) == pytest.approx(std_of(estimated, name), rel=0.35)
 
@@ -118,7 +118,7 @@ def test_a_considered_mean_need_not_survive_its_logarithm(monkeypatch):
         replace(u, treatment=Treatment.CONSIDERED) if u.name == "E_f.anterior" else u
         for u in unknowns(Treatment.FIXED)
     ]
-    found = personalise(made_up_case(0.3, displaced=False), settings(*given))
+    found = personalise_case(made_up_case(0.3, displaced=False), settings(*given))
     assert found.result.estimate[0] == pytest.approx(6.23, rel=1e-14)
     assert found.result.fitted is not None
     assert len(found.distances) == 2
@@ -127,7 +127,7 @@ def test_a_considered_mean_need_not_survive_its_logarithm(monkeypatch):
 def test_the_generic_valve_is_closed_once(monkeypatch):
     # The estimation begins where the generic valve was closed, and that is the longest closure.
     built = use(monkeypatch)
-    personalise(made_up_case(0.3), settings(moduli_only=True))
+    personalise_case(made_up_case(0.3), settings(moduli_only=True))
     calls = np.array(built[0].calls)
     start = [6.23, 2.09, 1.0, 1.0, 1.0]
     assert np.all(np.isclose(calls, start, rtol=1e-12), axis=1).sum() == 1
@@ -136,9 +136,9 @@ def test_the_generic_valve_is_closed_once(monkeypatch):
 def test_unknowns_may_come_in_any_order(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3)
-    one = personalise(case, settings())
+    one = personalise_case(case, settings())
     order = [*unknowns()[::-1]]
-    other = personalise(case, settings(*order))
+    other = personalise_case(case, settings(*order))
     assert set(other.names[-6:]) == set(REGISTRATION)
     at = [other.names.index(name) for name in one.names]
     np.testing.assert_allclose(other.result.estimate[at], one.result.estimate, rtol=1e-6, atol=1e-9)
@@ -202,7 +202,7 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
 def test_the_registered_valve_is_the_rigid_motion_of_least_squares(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, noise=np.random.default_rng(2))
-    found = personalise(case, settings())
+    found = personalise_case(case, settings())
     seen = case.frame(Role.CLOSED).vertices
     generic, registered = found.generic["closed"], found.registered["closed"]
     # Rigid: distances among vertices are kept, and so is the side.
@@ -226,7 +226,7 @@ def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
     case = made_up_case(0.3)
     late = case.held_out[0]
     later = replace(late, name="later", time=0.5)
-    personalise(replace(case, frames=(*case.frames, later)), settings())
+    personalise_case(replace(case, frames=(*case.frames, later)), settings())
     states = built[0].states
     assert len(states) == 4
     # All of one valve and then all of the other: changing between them is to close anew.
@@ -240,7 +240,7 @@ def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
 def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
     built = use(monkeypatch)
     monkeypatch.setattr("tests.made_up_closure.MadeUpClosure.held", lambda *arguments: [None])
-    found = personalise(made_up_case(0.3), settings())
+    found = personalise_case(made_up_case(0.3), settings())
     assert built
     assert [d.frame for d in found.distances] == ["closed"]
     assert "late" not in found.fitted
@@ -249,7 +249,7 @@ def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
 def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, noise=np.random.default_rng(2))
-    found = personalise(case, settings())
+    found = personalise_case(case, settings())
     narrower, filtered = found.narrower, found.result.filtered
     now = narrower["now"]
     # P+ = (P^-1 + H^T H / s^2)^-1 in logarithms; a known unknown is a column less.
@@ -291,7 +291,7 @@ def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
 def test_nothing_is_said_of_unknowns_that_a_case_does_not_have(monkeypatch):
     use(monkeypatch)
     given = [u for u in unknowns() if u.name in (*MODULI, "pressure_scale")]
-    found = personalise(made_up_case(0.3), settings(*given))
+    found = personalise_case(made_up_case(0.3), settings(*given))
     assert "registration known" not in found.narrower
     np.testing.assert_array_equal(
         found.narrower["all nuisances known"], found.narrower["pressure known"]
@@ -302,7 +302,7 @@ def test_the_paper_s_filter_sees_the_moduli_and_independent_errors(monkeypatch):
     use(monkeypatch)
     paper = PaperSettings(P0=1.0, Q=0.01, R=1e-4, max_iterations=30)
     case = made_up_case(0.3, 8.0, displaced=False)
-    found = personalise(case, settings(*right_nuisances(), paper=paper))
+    found = personalise_case(case, settings(*right_nuisances(), paper=paper))
     assert found.paper.parameters == MODULI
     assert found.paper.observation.correlation is None
     assert found.paper.observation.variance == pytest.approx(1e-4)
@@ -316,7 +316,7 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
     use(monkeypatch)
     case = made_up_case(0.02, length, corresponds=corresponds, displaced=False)
     given = [*right_nuisances(), Unknown("shift.z", 0.0, 1.0)]
-    found = personalise(
+    found = personalise_case(
         case,
         settings(
             *given,
@@ -357,7 +357,7 @@ def test_very_many_vertices_are_thinned_evenly():
 
 def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
     use(monkeypatch, fails_above=4.0)
-    found = personalise(
+    found = personalise_case(
         made_up_case(0.3),
         settings(moduli_only=True, paper=PaperSettings(), confirm=True),
     )
@@ -373,7 +373,7 @@ def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
 
 def test_the_fitted_valve_is_closed_anew(monkeypatch):
     use(monkeypatch)
-    found = personalise(made_up_case(0.3), settings(confirm=True))
+    found = personalise_case(made_up_case(0.3), settings(confirm=True))
     assert found.confirmed_mm == 0.0
     # One that closes otherwise from the open valve is told.
     first = MadeUpClosure.__call__
@@ -387,7 +387,7 @@ def test_the_fitted_valve_is_closed_anew(monkeypatch):
         return Prediction(y, found.jacobian)
 
     monkeypatch.setattr(MadeUpClosure, "__call__", other)
-    again = personalise(made_up_case(0.3), settings(confirm=True))
+    again = personalise_case(made_up_case(0.3), settings(confirm=True))
     assert again.confirmed_mm == pytest.approx(0.25)
 
 
@@ -523,7 +523,7 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
     }
     frames = [replace(f, vertices=seen.get(f.name, f.vertices)) for f in case.frames]
     frames[2] = replace(frames[2], pressure_mmHg=95.0)
-    result = personalise(replace(case, frames=tuple(frames)), wanted)
+    result = personalise_case(replace(case, frames=tuple(frames)), wanted)
     assert result.result.converged
     np.testing.assert_allclose(result.result.estimate, true, rtol=1e-4)
     assert [d.frame for d in result.distances] == ["closed", "late"]
@@ -576,8 +576,8 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
     use_geometry(monkeypatch)
     case = made_up_case(std, 8.0, np.random.default_rng(1), displaced=False)
     wanted = settings(*right_nuisances(), correspondence=correspondence)
-    plain = personalise(case, wanted)
-    told = personalise(seen_in_error(case, std=4 * std), wanted)
+    plain = personalise_case(case, wanted)
+    told = personalise_case(seen_in_error(case, std=4 * std), wanted)
     assert plain.image_share is None
     assert plain.geometry is None
     assert told.result.converged
@@ -606,14 +606,14 @@ def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
 def test_samples_that_do_not_close_are_counted_and_too_many_of_them_are_an_error(monkeypatch):
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     use_geometry(monkeypatch, fails=(1, 5, 7))
-    found = personalise(case, settings(*right_nuisances()))
+    found = personalise_case(case, settings(*right_nuisances()))
     assert [text.split(":")[0] for text in found.geometry.failures] == [
         "sample 1", "sample 5", "sample 7"
     ]  # fmt: skip
     assert (found.geometry.asked, len(found.geometry.predicted)) == (12, 9)
     use_geometry(monkeypatch, fails=(1, 5, 7, 8))
     with pytest.raises(GeometryError, match=r"4 of 12 error samples do not close.*no equilibrium"):
-        personalise(case, settings(*right_nuisances()))
+        personalise_case(case, settings(*right_nuisances()))
 
 
 def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
@@ -623,7 +623,7 @@ def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
         replace(u, treatment=Treatment.CONSIDERED) if u.name == "shift.z" else u
         for u in (*right_nuisances(), Unknown("shift.z", 0.0, 1.0))
     ]
-    found = personalise(case, settings(*given, moduli_only=True))
+    found = personalise_case(case, settings(*given, moduli_only=True))
     assert std_of(found, "shift.z") == pytest.approx(1.0)
     assert found.result.estimate[2] == 0.0
     assert found.moduli_only.parameters == MODULI

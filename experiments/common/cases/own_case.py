@@ -17,14 +17,14 @@ from experiments.common.progress import SolveBar
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError
-from mvest.personalise import (
+from mvest.personalise.chain import personalise_case
+from mvest.personalise.model import build_model
+from mvest.personalise.settings import (
     CaseMesh,
     PaperSettings,
     PersonaliseSettings,
     Treatment,
     Unknown,
-    build_model,
-    personalise,
 )
 from mvest.reporting.case.fields import turn_of
 from mvest.reporting.case.frames import frame_fields, frames_figure
@@ -164,7 +164,7 @@ def run_case(
     steps = len(settings.mechanics.protocol.steps())
     store = Path(config["paths"]["outputs"]) / "meshes"
     with SolveBar(case.name, steps, TYPICAL_SOLVES) as bar:
-        found = personalise(case, settings, store=store, on_step=bar.step)
+        found = personalise_case(case, settings, store=store, on_step=bar.step)
     record = {**case_record(config, found, config_hash, started), **(about or {})}
     files: list[Path] = []
     if found.distances:

@@ -12,10 +12,8 @@ from scipy import sparse
 
 from experiments.common.record import make_record
 from mvest.cases.case import Role
-from mvest.estimation import moran, zero_mean
-from mvest.personalise import (
-    Personalised,
-)
+from mvest.estimation.information.consistency import moran, zero_mean
+from mvest.personalise.result import Personalised
 from mvest.problem.study import StudyResult
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import surface_edges

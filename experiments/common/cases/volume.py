@@ -15,20 +15,11 @@ from experiments.common.cases.own_case import run_case
 from experiments.common.progress import PartBar
 from mvest.cases.case import ValveCase
 from mvest.cases.csv_files import read_numbers
-from mvest.cases.from_images import (
-    CaseFrames,
-    CaseTexts,
-    case_of_sequence,
-    choose_frames,
-    closed_frame,
-    measure_sequence,
-    samples_in_world,
-    without_mean_error,
-    write_for_slicer,
-    write_measures,
-    write_surfaces,
-)
-from mvest.cases.from_images.measures import Row
+from mvest.cases.from_images.build import CaseTexts, case_of_sequence
+from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
+from mvest.cases.from_images.files import write_for_slicer, write_surfaces
+from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
+from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
 from mvest.cases.pressure_curve import PressureCurve
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case

@@ -13,9 +13,12 @@ import numpy as np
 from experiments.common.build import build_filter
 from experiments.common.forward import forward_record
 from experiments.common.whole_cycle import bound_entry, closed_frame, cycle_model
-from mvest.closure.cycle import CycleObservation
+from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
-from mvest.estimation import Estimate, IteratedFilter, identifiability, nees
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.information.consistency import nees
+from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 

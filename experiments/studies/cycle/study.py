@@ -20,9 +20,13 @@ from experiments.common.whole_cycle import (
     stored_cycle,
     stored_frames,
 )
-from mvest.closure.cycle import Beats, CycleModel, CycleObservation
+from mvest.closure.cycle.model import CycleModel
+from mvest.closure.cycle.observation import Beats, CycleObservation
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import DriftSmoother, Log, Trajectory, identifiability
+from mvest.estimation.filters.drift import DriftSmoother
+from mvest.estimation.information.identifiability import identifiability
+from mvest.estimation.trajectory import Trajectory
+from mvest.estimation.transform import Log
 from mvest.typing import FloatArray
 
 __all__ = ["frame_sets", "run_cycle_study"]

@@ -24,7 +24,10 @@ from experiments.common.record import make_record
 from experiments.studies.donor.report import donor_figure
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction, Transform
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.problem.study import Case, Observation, StudyResult, estimate

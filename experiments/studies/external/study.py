@@ -12,8 +12,14 @@ import numpy as np
 
 from experiments.common.build import build_filter
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation import Estimate, Filter, Gaussian, Prediction, Transform
-from mvest.external import Command, Differences, ProcessModel, read_points, write_points
+from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.transform import Transform
+from mvest.external.contract import read_points, write_points
+from mvest.external.differences import Differences
+from mvest.external.model import ProcessModel
+from mvest.external.process import Command
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 

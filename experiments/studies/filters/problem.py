@@ -18,14 +18,10 @@ from scipy.stats import qmc
 
 from experiments.common.build import build_twin
 from mvest.errors import ConfigurationError
-from mvest.estimation import (
-    Gaussian,
-    Log,
-    ObservationModel,
-    Prediction,
-)
 from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
-from mvest.estimation.transform import to_filter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.transform import Log, to_filter
 from mvest.files import write_atomically
 from mvest.observation.vertices import ObservedFrames
 from mvest.typing import FloatArray

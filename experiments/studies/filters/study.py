@@ -26,9 +26,11 @@ from experiments.studies.filters.problem import (
 )
 from experiments.studies.filters.report import REFERENCE, filters_figure
 from mvest.errors import ConfigurationError
-from mvest.estimation import EnsembleFilter, Estimate, Filter, SamplerSettings, observation_noise
+from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import log_posterior
-from mvest.estimation.filters.sampler import draw
+from mvest.estimation.filters.sampler import SamplerSettings, draw
+from mvest.estimation.noise import observation_noise
 from mvest.provenance import provenance, write_json
 from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray

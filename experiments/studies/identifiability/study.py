@@ -15,11 +15,15 @@ import numpy as np
 from experiments.common.forward import forward_record, model_of
 from experiments.studies.identifiability.figures import write_identifiability_figures
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
-from mvest.closure.cycle import CycleModel, CycleProtocol
+from mvest.closure.cycle.model import CycleModel
+from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GateCase
 from mvest.errors import ConfigurationError
-from mvest.estimation import Design, Log, Prediction, Profile, profile, together
+from mvest.estimation.information.design import Design, together
+from mvest.estimation.information.profile import Profile, profile
+from mvest.estimation.prediction import Prediction
+from mvest.estimation.transform import Log
 from mvest.observation.errors import SpatialCorrelation
 from mvest.reporting.expectation import confounded_record
 from mvest.typing import BoolArray, FloatArray

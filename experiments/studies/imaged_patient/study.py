@@ -17,20 +17,19 @@ from experiments.common.cases.blind import estimate_blindly
 from experiments.common.mirror import build
 from experiments.common.truth import truth_key
 from mvest.cases.case import ValveCase
-from mvest.cases.from_images import CaseFrames, CaseTexts, case_of_sequence
+from mvest.cases.from_images.build import CaseTexts, case_of_sequence
+from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, GeometryError, InputError, cannot_write
 from mvest.imaging.sequence import ValveSequence
-from mvest.imaging.simulator import draw_acquisition, draw_probe, simulate_volume, true_sequence
-from mvest.imaging.writing import write_sequence_nrrd
+from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.simulator.spread import draw_acquisition
+from mvest.imaging.writing.sequence import write_sequence_nrrd
 from mvest.provenance import write_json
-from mvest.simulation.motion import (
-    IMAGED,
-    ImagedPatient,
-    MotionSettings,
-    draw_tip_motion,
-    simulate_imaged_patient,
-)
+from mvest.simulation.motion.closing import MotionSettings
+from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
+from mvest.simulation.motion.population import draw_tip_motion
 from mvest.simulation.virtual_patient import Deviations, draw_hidden
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template

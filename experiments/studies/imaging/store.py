@@ -42,13 +42,8 @@ from mvest.imaging.learning.training import (
 )
 from mvest.imaging.moving_valve import MovingValve
 from mvest.provenance import write_json
-from mvest.simulation.motion import (
-    Population,
-    PopulationSettings,
-    draw_population,
-    load_population,
-    save_population,
-)
+from mvest.simulation.motion.files import load_population, save_population
+from mvest.simulation.motion.population import Population, PopulationSettings, draw_population
 from mvest.valve.anatomy.template import TemplateParameters
 
 __all__ = ["ImagingStore", "Spent", "imaging_source"]

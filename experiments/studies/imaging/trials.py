@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.cases.from_images import OPEN_SHARE
+from mvest.cases.from_images.measures import OPEN_SHARE
 from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
@@ -24,13 +24,10 @@ from mvest.imaging.learning.evaluation import frame_errors, surface_distances
 from mvest.imaging.learning.training import Setting, render_frame
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.simulator import (
-    Acquisition,
-    draw_acquisition,
-    draw_probe,
-    simulate_volume,
-    true_sequence,
-)
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.simulator.spread import draw_acquisition
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus

@@ -20,18 +20,15 @@ from experiments.common.whole_cycle import (
     shift_by_check_mesh,
     stored_cycle,
 )
-from mvest.closure.cycle import CycleObservation, SeenFrames
+from mvest.closure.cycle.observation import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
-from mvest.estimation import (
-    Estimate,
-    Gaussian,
-    IteratedFilter,
-    SequentialEstimate,
-    SequentialFilter,
-    Transform,
-    identifiability,
-    nees,
-)
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.filters.sequential import SequentialEstimate, SequentialFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.consistency import nees
+from mvest.estimation.information.identifiability import identifiability
+from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray
 
 __all__ = ["run_joint_study"]

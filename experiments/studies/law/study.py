@@ -14,7 +14,8 @@ import numpy as np
 from experiments.common.build import Twin, build_twin
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
-from mvest.estimation import Prediction, chi_square_band
+from mvest.estimation.information.consistency import chi_square_band
+from mvest.estimation.prediction import Prediction
 from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.exponential import ExponentialLaw, ExponentialTissue
 from mvest.mechanics.parameters import kind_of

@@ -19,8 +19,13 @@ from experiments.studies.models.sheet.own import OwnSheet
 from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
 from mvest.errors import ConfigurationError
-from mvest.estimation import Filter, Gaussian, ObservationModel, Prediction, Transform
-from mvest.external import Command, Differences, ProcessModel
+from mvest.estimation.estimate import Filter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.transform import Transform
+from mvest.external.differences import Differences
+from mvest.external.model import ProcessModel
+from mvest.external.process import Command
 from mvest.provenance import config_hash as hash_of_data
 from mvest.provenance import provenance
 from mvest.typing import FloatArray

@@ -19,9 +19,10 @@ import numpy as np
 from experiments.common.build import build_filter, mechanics_of, template_of
 from experiments.common.forward import forward_record
 from experiments.common.whole_cycle import cycle_model, shift_by_check_mesh, stored_cycle
-from mvest.closure.cycle import CycleObservation, SeenFrames
+from mvest.closure.cycle.observation import CycleObservation, SeenFrames
 from mvest.errors import ConfigurationError
-from mvest.estimation import Estimate, IteratedFilter
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.law.field import FieldBasis, StiffPatch
 from mvest.typing import FloatArray

@@ -22,10 +22,11 @@ from experiments.common.progress import PartBar
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.study import StudyResult, estimate, simulate_observation
-from mvest.scenarios import PredictedScenario, Scenario, model_under, posterior_samples
-from mvest.scenarios import predict_scenario as predict
 from mvest.scenarios.measures import contact_reach, meaning_of
-from mvest.scenarios.predict import Sample, closed_valve
+from mvest.scenarios.posterior import posterior_samples
+from mvest.scenarios.predict import PredictedScenario, Sample, closed_valve
+from mvest.scenarios.predict import predict_scenario as predict
+from mvest.scenarios.scenario import Scenario, model_under
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh

@@ -14,7 +14,8 @@ from mvest.imaging.landmarks import landmarks
 from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing import voxelise_leaflets, write_segmentation
+from mvest.imaging.writing.segmentation import write_segmentation
+from mvest.imaging.writing.voxels import voxelise_leaflets
 from mvest.valve.io.surface_files import region_arrays, write_surface
 
 __all__ = ["write_for_slicer", "write_landmarks", "write_surfaces"]

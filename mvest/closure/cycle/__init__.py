@@ -1,7 +1,5 @@
 """The whole cycle of a simulated valve: any number of frames, open to closed and back."""
 
-from mvest.closure.cycle.model import CycleModel
-from mvest.closure.cycle.observation import Beats, CycleObservation, SeenFrames
-from mvest.closure.cycle.protocol import CycleProtocol
+import lazy_loader
 
-__all__ = ["Beats", "CycleModel", "CycleObservation", "CycleProtocol", "SeenFrames"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

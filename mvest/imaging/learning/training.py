@@ -37,13 +37,10 @@ from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boost
 from mvest.imaging.learning.degrade import degrade
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.simulator import (
-    Acquisition,
-    draw_acquisition,
-    draw_probe,
-    simulate_volume,
-    true_sequence,
-)
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.simulator.spread import draw_acquisition
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 

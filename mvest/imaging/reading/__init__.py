@@ -1,5 +1,5 @@
 """Reading volumes over time from the files that scanners and viewers write."""
 
-from mvest.imaging.reading.reader import read_volume
+import lazy_loader
 
-__all__ = ["read_volume"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,5 @@
 """Writing what the image step makes: sequences and segmentations for 3D Slicer."""
 
-from mvest.imaging.writing.segmentation import write_segmentation
-from mvest.imaging.writing.sequence import write_sequence_nrrd
-from mvest.imaging.writing.voxels import voxelise_leaflets
+import lazy_loader
 
-__all__ = ["voxelise_leaflets", "write_segmentation", "write_sequence_nrrd"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,7 +13,7 @@ from experiments.common.config import hash_of
 from experiments.run import main
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
-from mvest.personalise import Treatment, personalise
+from mvest.personalise import Treatment, personalise_case
 from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.common.test_config import composed, plain
@@ -60,7 +60,7 @@ def made(folder):
     with pytest.MonkeyPatch.context() as patch:
         use(patch)
         config = plain(composed(*OWN, f"case={folder}"))
-        found = personalise(read_configured(config), settings_of(config))
+        found = personalise_case(read_configured(config), settings_of(config))
         return case_record(config, found, "hash", 0.0), found
 
 
@@ -182,7 +182,7 @@ def test_what_would_narrow_is_told_of_each_modulus(made):
 
 def test_a_failed_estimation_is_a_record_too(config, monkeypatch, tmp_path, unmeasured):
     use(monkeypatch, fails_above=4.0)
-    found = personalise(read_configured(config), settings_of(config))
+    found = personalise_case(read_configured(config), settings_of(config))
     record = case_record(config, found, "hash", 0.0)
     write_json(tmp_path / "record.json", record)
     assert record["status"] == "failed"
@@ -232,7 +232,7 @@ def test_fields_without_correspondence_have_points(config, monkeypatch, tmp_path
         for name, about in config["personal"]["unknowns"].items()
         if name.startswith(("E_f", "shift"))
     }
-    found = personalise(case, settings_of(config))
+    found = personalise_case(case, settings_of(config))
     np.savez(tmp_path / "fields.npz", **fields_of(found))
     fields = read_case_fields(tmp_path / "fields.npz")
     assert fields.observed is None

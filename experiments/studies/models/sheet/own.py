@@ -6,8 +6,8 @@ import numpy as np
 
 from experiments.studies.models.sheet.sheet import Sheet, inadmissible
 from mvest.estimation.prediction import Prediction
+from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.body import simulate_body
-from mvest.mechanics.box import box, outer_faces
 from mvest.mechanics.law.biot import TransverselyIsotropic
 from mvest.mechanics.system import Parameter
 from mvest.typing import FloatArray

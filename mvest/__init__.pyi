@@ -1,0 +1,36 @@
+__version__: str
+
+from . import units as units
+from .cases.case import ValveCase as ValveCase
+from .cases.folder import read_case as read_case
+from .cases.writer import write_case as write_case
+from .closure.model import ClosureModel as ClosureModel
+from .closure.robustness import run_gate as run_gate
+from .errors import MvestError as MvestError
+from .estimation.filters.ensemble import EnsembleFilter as EnsembleFilter
+from .estimation.filters.extended import ExtendedFilter as ExtendedFilter
+from .estimation.filters.iterated import IteratedFilter as IteratedFilter
+from .estimation.filters.monte_carlo import MonteCarloFilter as MonteCarloFilter
+from .estimation.filters.paper import PaperFilter as PaperFilter
+from .estimation.filters.unscented import UnscentedFilter as UnscentedFilter
+from .estimation.gaussian import Gaussian as Gaussian
+from .estimation.information.identifiability import identifiability as identifiability
+from .estimation.prediction import Prediction as Prediction
+from .imaging.detection.model import default_model as default_model
+from .imaging.detection.tracking import detect_valve as detect_valve
+from .imaging.reading.reader import read_volume as read_volume
+from .imaging.volume import Modality as Modality
+from .mechanics.body import simulate_body as simulate_body
+from .mechanics.law.moduli import TransverselyIsotropic as TransverselyIsotropic
+from .mechanics.settings import ClosureProtocol as ClosureProtocol
+from .mechanics.settings import MechanicsSettings as MechanicsSettings
+from .mechanics.settings import TissueSettings as TissueSettings
+from .personalise.chain import personalise_case as personalise_case
+from .personalise.settings import PersonaliseSettings as PersonaliseSettings
+from .personalise.settings import Unknown as Unknown
+from .problem.study import estimate as estimate
+from .problem.study import simulate_observation as simulate_observation
+from .valve.anatomy.template import Template as Template
+from .valve.anatomy.template import TemplateParameters as TemplateParameters
+from .valve.anatomy.valve import Valve as Valve
+from .valve.mesh.structured import structured_mesh as structured_mesh

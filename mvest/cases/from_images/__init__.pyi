@@ -1,0 +1,16 @@
+from .build import CaseTexts as CaseTexts
+from .build import case_of_sequence as case_of_sequence
+from .errors_in_world import samples_in_world as samples_in_world
+from .errors_in_world import valve_axes as valve_axes
+from .errors_in_world import without_mean_error as without_mean_error
+from .files import write_for_slicer as write_for_slicer
+from .files import write_landmarks as write_landmarks
+from .files import write_surfaces as write_surfaces
+from .frame_choice import CaseFrames as CaseFrames
+from .frame_choice import choose_frames as choose_frames
+from .measures import OPEN_SHARE as OPEN_SHARE
+from .measures import closed_frame as closed_frame
+from .measures import contact_distance as contact_distance
+from .measures import measure_meaning as measure_meaning
+from .measures import measure_sequence as measure_sequence
+from .measures import write_measures as write_measures

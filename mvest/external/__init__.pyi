@@ -1,0 +1,12 @@
+from .contract import Answer as Answer
+from .contract import Request as Request
+from .contract import read_answer as read_answer
+from .contract import read_points as read_points
+from .contract import read_request as read_request
+from .contract import write_answer as write_answer
+from .contract import write_points as write_points
+from .contract import write_request as write_request
+from .differences import Differences as Differences
+from .model import ProcessModel as ProcessModel
+from .process import Command as Command
+from .process import Ending as Ending

@@ -1,0 +1,10 @@
+from .chain import foresee_case as foresee_case
+from .chain import personalise_case as personalise_case
+from .model import build_model as build_model
+from .result import FrameDistance as FrameDistance
+from .result import Personalised as Personalised
+from .settings import CaseMesh as CaseMesh
+from .settings import PaperSettings as PaperSettings
+from .settings import PersonaliseSettings as PersonaliseSettings
+from .settings import Treatment as Treatment
+from .settings import Unknown as Unknown

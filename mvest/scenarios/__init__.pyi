@@ -1,0 +1,16 @@
+from .measures import MEASURES as MEASURES
+from .measures import Measured as Measured
+from .measures import measure_closed as measure_closed
+from .posterior import Spread as Spread
+from .posterior import posterior_samples as posterior_samples
+from .posterior import spread_of as spread_of
+from .predict import PredictedScenario as PredictedScenario
+from .predict import Sample as Sample
+from .predict import predict_scenario as predict_scenario
+from .scenario import Annuloplasty as Annuloplasty
+from .scenario import Clip as Clip
+from .scenario import Scenario as Scenario
+from .scenario import model_under as model_under
+from .stress import PeakStress as PeakStress
+from .stress import peak_stress as peak_stress
+from .stress import principal_cauchy as principal_cauchy

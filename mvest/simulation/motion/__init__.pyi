@@ -1,0 +1,15 @@
+from .closing import MotionSettings as MotionSettings
+from .closing import close_in_motion as close_in_motion
+from .files import load_population as load_population
+from .files import save_population as save_population
+from .patient import IMAGED as IMAGED
+from .patient import ImagedPatient as ImagedPatient
+from .patient import simulate_imaged_patient as simulate_imaged_patient
+from .population import Population as Population
+from .population import PopulationSettings as PopulationSettings
+from .population import draw_population as draw_population
+from .population import draw_tip_motion as draw_tip_motion
+from .population import population_hash as population_hash
+from .refusal import MotionLimits as MotionLimits
+from .refusal import Refusal as Refusal
+from .refusal import RefusedError as RefusedError

@@ -1,0 +1,208 @@
+"""The front door: what `import mvest` offers is enough, loads late, and is known to type checkers.
+
+The five functions of the first part name nothing of the library but `mvest`.
+"""
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mvest
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume
+from mvest.imaging.writing import write_sequence_nrrd
+from mvest.valve.anatomy.template import Template, TemplateParameters
+from tests.made_up_closure import made_up_case, use
+from tests.places import ROOT
+
+REGIONS = ("anterior", "posterior")
+MODULI = tuple(f"E_f.{region}" for region in REGIONS)
+TISSUE = {"anterior": mvest.TissueSettings(ratio=2.65), "posterior": mvest.TissueSettings(1.11)}
+
+
+def small_model() -> mvest.ClosureModel:
+    """A coarse valve that a low pressure moves in two steps without closing it."""
+    template = mvest.Template(mvest.TemplateParameters(half_ap=13.8))
+    protocol = mvest.ClosureProtocol(5.0, ramp=0.1, dt=0.05, end=0.1, equilibrium=False)
+    return mvest.ClosureModel(
+        template.valve(24, 7),
+        template.valve(48, 20),
+        mvest.structured_mesh(template, "hex18", 24, 3),
+        mvest.MechanicsSettings(TISSUE, protocol),
+        MODULI,
+    )
+
+
+def test_moduli_of_a_template_from_how_it_closes() -> None:
+    model = small_model()
+    seen = mvest.simulate_observation(
+        model, MODULI, np.array([6.2, 2.1]), variance=1e-6, rng=np.random.default_rng(1)
+    )
+    assert seen.observation is not None
+    prior = mvest.Gaussian.from_variance([5.0, 3.0], 1.0)
+    found = mvest.IteratedFilter()(
+        seen.observation.of(model), prior, seen.observation.y, seen.observation.R, names=MODULI
+    )
+    assert found.converged
+    np.testing.assert_allclose(found.mean, [6.2, 2.1], rtol=1e-4)
+    assert found.prediction is not None
+    known = mvest.identifiability(found.prediction.jacobian, seen.observation.R, found.mean)
+    assert np.all(known.std > 0)
+
+
+def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use(monkeypatch)  # a formula instead of a closure
+    mvest.write_case(tmp_path / "case", made_up_case(0.01, displaced=False))
+    case = mvest.read_case(tmp_path / "case")
+    assert isinstance(case, mvest.ValveCase)
+    settings = mvest.PersonaliseSettings(
+        tuple(
+            mvest.Unknown(name, mean, 2.0) for name, mean in ((MODULI[0], 6.23), (MODULI[1], 2.09))
+        ),
+        mvest.MechanicsSettings(TISSUE),
+    )
+    found = mvest.personalise_case(case, settings)
+    assert found.result.converged
+    assert found.result.estimate is not None
+    assert found.result.estimate.shape == (2,)
+
+
+def simulated_volume(folder: Path) -> Path:
+    """A file as a user has one: a valve of its own, closing a little, in simulated echo."""
+    layout = ValveLayout(64, 15)
+    template = Template(TemplateParameters(half_commissural=17.2, half_ap=13.4))
+    valve = template.valve(layout.columns, layout.rows)
+    phi, s, _, tip = template.chord_places()
+    vertices = valve.surface.vertices
+    moving = MovingValve(
+        "made up",
+        layout,
+        np.array([0.0, 0.04]),
+        np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
+        np.stack([valve.papillary_tips] * 2),
+        valve.surface.thickness,
+        phi,
+        s,
+        tip,
+    )
+    probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))
+    return write_sequence_nrrd(
+        folder / "v.seq.nrrd", simulate_volume(moving, Acquisition(), probe, 3)
+    )
+
+
+def test_a_valve_in_a_volume(tmp_path: Path) -> None:
+    file = simulated_volume(tmp_path)
+    volume = mvest.read_volume(file, modality=mvest.Modality.ULTRASOUND)
+    valve = mvest.detect_valve(volume, mvest.default_model())
+    assert valve.vertices.shape[0] == len(volume.times)
+    assert valve.tips.shape == (len(volume.times), 2, 3)
+    assert valve.frame_confidence.max() > 0.6
+
+
+FILTERS = (
+    mvest.PaperFilter(),
+    mvest.ExtendedFilter(),
+    mvest.IteratedFilter(),
+    mvest.UnscentedFilter(),
+    mvest.EnsembleFilter(),
+    mvest.MonteCarloFilter(),
+)
+
+
+@pytest.mark.parametrize("own_filter", FILTERS, ids=lambda f: type(f).__name__)
+def test_an_own_model_behind_every_filter(own_filter: mvest.PaperFilter) -> None:
+    H = np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]])
+
+    def model(m: np.ndarray) -> mvest.Prediction:
+        return mvest.Prediction(H @ m, H)
+
+    prior = mvest.Gaussian.from_variance([5.0, 3.0], 4.0)
+    found = own_filter(model, prior, H @ np.array([4.5, 3.2]), R=1e-4)
+    # The ensemble's gain is that of a hundred samples.
+    np.testing.assert_allclose(found.mean, [4.5, 3.2], atol=0.1)
+
+
+def test_an_own_filter_for_the_valve() -> None:
+    def best_of(model, candidates, y):
+        return min(candidates, key=lambda m: float(np.linalg.norm(model(m).y - y)))
+
+    model, candidates = small_model(), [np.array([5.0, 3.0]), np.array([6.2, 2.1])]
+    y = model(np.array([6.1, 2.2])).y
+    np.testing.assert_array_equal(best_of(model, candidates, y), candidates[1])
+
+
+def test_a_body_without_a_valve() -> None:
+    nodes = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]], dtype=float)
+    tetrahedron = np.array([[0, 1, 2, 3]])
+    body = mvest.simulate_body(
+        nodes,
+        tetrahedron,
+        "tet4",
+        fixed_nodes=[0, 1, 2],
+        pressure_faces=np.array([[1, 2, 3]]),
+        material=mvest.TransverselyIsotropic.isotropic(E=2.0, nu=0.45),
+        pressure=float(mvest.units.mmhg_to_mpa(10.0)),
+        times=[0.05, 0.1],
+    )
+    assert body.converged
+    assert body.frames[-1, 3, 2] != 3.0
+
+
+def test_what_a_user_can_cause_is_one_family() -> None:
+    with pytest.raises(mvest.MvestError, match="no such folder"):
+        mvest.read_case("nowhere")
+
+
+# --- the faces ----------------------------------------------------------------------------------
+
+STUBS = sorted(ROOT.joinpath("mvest").rglob("__init__.pyi"))
+
+
+def package_of(stub: Path) -> str:
+    return ".".join(stub.relative_to(ROOT).parent.parts)
+
+
+@pytest.mark.parametrize("stub", STUBS, ids=package_of)
+def test_a_face_offers_what_its_stub_says(stub: Path) -> None:
+    package = importlib.import_module(package_of(stub))
+    said = {
+        alias.asname or alias.name: f"{package.__name__}.{node.module or alias.name}"
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert dir(package) == package.__all__ == sorted(said)
+    for name, home in said.items():
+        own = importlib.import_module(home)
+        assert getattr(package, name) is getattr(own, name, own), name
+
+
+def test_the_front_door_loads_nothing_before_it_is_asked() -> None:
+    code = (
+        "import sys, mvest; assert dir(mvest); heavy = {'numpy', 'scipy', 'numba', 'yaml'}; "
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules); "
+        "mvest.MvestError; assert 'numpy' not in sys.modules; "
+        "mvest.Gaussian; assert 'numpy' in sys.modules and 'numba' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.slow
+def test_type_checkers_know_the_names_and_their_types(tmp_path: Path) -> None:
+    source = tmp_path / "user.py"
+    source.write_text("import mvest\nreveal_type(mvest.Gaussian)\nmvest.Gausian\n")
+    told = subprocess.run(
+        [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", source],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    ).stdout
+    assert "mvest.estimation.gaussian.Gaussian" in told
+    assert 'has no attribute "Gausian"' in told
