@@ -15,9 +15,10 @@ from experiments.common.progress import SolveBar
 from experiments.common.whole_cycle import cycle_model, stored_cycle
 from experiments.studies.patient.study import make_patient
 from mvest.estimation.prediction import Prediction
+from mvest.estimation.wrappers import SharedStart
 from mvest.personalise.chain import foresee_case
 from mvest.problem.expectation import Foresight, foresee, foresee_model
-from mvest.problem.study import SharedStart, simulate_observation
+from mvest.problem.study import simulate_observation
 from mvest.provenance import config_hash
 from mvest.reporting.expectation import foresight_text
 from mvest.typing import FloatArray

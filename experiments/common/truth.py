@@ -22,7 +22,7 @@ from filelock import FileLock
 
 import mvest
 from mvest.errors import InputError, cannot_write
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.provenance import config_hash
 from mvest.typing import FloatArray
 
@@ -128,7 +128,7 @@ class StoredModel:
         for part in self._folder.glob(f"{path.stem}.*.part"):
             # Left by a process that was killed while it wrote.
             part.unlink(missing_ok=True)
-        prediction = self._model(m)
+        prediction = predict(self._model, m)
         if prediction.converged:
             part = self._folder / f"{path.stem}.{uuid.uuid4().hex}.part"
             try:

@@ -21,7 +21,7 @@ from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.information.model_error import shift_by_model_error
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 
@@ -136,7 +136,7 @@ def shift_by_check_mesh(
     """
     if not found.converged:
         return f"no estimate: {found.reason.value}"
-    predicted = model(found.mean)
+    predicted = predict(model, found.mean)
     try:
         check = frames_on_mesh(config, found.mean, "check")
     except InputError as error:

@@ -1,11 +1,11 @@
 """What a filter needs from a biomechanical model: the observation it predicts, and its Jacobian."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from mvest.errors import InputError
+from mvest.errors import InputError, MaterialError
 from mvest.typing import FloatArray
 
 
@@ -24,6 +24,9 @@ class Prediction:
         False if the model found no answer. Filters then read nothing but `reason`.
     reason : str
         Why the model stopped; must say something where it failed.
+    aux : object
+        Whatever else the model hands on to who asked for the estimate; filters carry it along
+        unread.
 
     Raises
     ------
@@ -36,6 +39,7 @@ class Prediction:
     jacobian: FloatArray
     converged: bool = True
     reason: str = "converged"
+    aux: object = None
 
     def __post_init__(self) -> None:
         y = read_only(self.y)
@@ -76,17 +80,99 @@ class Prediction:
         return cls(np.empty(0), np.empty((0, 0)), converged=False, reason=reason)
 
 
+Predicted: TypeAlias = Prediction | tuple[FloatArray, FloatArray]
+"""What a model may return: a `Prediction`, or the pair (y, jacobian) of one that converged."""
+
+
 class ObservationModel(Protocol):
-    """Any function from parameters (p,) to a `Prediction`; this is all a filter knows of a model.
+    """Any function from parameters (p,) to a prediction; this is all a filter knows of a model.
 
     The model must accept every finite m. Where m is inadmissible, or the computation does not
-    converge, it returns `Prediction.failed(reason)` and raises nothing: filters try steps that may
-    leave the admissible range and shorten them when told so.
+    converge, it returns `Prediction.failed(reason)`: filters try steps that may leave the
+    admissible range and shorten them when a prediction has failed.
     """
 
-    def __call__(self, m: FloatArray, /) -> Prediction:
+    def __call__(self, m: FloatArray, /) -> Predicted:
         """Predict the observation of parameters m (p,)."""
         ...
+
+
+def predict(
+    model: ObservationModel, m: FloatArray, n: int | None = None, *, derivatives: bool = False
+) -> Prediction:
+    """Run a model; where it refuses m as no tissue can have it, the prediction has failed.
+
+    Parameters
+    ----------
+    model : ObservationModel
+    m : (p,)
+    n, derivatives
+        See `as_prediction`.
+    """
+    try:
+        returned = model(np.array(m, dtype=np.float64))
+    except MaterialError as error:
+        return Prediction.failed(str(error))
+    return as_prediction(returned, np.size(m), n, derivatives=derivatives)
+
+
+def as_prediction(
+    returned: Predicted, p: int, n: int | None = None, *, derivatives: bool = False
+) -> Prediction:
+    """What a model of p parameters returned, checked; the one place where that is done.
+
+    Parameters
+    ----------
+    returned : Prediction or (y, jacobian)
+    p : int
+    n : int, optional
+        How many observations are expected; default any number.
+    derivatives : bool
+        Whether the Jacobian is needed.
+
+    Raises
+    ------
+    InputError
+        If the model breaks its contract: it returned something else, or other shapes than (n,) and
+        (n, p).
+    """
+    prediction = returned if isinstance(returned, Prediction) else _from_pair(returned, p)
+    if not prediction.converged:
+        return prediction
+    y, jacobian = prediction.y, prediction.jacobian
+    plain = not derivatives and not prediction.differentiated
+    if (n is not None and len(y) != n) or not (plain or jacobian.shape[1] == p):
+        raise InputError(
+            f"the model must predict {len(y) if n is None else n} observations and their "
+            f"derivatives with respect to {p} parameters; got y of shape {y.shape} and jacobian of "
+            f"shape {jacobian.shape}"
+        )
+    return prediction
+
+
+def _from_pair(returned: object, p: int) -> Prediction:
+    """The prediction of p parameters that a model gave as (y, jacobian)."""
+    got = _kind(returned)
+    if isinstance(returned, tuple) and len(returned) == 2:
+        try:
+            y, jacobian = (np.asarray(part, dtype=np.float64) for part in returned)
+        except (TypeError, ValueError):
+            got = " and ".join(map(_kind, returned))
+        else:
+            return Prediction(y, jacobian)
+    raise InputError(
+        f"a model must return a Prediction, or a tuple of y of shape (n,) and jacobian of shape "
+        f"(n, {p}); got {got}"
+    )
+
+
+def _kind(value: object) -> str:
+    """What a value is, in words."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if isinstance(value, tuple):
+        return f"a tuple of {len(value)}"
+    return "None" if value is None else f"a value of type {type(value).__name__}"
 
 
 def read_only(values: FloatArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """One run of a filter: its problem in filter coordinates, its count of solves, its history."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import (
     ObservationModel,
     Prediction,
+    predict,
     read_only,
     require_finite,
 )
@@ -84,17 +86,7 @@ class FilterRun:
         if not np.all(np.isfinite(m)):
             return Prediction.failed(f"the parameters {m} are not finite")
         self.forward_solves += 1
-        prediction = self._model(m.copy())
-        n, p = self.y.size, self.prior.size
-        fits = prediction.jacobian.shape == (n, p)
-        if not derivatives and not prediction.differentiated:
-            fits = prediction.y.size == n
-        if prediction.converged and not fits:
-            raise InputError(
-                f"the model must predict {n} observations and their derivatives with respect to "
-                f"{p} parameters; got y of shape {prediction.y.shape} and jacobian of shape "
-                f"{prediction.jacobian.shape}"
-            )
+        prediction = predict(self._model, m, self.y.size, derivatives=derivatives)
         self._last = (z.copy(), prediction)
         return prediction
 
@@ -170,7 +162,7 @@ class FilterRun:
             return self.fail(z, P, prediction)
         if not prediction.differentiated:
             jacobian = slope / self.transform.derivative(z)
-            prediction = Prediction(prediction.y, jacobian, reason=prediction.reason)
+            prediction = replace(prediction, jacobian=jacobian)
         H = self.jacobian(z, prediction)
         innovation = self.y - prediction.y + H @ (z - self.prior.mean)
         update = kalman_update(self.prior, innovation, H, self.noise)

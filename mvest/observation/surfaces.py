@@ -36,14 +36,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError
 from mvest.estimation.noise import (
     NoiseCovariance,
     observation_noise,
     scaled_noise,
     stacked_noise,
 )
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.vertices import FRAMES
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -60,7 +60,6 @@ __all__ = [
     "UNKNOWN",
     "ObservedSurface",
     "PredictedSurface",
-    "SurfaceFrames",
     "SurfaceObservation",
     "mean_surface_distance",
     "surface_distance",
@@ -261,8 +260,14 @@ class SurfaceObservation:
         """Zeros: the seen points have no distance to the surface that was seen."""
         return np.zeros(sum(self._size(seen) for seen in self.seen))
 
-    def of(self, model: ObservationModel, all_frames: Sequence[str] = FRAMES, /) -> SurfaceFrames:
-        """What a model predicts of this observation.
+    def of(
+        self, model: ObservationModel, all_frames: Sequence[str] = FRAMES, /
+    ) -> ObservationModel:
+        """The distances of what was seen to what a model predicts.
+
+        What it hands on with a prediction are the observed frames with all vertices, (f, n, 3) mm.
+        To a triangle without area a distance is that to its edges; a point on it has no direction
+        and no derivative.
 
         Parameters
         ----------
@@ -279,7 +284,29 @@ class SurfaceObservation:
         unknown = set(self.frames) - set(all_frames)
         if unknown:
             raise InputError(f"observed frames {sorted(unknown)}, predicted {list(all_frames)}")
-        return SurfaceFrames(model, self, tuple(all_frames))
+        chosen = [all_frames.index(frame) for frame in self.frames]
+        shape = (len(all_frames), self.surface.n_vertices, 3)
+
+        def distances(m: FloatArray) -> Prediction:
+            prediction = predict(model, m)
+            if not prediction.converged:
+                return prediction
+            if prediction.y.size != np.prod(shape):
+                raise InputError(
+                    f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
+                    f"{shape[1]} vertices in each of the frames {', '.join(all_frames)}"
+                )
+            whole = prediction.y.reshape(shape)[chosen]
+            motion = prediction.jacobian.reshape(*shape, prediction.jacobian.shape[1])[chosen]
+            parts = [
+                part
+                for seen, vertices, moved in zip(self.seen, whole, motion, strict=True)
+                for part in _of_frame(self, seen, vertices, moved)
+            ]
+            y, jacobian = (np.concatenate(column) for column in zip(*parts, strict=True))
+            return replace(prediction, y=y, jacobian=jacobian, aux=whole)
+
+        return distances
 
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Unsigned distances ``(q,)`` mm of the last frame's points to fitted ``(f, n, 3)``."""
@@ -337,71 +364,24 @@ class SurfaceObservation:
         return stacked_noise(parts)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceFrames:
-    """The distances of what was seen to what a model predicts.
-
-    Parameters that no tissue can have, as a filter may try, give a failed prediction. To a triangle
-    without area a distance is that to its edges; a point on it has no direction and no derivative.
-
-    Attributes
-    ----------
-    model : ObservationModel
-        Predicts the stacked positions of all frames.
-    observation : SurfaceObservation
-    all_frames : tuple of str
-        In the order in which the model stacks them.
-    """
-
-    model: ObservationModel
-    observation: SurfaceObservation
-    all_frames: tuple[str, ...]
-    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
-
-    def whole(self, m: FloatArray) -> FloatArray | None:
-        """Observed frames ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
-        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict the distances for parameters ``m (p,)``."""
-        try:
-            prediction = self.model(m)
-        except MaterialError as error:
-            return Prediction.failed(str(error))
-        if not prediction.converged:
-            return prediction
-        surface = self.observation.surface
-        shape = (len(self.all_frames), surface.n_vertices, 3)
-        if prediction.y.size != np.prod(shape):
-            raise InputError(
-                f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
-                f"{surface.n_vertices} vertices in each of the frames {', '.join(self.all_frames)}"
-            )
-        chosen = [self.all_frames.index(frame) for frame in self.observation.frames]
-        whole = prediction.y.reshape(shape)[chosen]
-        motion = prediction.jacobian.reshape(*shape, -1)[chosen]
-        y, jacobian = [], []
-        for seen, vertices, moved in zip(self.observation.seen, whole, motion, strict=True):
-            for h, H in self._of_frame(seen, vertices, moved):
-                y.append(h)
-                jacobian.append(H)
-        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
-        return Prediction(np.concatenate(y), np.concatenate(jacobian), reason=prediction.reason)
-
-    def _of_frame(
-        self, seen: ObservedSurface, vertices: FloatArray, motion: FloatArray
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
-        surface = self.observation.surface
-        h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
-        for region, members in _by_region(seen):
-            h[members], H[members] = signed_distances(
-                seen.points[members], vertices, surface.of(region), motion
-            )
-        yield h, H
-        for curve, loop in _curves(seen, surface):
-            assert self.observation.curve_std_mm is not None
-            across = across_curve(curve, self.observation.curve_std_mm)
-            yield curve_offsets(curve, across, vertices[loop], motion[loop])
+def _of_frame(
+    observation: SurfaceObservation,
+    seen: ObservedSurface,
+    vertices: FloatArray,
+    motion: FloatArray,
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Distances of what was seen in a frame to a predicted surface, and their derivatives."""
+    surface = observation.surface
+    h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
+    for region, members in _by_region(seen):
+        h[members], H[members] = signed_distances(
+            seen.points[members], vertices, surface.of(region), motion
+        )
+    yield h, H
+    for curve, loop in _curves(seen, surface):
+        assert observation.curve_std_mm is not None
+        across = across_curve(curve, observation.curve_std_mm)
+        yield curve_offsets(curve, across, vertices[loop], motion[loop])
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError
 from mvest.estimation.noise import NoiseCovariance, scaled_noise, stacked_noise
-from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
+from mvest.estimation.prediction import ObservationModel, Prediction, predict, require_finite
 from mvest.observation.errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["FRAMES", "Observation", "ObservedFrames", "require_frames", "select_frames"]
+__all__ = ["FRAMES", "Observation", "observed_frames", "require_frames", "select_frames"]
 
 FRAMES = ("open", "closed")
 """Frames that a valve model predicts, in the order in which it stacks them."""
@@ -98,9 +98,9 @@ class Observation:
         """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
         return self.positions[self.seen].ravel()
 
-    def of(self, model: ObservationModel, /) -> ObservedFrames:
-        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation."""
-        return ObservedFrames(model, self.frames, self.seen)
+    def of(self, model: ObservationModel, /) -> ObservationModel:
+        """What a model predicts of this observation; see :func:`observed_frames`."""
+        return observed_frames(model, self.frames, self.seen)
 
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Distance ``(n,)`` mm of each vertex of the last frame from fitted ``(f, n, 3)``.
@@ -139,44 +139,31 @@ def require_frames(frames: Sequence[str]) -> None:
         raise InputError(f"observed frames {list(frames)}, expected some of {list(FRAMES)}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ObservedFrames:
-    """The observed frames of a model that predicts all of ``FRAMES``.
+def observed_frames(
+    model: ObservationModel, frames: Sequence[str], seen: BoolArray | None = None
+) -> Callable[[FloatArray], Prediction]:
+    """The observed frames of a model that predicts all of ``FRAMES``, stacked.
 
-    Parameters that no tissue can have, as a filter may try, give a failed prediction.
+    What it hands on with a prediction are these frames with all vertices, ``(f, n, 3)`` mm.
 
-    Attributes
+    Parameters
     ----------
     model : ObservationModel
-    frames : tuple of str, (f,)
-    seen : (f, n) or None
-        Vertices that are predicted in each frame; None for all.
+    frames : sequence of str, (f,)
+    seen : (f, n), optional
+        Vertices that are predicted in each frame; default all.
     """
+    rows = slice(None) if seen is None else np.repeat(seen, 3)
 
-    model: ObservationModel
-    frames: tuple[str, ...]
-    seen: BoolArray | None = None
-    _whole: dict[bytes, FloatArray] = field(default_factory=dict, init=False, repr=False)
-
-    def whole(self, m: FloatArray) -> FloatArray | None:
-        """Positions ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
-        return self._whole.get(np.asarray(m, dtype=np.float64).tobytes())
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict the observed frames of parameters ``m (p,)``."""
-        try:
-            prediction = self.model(m)
-        except MaterialError as error:
-            return Prediction.failed(str(error))
+    def observed(m: FloatArray) -> Prediction:
+        prediction = predict(model, m)
         if not prediction.converged:
             return prediction
-        y, jacobian = (select_frames(a, self.frames) for a in (prediction.y, prediction.jacobian))
-        whole = y.reshape(len(self.frames), -1, 3)
-        self._whole[np.asarray(m, dtype=np.float64).tobytes()] = whole
-        if self.seen is not None:
-            rows = np.repeat(self.seen, 3)
-            y, jacobian = y[rows], jacobian[rows]
-        return Prediction(y, jacobian, reason=prediction.reason)
+        y, jacobian = (select_frames(a, frames) for a in (prediction.y, prediction.jacobian))
+        whole = y.reshape(len(frames), -1, 3)
+        return replace(prediction, y=y[rows], jacobian=jacobian[rows], aux=whole)
+
+    return observed
 
 
 def select_frames(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:

@@ -18,10 +18,10 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
-from mvest.estimation.prediction import Prediction
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.update import kalman_update
+from mvest.estimation.wrappers import SharedStart, of_some
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.surfaces import (
@@ -43,7 +43,7 @@ from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.expectation import Foresight, foresee
 from mvest.problem.registration import REGISTRATION, RegisteredModel
-from mvest.problem.study import Case, Observed, SharedStart, StudyResult, estimate
+from mvest.problem.study import Case, Observed, StudyResult, estimate
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.band import Band
 
@@ -321,7 +321,7 @@ class _Chain:
             prior = Gaussian.from_variance(prior.mean, variance)
         case = Case(
             tuple(self.names[k] for k in moduli),
-            _Moduli(self.shared, self.shared.start, moduli),
+            of_some(self.shared, self.shared.start, moduli, snap=1e-14),
             prior,
             filter_,
             Log() if log else Log((False,) * len(moduli)),
@@ -465,25 +465,6 @@ class _Chain:
             return None
         closed = found.y.reshape(2, -1, 3)[1]
         return float(np.linalg.norm(closed - result.fitted[-1], axis=1).max())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Moduli:
-    """A model as a function of some of its parameters, the others fixed at ``values``."""
-
-    model: Callable[[FloatArray], Prediction]
-    values: FloatArray
-    kept: IntArray
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        whole = np.array(self.values)
-        # The start is met to the last bit, so that it is not computed again.
-        changed = ~np.isclose(m, whole[self.kept], rtol=1e-14, atol=0.0)
-        whole[self.kept[changed]] = m[changed]
-        found = self.model(whole)
-        if not found.converged:
-            return found
-        return Prediction(found.y, found.jacobian[:, self.kept], reason=found.reason)
 
 
 def _thinned(n: int) -> BoolArray:

@@ -21,12 +21,12 @@ from mvest.cases.displaced import displaced_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import MvestError
 from mvest.estimation.noise import ObservationNoise
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalise.model import build_coarse
 from mvest.personalise.settings import PersonaliseSettings
-from mvest.problem.study import Observed, PredictedFrames
+from mvest.problem.study import Observed
 from mvest.typing import FloatArray
 
 __all__ = ["GeometryErrors", "WeighedObservation", "errors_of", "sample_geometry"]
@@ -151,7 +151,7 @@ def errors_of(
 
     def distances(what: SurfaceObservation, predicted: FloatArray) -> FloatArray:
         y = np.concatenate([generic[:half], generic[half:] + predicted.ravel()])
-        return what.of(lambda _: Prediction(y, np.zeros((len(y), 1))))(np.zeros(1)).y
+        return predict(what.of(lambda _: Prediction.undifferentiated(y)), np.zeros(1)).y
 
     first = distances(plain, np.zeros(half))
     columns = []
@@ -188,7 +188,7 @@ class WeighedObservation:
         """The observation ``(k,)``."""
         return self.plain.y
 
-    def of(self, model: ObservationModel, /) -> PredictedFrames:
+    def of(self, model: ObservationModel, /) -> ObservationModel:
         """What a model predicts of this observation."""
         return self.plain.of(model)
 

@@ -14,7 +14,7 @@ from scipy.stats import norm
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel
+from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.transform import Transform, to_filter
 from mvest.problem.study import Case, Observed
 from mvest.typing import FloatArray
@@ -117,7 +117,7 @@ def foresee_model(
     """
     # As filters start, whose first prediction may be shared.
     assumed = transform.inverse(transform.forward(prior.mean))
-    predicted = model(assumed)
+    predicted = predict(model, assumed, derivatives=True)
     data = informed = None
     if predicted.converged:
         scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)

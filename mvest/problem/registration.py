@@ -8,6 +8,8 @@ frame is turned and shifted before it is compared.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -133,6 +135,4 @@ class RegisteredModel:
                 by_radian = (closed - self.centre) @ turns[i].T
                 jacobian[half:, k] = np.deg2rad(by_radian).ravel()
         seen = displace(closed, registration, self.centre)
-        return Prediction(
-            np.concatenate([found.y[:half], seen.ravel()]), jacobian, reason=found.reason
-        )
+        return replace(found, y=np.concatenate([found.y[:half], seen.ravel()]), jacobian=jacobian)

@@ -14,20 +14,18 @@ from typing import Protocol
 
 import numpy as np
 
-from mvest.closure.model import ClosedState
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
+from mvest.estimation.prediction import ObservationModel, as_prediction, require_finite
 from mvest.estimation.transform import Transform
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import ObservationError, SpatialCorrelation, observe
 from mvest.observation.vertices import (
     FRAMES,
     Observation,
-    ObservedFrames,
     require_frames,
     select_frames,
 )
@@ -39,9 +37,6 @@ __all__ = [
     "Modulus",
     "Observation",
     "Observed",
-    "ObservedFrames",
-    "PredictedFrames",
-    "SharedStart",
     "StudyResult",
     "Truth",
     "TwinData",
@@ -67,18 +62,6 @@ class Truth:
     positions: FloatArray
 
 
-class PredictedFrames(Protocol):
-    """What a model predicts of an observation, and the frames that this was taken from."""
-
-    def whole(self, m: FloatArray) -> FloatArray | None:
-        """Observed frames ``(f, n, 3)`` of all vertices where the model was run with ``m (p,)``."""
-        ...
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an ``ObservationModel`` does."""
-        ...
-
-
 class Observed(Protocol):
     """What an estimation needs of an observation, whatever its kind."""
 
@@ -97,8 +80,11 @@ class Observed(Protocol):
         """Covariance of ``y``."""
         ...
 
-    def of(self, model: ObservationModel, /) -> PredictedFrames:
-        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation."""
+    def of(self, model: ObservationModel, /) -> ObservationModel:
+        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation.
+
+        Its predictions have for ``aux`` the observed frames ``(f, n, 3)`` mm with all vertices.
+        """
         ...
 
     def distance(self, fitted: FloatArray) -> FloatArray:
@@ -113,56 +99,6 @@ class TwinData:
     observation: Observation | None
     truth: Truth | None
     reason: str
-
-
-class Restartable(Protocol):
-    """A model whose next prediction may start from where an earlier one ended."""
-
-    @property
-    def closed(self) -> ClosedState | None:
-        """Where the next prediction would start from."""
-        ...
-
-    def restart(self, closed: ClosedState | None) -> None:
-        """Forget everything but where to start from."""
-        ...
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an ``ObservationModel`` does."""
-        ...
-
-
-class SharedStart:
-    """A model for many estimations that all begin with one and the same prediction.
-
-    The prediction at the common start is computed once, and whenever it is asked for the model goes
-    on from there as if nothing else had been computed before. So an estimation gives the same
-    numbers, to the last bit, by itself and after any others.
-
-    Parameters
-    ----------
-    model : Restartable
-        Nobody else may use it meanwhile.
-    start : (p,)
-        Parameters at which every estimation begins.
-    """
-
-    def __init__(self, model: Restartable, start: FloatArray) -> None:
-        self._model = model
-        self.start = np.array(start, dtype=np.float64)
-        self._first: tuple[Prediction, ClosedState | None] | None = None
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict, as an ``ObservationModel`` does."""
-        if not np.array_equal(m, self.start):
-            return self._model(m)
-        if self._first is None:
-            self._model.restart(None)
-            prediction = self._model(m)
-            self._first = prediction, self._model.closed
-        prediction, closed = self._first
-        self._model.restart(closed)
-        return prediction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -373,7 +309,7 @@ def simulate_observation(
         )
     require_finite(values, "the true values")
     require_frames(frames)
-    prediction = model(values)
+    prediction = as_prediction(model(values), values.size)
     if not prediction.converged:
         return TwinData(None, None, f"no synthetic observation: {prediction.reason}")
     positions = select_frames(prediction.y, frames).reshape(len(frames), -1, 3)
@@ -390,10 +326,9 @@ def estimate(
     Numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
-    predicted = observation.of(case.model)
     R = observation.R
     filtered = case.filter(
-        predicted,
+        observation.of(case.model),
         case.prior,
         observation.y,
         R,
@@ -401,8 +336,10 @@ def estimate(
         transform=case.transform,
         on_iterate=on_iterate,
     )
-    bound = None
+    bound = fitted = None
     if filtered.prediction is not None:
+        aux = filtered.prediction.aux
+        fitted = aux if isinstance(aux, np.ndarray) else None
         # What is estimated near zero has its prior for a size.
         bound = identifiability(
             filtered.prediction.jacobian,
@@ -420,5 +357,5 @@ def estimate(
         detail=filtered.detail,
         converged=filtered.converged,
         seconds=time.perf_counter() - started,
-        fitted=None if filtered.prediction is None else predicted.whole(filtered.mean),
+        fitted=fitted,
     )

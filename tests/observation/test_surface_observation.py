@@ -635,8 +635,7 @@ def test_frames_are_chosen_by_name_out_of_any_number() -> None:
     # Only the closed frame, here the first observed one, moves.
     np.testing.assert_allclose(prediction.y, np.repeat([0.6, 1.0], 5), atol=1e-14)
     np.testing.assert_allclose(prediction.jacobian[:, 2], np.repeat([-1.0, 0.0], 5), atol=1e-14)
-    np.testing.assert_array_equal(predict.whole(m), [vertices + m, vertices])
-    assert predict.whole(m + 1) is None
+    np.testing.assert_array_equal(prediction.aux, [vertices + m, vertices])
     with pytest.raises(InputError, match="half"):
         SurfaceObservation(frames, surface, 1.0).of(last, FRAMES)
 

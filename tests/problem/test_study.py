@@ -8,12 +8,12 @@ import pytest
 from mvest.closure.model import ClosedState
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Prediction
+from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.problem.study import (
     Case,
     Observation,
-    SharedStart,
     StudyResult,
     Truth,
     TwinData,

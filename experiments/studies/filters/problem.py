@@ -20,10 +20,10 @@ from experiments.common.build import build_twin
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import Log, to_filter
 from mvest.files import write_atomically
-from mvest.observation.vertices import ObservedFrames
+from mvest.observation.vertices import observed_frames
 from mvest.typing import FloatArray
 
 __all__ = ["Problem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
@@ -106,7 +106,7 @@ class TimedModel:
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict, as an ``ObservationModel`` does."""
         began = time.process_time()
-        prediction = self._model(m)
+        prediction = predict(self._model, m)
         self.seconds += time.process_time() - began
         self.runs += 1
         return prediction
@@ -170,7 +170,7 @@ def build_problem(config: Values, name: str) -> Problem:
     return Problem(
         name,
         parameters,
-        TimedModel(ObservedFrames(model, ("closed",), seen), lambda: model.restart(None)),
+        TimedModel(observed_frames(model, ("closed",), seen), lambda: model.restart(None)),
         prior,
         twin.truth_values,
         float(settings["noise_mm"]),

@@ -20,7 +20,7 @@ from experiments.common.whole_cycle import (
     shift_by_check_mesh,
     stored_cycle,
 )
-from mvest.closure.cycle.observation import CycleObservation, SeenFrames
+from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -28,6 +28,7 @@ from mvest.estimation.filters.sequential import SequentialEstimate, SequentialFi
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.consistency import nees
 from mvest.estimation.information.identifiability import identifiability
+from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray
 
@@ -137,7 +138,7 @@ class _Study:
         parameters: tuple[str, ...],
         transform: Transform,
         prior: Gaussian,
-        seen: SeenFrames,
+        seen: ObservationModel,
         truth: FloatArray,
         tolerance: float,
     ) -> None:

@@ -16,6 +16,7 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.prediction import Prediction
+from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.exponential import ExponentialLaw, ExponentialTissue
 from mvest.mechanics.parameters import kind_of
@@ -23,7 +24,6 @@ from mvest.mechanics.solid import Law
 from mvest.mechanics.valve_system import material_law
 from mvest.observation.vertices import Observation
 from mvest.problem.study import (
-    SharedStart,
     StudyResult,
     Truth,
     TwinData,

@@ -19,10 +19,11 @@ import numpy as np
 from experiments.common.build import build_filter, mechanics_of, template_of
 from experiments.common.forward import forward_record
 from experiments.common.whole_cycle import cycle_model, shift_by_check_mesh, stored_cycle
-from mvest.closure.cycle.observation import CycleObservation, SeenFrames
+from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.law.field import FieldBasis, StiffPatch
 from mvest.typing import FloatArray
@@ -42,7 +43,7 @@ def run_patch_study(
     model = cycle_model(config)
     leaflet = _Leaflet(config, parameters, patch)
     noise, start, results = settings["noise_mm"], prior.mean, {}
-    seen: SeenFrames | None = None
+    seen: ObservationModel | None = None
     valves: dict[str, dict[str, StiffPatch]] = {"patch": {"patch": patch}}
     if config["patch"]["compared"]:
         valves["no patch"] = {}

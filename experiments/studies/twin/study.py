@@ -15,9 +15,9 @@ from experiments.common.build import Twin, build_twin
 from experiments.common.progress import SolveBar
 from experiments.common.record import make_record, measure_frames, repeat_entry, write_fields
 from mvest.closure.model import ClosureModel
+from mvest.estimation.wrappers import SharedStart
+from mvest.observation.vertices import observed_frames
 from mvest.problem.study import (
-    ObservedFrames,
-    SharedStart,
     StudyResult,
     estimate,
     simulate_observation,
@@ -125,7 +125,7 @@ def _confirm(twin: Twin, result: StudyResult) -> float | None:
     twin.model.continuation, twin.model.guide = False, None
     with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
         twin.model.on_step = bar.step
-        anew = ObservedFrames(twin.model, twin.frames)(result.estimate)
+        anew = observed_frames(twin.model, twin.frames)(result.estimate)
     twin.model.continuation, twin.model.guide = usual
     if not anew.converged:
         return None

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.estimation.prediction import ObservationModel, Prediction, require_finite
+from mvest.estimation.prediction import ObservationModel, Predicted, require_finite
+from mvest.estimation.wrappers import Remembered, rows_of
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["Beats", "CycleObservation", "SeenFrames"]
+__all__ = ["Beats", "CycleObservation"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,41 +88,9 @@ class CycleObservation:
         """Variances ``(m,)`` mm² of ``y``."""
         return np.repeat(self.std**2, 3 * self.seen.sum(axis=1))
 
-    def of(self, model: ObservationModel) -> SeenFrames:
-        """What a model of all vertices in all frames predicts of this observation."""
-        return SeenFrames(model, self.seen)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SeenFrames:
-    """The part of a model's prediction that is seen. Each run of the model is kept.
-
-    Attributes
-    ----------
-    model : ObservationModel
-        Predicts all vertices in all frames.
-    seen : (f, n)
-    """
-
-    model: ObservationModel
-    seen: BoolArray
-    _kept: dict[bytes, Prediction] = field(default_factory=dict, init=False, repr=False)
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Predict what is seen of parameters ``m (p,)``."""
-        key = np.asarray(m, dtype=np.float64).tobytes()
-        if key not in self._kept:
-            whole = self.model(m)
-            if whole.converged:
-                rows = np.repeat(self.seen, 3)
-                if len(whole.y) != rows.size:
-                    raise InputError(
-                        f"the model predicts {len(whole.y)} coordinates, the observation has "
-                        f"{rows.size} with those that are not seen"
-                    )
-                whole = Prediction(whole.y[rows], whole.jacobian[rows])
-            self._kept[key] = whole
-        return self._kept[key]
+    def of(self, model: ObservationModel) -> ObservationModel:
+        """What a model of all vertices in all frames predicts of this; each run is kept."""
+        return Remembered(rows_of(model, np.repeat(self.seen, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +105,6 @@ class Beats:
 
     model: ObservationModel
 
-    def frame(self, k: int, m: FloatArray, /) -> Prediction:
+    def frame(self, k: int, m: FloatArray, /) -> Predicted:
         """Predict beat ``k``, of which only the parameters differ from another's."""
         return self.model(m)

@@ -15,7 +15,7 @@ from mvest.estimation.noise import (
     low_rank_noise,
     observation_noise,
 )
-from mvest.estimation.prediction import ObservationModel, Prediction, read_only
+from mvest.estimation.prediction import ObservationModel, Prediction, predict, read_only
 from mvest.estimation.run import require_settings
 from mvest.estimation.transform import Identity, Transform, to_filter
 from mvest.typing import BoolArray, FloatArray, IntArray
@@ -153,11 +153,12 @@ class _Problem:
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict at estimated parameters ``m``, differentiated by them only."""
         if self._last is None or not np.array_equal(self._last[0], m):
-            self._last = np.array(m, dtype=np.float64), self.model(self._filled(m))
+            prediction = predict(self.model, self._filled(m), derivatives=True)
+            self._last = np.array(m, dtype=np.float64), prediction
         prediction = self._last[1]
         if not prediction.converged:
             return prediction
-        return Prediction(prediction.y, prediction.jacobian[:, self.kept], reason=prediction.reason)
+        return replace(prediction, jacobian=prediction.jacobian[:, self.kept])
 
     @property
     def columns(self) -> FloatArray:

@@ -1,6 +1,7 @@
 """The smoother of parameters that drift from frame to frame."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +12,7 @@ from mvest.estimation.filters.iterated import ROUND_OFF
 from mvest.estimation.filters.sequential import HALVINGS
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise
-from mvest.estimation.prediction import Prediction
+from mvest.estimation.prediction import Predicted, predict
 from mvest.estimation.run import require_settings
 from mvest.estimation.trajectory import (
     FrameState,
@@ -32,7 +33,7 @@ __all__ = ["DriftEstimate", "DriftSmoother", "FrameModel"]
 class FrameModel(Protocol):
     """A model whose frames depend on the parameters of that frame only."""
 
-    def frame(self, k: int, m: FloatArray, /) -> Prediction:
+    def frame(self, k: int, m: FloatArray, /) -> Predicted:
         """Predict frame k of parameters m (p,); fails as `ObservationModel` does."""
         ...
 
@@ -195,7 +196,7 @@ class _DriftRun:
         """Frame k linearised at z (p,) and its share of J, or why the model failed."""
         self.forward_solves += 1
         m = self.transform.inverse(z)
-        found = self.model.frame(k, m)
+        found = predict(partial(self.model.frame, k), m, len(self.y[k]), derivatives=True)
         if not found.converged:
             return f"frame {k} at {m}: {found.reason}"
         H = found.jacobian * self.transform.derivative(z)

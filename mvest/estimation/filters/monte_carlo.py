@@ -21,7 +21,7 @@ from mvest.estimation.filters.surrogate import (
 from mvest.estimation.filters.unscented import UnscentedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.run import FilterRun, by_filter
 from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray
@@ -117,9 +117,16 @@ class MonteCarloFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Draw from the posterior; see `Filter` for the arguments."""
-        kept = _Recorded(model)
-        run = FilterRun(kept, prior, y, R, names, transform, on_iterate)
-        first = self.start(kept, prior, y, R, names=names, transform=transform)
+        kept: list[tuple[FloatArray, Prediction]] = []
+
+        def recorded(m: FloatArray) -> Prediction:
+            prediction = predict(model, m)
+            if prediction.converged:
+                kept.append((m, prediction))
+            return prediction
+
+        run = FilterRun(recorded, prior, y, R, names, transform, on_iterate)
+        first = self.start(recorded, prior, y, R, names=names, transform=transform)
         run.forward_solves += first.forward_solves
         z, P = first.transformed.mean, first.transformed.covariance
         if first.prediction is None:
@@ -182,24 +189,10 @@ def log_posterior(misfit: Misfit) -> LogDensity:
     return density
 
 
-class _Recorded:
-    """A model that keeps what it predicted."""
-
-    def __init__(self, model: ObservationModel) -> None:
-        self._model = model
-        self.runs: list[tuple[FloatArray, Prediction]] = []
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        prediction = self._model(m)
-        if prediction.converged:
-            self.runs.append((np.array(m), prediction))
-        return prediction
-
-
 class _Runs:
     """All runs of the model so far, in coordinates x in which the prior is N(0, I)."""
 
-    def __init__(self, run: FilterRun, kept: _Recorded) -> None:
+    def __init__(self, run: FilterRun, kept: list[tuple[FloatArray, Prediction]]) -> None:
         self.run, self._kept = run, kept
         self._L = run.prior.factor
 
@@ -213,14 +206,14 @@ class _Runs:
 
     def fit(self, region: Region, most: int) -> Surrogate | None:
         """The polynomial through all runs in a region; None if there are fewer than 3 p."""
-        z = np.array([self.run.transform.forward(m) for m, _ in self._kept.runs])
+        z = np.array([self.run.transform.forward(m) for m, _ in self._kept])
         offset = (z - self.run.prior.mean).T
         points = np.asarray(np.linalg.lstsq(self._L, offset, rcond=None)[0].T, dtype=np.float64)
         inside = np.flatnonzero(region.holds(points, ROOM))
         r, p = len(inside), points.shape[1]
         if r < 3 * p:
             return None
-        predictions = [self._kept.runs[i][1] for i in inside]
+        predictions = [self._kept[i][1] for i in inside]
         values = np.array([prediction.y for prediction in predictions])
         jacobians = None
         if all(prediction.differentiated for prediction in predictions):

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance, ObservationNoise, observation_noise
-from mvest.estimation.prediction import ObservationModel, require_finite
+from mvest.estimation.prediction import ObservationModel, predict, require_finite
 from mvest.estimation.transform import Identity, Transform, to_filter
 from mvest.typing import FloatArray, IntArray
 
@@ -219,13 +219,10 @@ class _Fit:
 
     def point(self, z: FloatArray) -> _Point | str:
         """Residual and Jacobian at z (p,), or why there is none."""
-        prediction = self.model(self.transform.inverse(z))
+        m = self.transform.inverse(z)
+        prediction = predict(self.model, m, self.y.size, derivatives=True)
         if not prediction.converged:
             return prediction.reason
-        if prediction.y.shape != self.y.shape:
-            raise InputError(
-                f"the model predicts {prediction.y.size} observations; there are {self.y.size}"
-            )
         residual = self.noise.whiten(self.y - prediction.y)
         jacobian = -self.noise.whiten(prediction.jacobian * self.transform.derivative(z))
         if self.prior is not None:

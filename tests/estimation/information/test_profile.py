@@ -136,7 +136,7 @@ def test_a_profile_is_not_followed_far_beyond_its_threshold():
         ({"index": 3}, "parameter 3 of 3"),
         ({"level": 1.0}, "expected between 0 and 1"),
         ({"names": ("a",)}, "names"),
-        ({"y": np.zeros(4)}, "predicts 5 observations; there are 4"),
+        ({"y": np.zeros(4)}, r"must predict 4 observations.*y of shape \(5,\)"),
         ({"model": lambda m: Prediction.failed("broken")}, "broken"),
     ],
 )

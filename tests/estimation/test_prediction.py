@@ -1,0 +1,207 @@
+"""What a model may return, and what is said where it returns something else."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError, MaterialError
+from mvest.estimation import (
+    DriftSmoother,
+    EnsembleFilter,
+    ExtendedFilter,
+    Gaussian,
+    Identity,
+    IteratedFilter,
+    MonteCarloFilter,
+    PaperFilter,
+    Prediction,
+    SchmidtFilter,
+    SequentialFilter,
+    UnscentedFilter,
+    profile,
+)
+from mvest.estimation.prediction import as_prediction, predict
+from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of
+from mvest.problem.expectation import foresee_model
+
+H = np.random.default_rng(5).standard_normal((6, 2))
+Y = H @ np.array([1.0, 2.0]) + 0.01
+PRIOR = Gaussian(np.ones(2), np.eye(2))
+FILTERS = (
+    PaperFilter(0.0),
+    ExtendedFilter(),
+    IteratedFilter(),
+    UnscentedFilter(),
+    EnsembleFilter(),
+    SequentialFilter((2, 4)),
+    SchmidtFilter(IteratedFilter(), ("m[1]",)),
+    MonteCarloFilter(),
+)
+
+
+def named(filter_) -> str:
+    return type(filter_).__name__
+
+
+@pytest.mark.parametrize("filter_", FILTERS, ids=named)
+def test_a_filter_takes_a_pair_as_it_takes_a_prediction(filter_) -> None:
+    pair = filter_(lambda m: (H @ m, H), PRIOR, Y, 0.1)
+    whole = filter_(lambda m: Prediction(H @ m, H), PRIOR, Y, 0.1)
+    np.testing.assert_array_equal(pair.mean, whole.mean)
+    np.testing.assert_array_equal(pair.covariance, whole.covariance)
+    assert pair.converged
+
+
+def run_filter(filter_):
+    return lambda model: filter_(model, PRIOR, Y, 0.1)
+
+
+class Frames:
+    def __init__(self, model) -> None:
+        self.model = model
+
+    def frame(self, k: int, m: np.ndarray):
+        return self.model(m)
+
+
+def run_profile(model):
+    return profile(model, Y, 0.1, np.ones(2), 0, np.array([-1.0, 1.0]))
+
+
+def run_expectation(model):
+    return foresee_model(
+        model, PRIOR, 0.1, parameters=("a", "b"), transform=Identity(), frames=("closed",)
+    )
+
+
+USES = {
+    **{named(f): run_filter(f) for f in FILTERS},
+    "drift": lambda model: DriftSmoother((3, 3), 0.01)(Frames(model), PRIOR, Y, 0.1),
+    "profile": run_profile,
+    "expectation": run_expectation,
+    "some parameters": lambda model: of_some(model, np.ones(2), np.array([0]))(np.ones(1)),
+    "some rows": lambda model: rows_of(model, np.ones(6, dtype=bool))(np.ones(2)),
+    "remembered": lambda model: Remembered(model)(np.ones(2)),
+    "as_prediction": lambda model: as_prediction(model(np.ones(2)), 2),
+}
+
+
+@pytest.mark.parametrize(
+    ("returned", "words"),
+    [
+        (None, "got None"),
+        (H, r"got an array of shape \(6, 2\)"),
+        ((Y, H, H), "got a tuple of 3"),
+        ((Y, None), "jacobian"),
+        ({"y": Y}, "got a value of type dict"),
+        ((Y, "slope"), r"got an array of shape \(6,\) and a value of type str"),
+        ((Y, H.T), r"shape \(n,\) and jacobian of shape \(n, p\); got \(6,\) and \(2, 6\)"),
+    ],
+)
+@pytest.mark.parametrize("use", USES)
+def test_another_return_is_one_line_that_says_what_is_expected(use: str, returned, words) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        USES[use](lambda m: returned)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("use", ["IteratedFilter", "profile", "expectation", "some parameters"])
+def test_derivatives_by_other_parameters_are_refused(use: str) -> None:
+    with pytest.raises(InputError, match=r"2 parameters.*shape \(6, 3\)"):
+        USES[use](lambda m: (Y, np.ones((6, 3))))
+    with pytest.raises(InputError, match=r"derivatives.*shape \(6, 0\)"):
+        USES[use](lambda m: Prediction.undifferentiated(Y))
+
+
+def test_a_model_cannot_write_on_what_it_is_given() -> None:
+    def writes(m: np.ndarray) -> Prediction:
+        m[:] = 0.0
+        return Prediction(H @ m, H)
+
+    m = np.ones(2)
+    predict(writes, m)
+    np.testing.assert_array_equal(m, 1.0)
+
+
+def test_tissue_that_cannot_be_is_a_failed_prediction() -> None:
+    def refuses(m: np.ndarray) -> Prediction:
+        raise MaterialError("E_f = -1 MPa, expected > 0")
+
+    assert predict(refuses, np.ones(2)).reason == "E_f = -1 MPa, expected > 0"
+
+
+@pytest.mark.parametrize("filter_", FILTERS, ids=named)
+def test_what_a_model_hands_on_arrives_with_the_estimate(filter_) -> None:
+    found = filter_(lambda m: Prediction(H @ m, H, aux=tuple(m)), PRIOR, Y, 0.1)
+    np.testing.assert_allclose(found.prediction.aux, found.mean, rtol=1e-12)
+
+
+def test_what_a_model_without_derivatives_hands_on_arrives_too() -> None:
+    model = lambda m: Prediction(H @ m, np.empty((6, 0)), aux=tuple(m))  # noqa: E731
+    found = UnscentedFilter()(model, PRIOR, Y, 0.1)
+    assert found.prediction.differentiated
+    np.testing.assert_allclose(found.prediction.aux, found.mean, rtol=1e-12)
+
+
+def test_wrappers_hand_on() -> None:
+    model = lambda m: Prediction(H @ m, H, reason="closed", aux="state")  # noqa: E731
+    rows = np.array([True, False, True, False, False, True])
+    for wrapped, m in (
+        (of_some(model, np.ones(2), np.array([1])), np.array([3.0])),
+        (rows_of(model, rows), np.array([1.0, 3.0])),
+    ):
+        prediction = wrapped(m)
+        assert (prediction.reason, prediction.aux) == ("closed", "state")
+    whole = H @ np.array([1.0, 3.0])
+    np.testing.assert_array_equal(of_some(model, np.ones(2), np.array([1]))(m[1:]).y, whole)
+    np.testing.assert_array_equal(rows_of(model, rows)(m).y, whole[rows])
+    np.testing.assert_array_equal(rows_of(model, rows)(m).jacobian, H[rows])
+    failed = lambda m: Prediction.failed("does not close")  # noqa: E731
+    assert of_some(failed, np.ones(2), np.array([1]))(m[1:]).reason == "does not close"
+    assert rows_of(failed, rows)(m).reason == "does not close"
+
+
+def test_a_known_value_is_met_to_the_last_bit() -> None:
+    seen = []
+
+    def model(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        seen.append(tuple(m))
+        return H @ m, H
+
+    some = of_some(model, np.array([0.1, 0.2]), np.array([1]), snap=1e-14)
+    some(np.array([0.2 * (1 + 3e-16)]))
+    some(np.array([0.2 * (1 + 1e-12)]))
+    assert seen == [(0.1, 0.2), (0.1, 0.2 * (1 + 1e-12))]
+
+
+def test_a_remembered_run_is_not_repeated() -> None:
+    calls = []
+
+    def model(m: np.ndarray) -> Prediction:
+        calls.append(m)
+        return Prediction.failed("open") if m[0] < 0 else Prediction(H @ m, H)
+
+    exact, near = Remembered(model), Remembered(model, rtol=1e-12)
+    for m in ([1.0, 2.0], [1.0, 2.0], [-1.0, 2.0], [-1.0, 2.0], [1.0 + 1e-14, 2.0]):
+        exact(np.array(m))
+        near(np.array(m))
+    assert len(exact.runs) == 3
+    assert len(near.runs) == 2
+    assert len(calls) == 5
+    branch = Remembered(model, near.runs)
+    branch(np.array([5.0, 5.0]))
+    assert len(near.runs) == 2
+
+
+def test_a_shared_start_takes_pairs() -> None:
+    class Model:
+        closed = None
+
+        def restart(self, closed) -> None:
+            pass
+
+        def __call__(self, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return H @ m, H
+
+    shared = SharedStart(Model(), np.ones(2))
+    for m in (np.ones(2), np.zeros(2)):
+        np.testing.assert_array_equal(shared(m).y, H @ m)
