@@ -11,13 +11,13 @@ import difflib
 import os
 import sys
 from itertools import takewhile
-from pathlib import Path
 
 import hydra
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments.common.places import CONF
 from experiments.runner.job import FailedRunError, run_job
 from experiments.runner.slurm import register_launcher
 from experiments.runner.sweep import StopApplication
@@ -27,9 +27,6 @@ __all__ = ["main"]
 
 PRIMARY = "In 'config': "
 """How Hydra begins messages about the primary configuration."""
-
-CONF = Path(__file__).resolve().parent.parent / "conf"
-"""The folder of the configuration."""
 
 REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
 """What a wrong request raises; anything else is a mistake of ours and keeps its trace."""

@@ -14,8 +14,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mvest.errors import InputError
 from mvest.files import write_atomically
 
@@ -82,10 +80,12 @@ def git_state(directory: Path) -> dict[str, Any]:
     dict
         ``sha`` (40 hexadecimal digits) and ``dirty`` (True if a tracked file outside
         ``results/`` was changed); both
-        None outside a checkout, before the first commit, or where git is not installed.
+        None outside a checkout, in a folder of which it tracks nothing, before the first commit,
+        or where git is not installed.
     """
     sha = _git(directory, "rev-parse", "--verify", "HEAD")
-    if sha is None:
+    # Packages that are installed within somebody's checkout are no part of it.
+    if sha is None or not _git(directory, "ls-files"):
         return {"sha": None, "dirty": None}
     # What runs write to results/ is no part of what they ran.
     places = (":(top)", ":(top,exclude)results")
@@ -171,6 +171,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def _plain(value: Any, where: str) -> Any:
+    # Not at the top: `experiments` caps the threads of numerical libraries before they are loaded.
+    import numpy as np
+
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if value is None or isinstance(value, bool | int | str):

@@ -74,6 +74,12 @@ def test_outside_a_checkout_there_is_no_commit(
     assert git_state(tmp_path / "absent") == {"sha": None, "dirty": None}
 
 
+def test_packages_installed_within_a_checkout_are_not_of_its_commit(checkout: Path) -> None:
+    (checkout / "env").mkdir()
+    (checkout / "env" / "module.py").write_text("")
+    assert git_state(checkout / "env") == {"sha": None, "dirty": None}
+
+
 def test_without_git_there_is_no_commit(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert git_state(checkout) == {"sha": None, "dirty": None}

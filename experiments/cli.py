@@ -1,0 +1,162 @@
+"""The console command ``mvest``: short words for what people do most.
+
+Every word is the one application (``experiments.run``), or a page of it, with the overrides that it
+takes. Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is wrong (one
+line says how); 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+import shutil
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from experiments.common.places import EXPERIMENTS
+from mvest import __version__
+
+__all__ = ["experiments_in", "main", "quoted"]
+
+COMMANDS = {
+    "list": "the experiments, one sentence each",
+    "run": "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
+    "own-valve": "moduli of a valve from a case folder",
+    "volume": "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
+    "tables": "every table and figure of results/ anew, from the records that are kept there",
+    "dashboard": "MLflow's pages, on the comparison of the last sweep",
+}
+
+CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
+OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says what is wrong in one line, as everything here does."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say it and leave with status 2."""
+        self.exit(2, f"error: {message}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command on its arguments, those of the command line by default; the exit status."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    command, rest = (given[0], given[1:]) if given else ("--help", [])
+    match command:
+        case "-h" | "--help":
+            print(_help())
+        case "--version":
+            print(f"mvest {__version__}")
+        case "list":
+            Parser("mvest list", description=COMMANDS[command]).parse_args(rest)
+            width = shutil.get_terminal_size().columns
+            print(listing(experiments_in(EXPERIMENTS), width))
+        case "run":
+            return _application(rest)
+        case "own-valve":
+            return _application(_one_file("own-valve", "FOLDER", "own_valve", "case", rest))
+        case "volume":
+            return _application(_one_file("volume", "FILE", "volume", "volume", rest))
+        case "tables":
+            from experiments.tables import main as tables
+
+            parser = Parser("mvest tables", description=COMMANDS[command])
+            parser.add_argument("folder", nargs="?", default="results", metavar="FOLDER")
+            return tables([parser.parse_args(rest).folder])
+        case "dashboard":
+            from experiments.dashboard import main as dashboard
+
+            return dashboard(rest)
+        case _:
+            close = difflib.get_close_matches(command, COMMANDS, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(COMMANDS)}"
+            print(f"error: {command}: no such command; {hint}", file=sys.stderr)
+            return 2
+    return 0
+
+
+def _help() -> str:
+    about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
+    lines = [f"  mvest {name:<10} {text}" for name, text in COMMANDS.items()]
+    return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
+
+
+def _application(overrides: list[str]) -> int:
+    """Hydra's application, which reads the command line itself."""
+    from experiments.run import main as application
+
+    before = sys.argv
+    sys.argv = ["mvest run", *overrides]
+    try:
+        return application()
+    finally:
+        sys.argv = before
+
+
+def _one_file(
+    command: str, metavar: str, experiment: str, setting: str, given: list[str]
+) -> list[str]:
+    """Overrides of a command that is about one file or folder."""
+    parser = Parser(f"mvest {command}", description=COMMANDS[command])
+    parser.add_argument("path", type=Path, metavar=metavar)
+    parser.add_argument("--check", action="store_true", help=CHECK)
+    parser.add_argument("overrides", nargs="*", metavar="NAME=VALUE", help=OVERRIDES)
+    parsed = parser.parse_intermixed_args(given)
+    for override in parsed.overrides:
+        if "=" not in override:
+            parser.error(f"{override}: expected NAME=VALUE; one {metavar} at a time")
+    check = ["check=true"] if parsed.check else []
+    return [
+        f"experiment={experiment}",
+        f"{setting}={quoted(str(parsed.path))}",
+        *check,
+        *parsed.overrides,
+    ]
+
+
+def quoted(text: str) -> str:
+    """Text as Hydra's grammar takes it literally, whatever characters it has."""
+    doubled = re.sub(r"(\\+)(?='|$)", r"\1\1", text)
+    return "'" + doubled.replace("'", r"\'").replace("${", r"\${") + "'"
+
+
+def experiments_in(folder: Path) -> dict[str, str]:
+    """Name and first sentence of every experiment: of its leading comment, or else its title."""
+    return {path.stem: _sentence(path) for path in sorted(folder.glob("*.yaml"))}
+
+
+def _sentence(path: Path) -> str:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comment = []
+    for line in lines:
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @package"):
+            comment.append(line.lstrip("# "))
+    if found := re.match(r".+?[.?!](?=\s|$)", " ".join(comment)):
+        return found[0]
+    title = next((line for line in lines if line.startswith("title:")), "")
+    return title.removeprefix("title:").strip().strip("'\"")
+
+
+def listing(sentences: dict[str, str], width: int) -> str:
+    """Experiments and their sentences in two columns, the second one folded to the width."""
+    first = max(map(len, sentences), default=0) + 2
+    return "\n".join(
+        textwrap.fill(
+            sentence,
+            max(width, first + 40),
+            initial_indent=name.ljust(first),
+            subsequent_indent=" " * first,
+        )
+        for name, sentence in sentences.items()
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

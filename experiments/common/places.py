@@ -1,0 +1,16 @@
+"""Where things lie, in a checkout and in an installation."""
+
+from pathlib import Path
+
+__all__ = ["CONF", "EXPERIMENTS"]
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+CONF = next(
+    (place for place in (_PACKAGE / "conf", _PACKAGE.parent / "conf") if place.is_dir()),
+    _PACKAGE / "conf",
+)
+"""Hydra's configuration: in the package as it is installed, beside it in a checkout."""
+
+EXPERIMENTS = CONF / "experiment"
+"""One YAML file an experiment."""

@@ -1,0 +1,211 @@
+"""The console command: what it says, what it hands on, and all of it from an installed wheel."""
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from experiments import cli
+from experiments.common.places import CONF
+from mvest.cases.writer import write_case
+from tests.made_up_closure import made_up_case
+from tests.places import ROOT
+
+
+@pytest.fixture
+def handed(monkeypatch):
+    """Overrides that the application would have been given."""
+    given = []
+    monkeypatch.setattr(cli, "_application", lambda overrides: given.append(overrides) or 0)
+    return given
+
+
+def test_every_experiment_is_listed_with_one_sentence(capsys):
+    assert cli.main(["list"]) == 0
+    said = capsys.readouterr().out
+    sentences = cli.experiments_in(CONF / "experiment")
+    assert len(sentences) >= 26
+    for name, sentence in sentences.items():
+        assert re.search(rf"^{name} ", said, re.MULTILINE)
+        assert sentence[-1] in ".?!" or f"title: {sentence}" in (
+            CONF / "experiment" / f"{name}.yaml"
+        ).read_text(encoding="utf-8")
+        assert 20 < len(sentence) < 200, name
+        assert len(re.findall(r"[.?!] [A-Z]", sentence)) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("# @package _global_\n# Is it\n# one? And more.\ntitle: T\n", "Is it one?"),
+        ("# From case.yaml to moduli.\ntitle: T\n", "From case.yaml to moduli."),
+        ("# @package _global_\nname: x\ntitle: 'A title'\n", "A title"),
+        ("# without an end\ntitle: T\n", "T"),
+    ],
+)
+def test_the_sentence_of_an_experiment(tmp_path, text, sentence):
+    (tmp_path / "x.yaml").write_text(text)
+    assert cli.experiments_in(tmp_path) == {"x": sentence}
+
+
+def test_the_list_is_folded_to_the_width():
+    lines = cli.listing({"a": "word " * 40, "longer": "One."}, 60).splitlines()
+    assert max(map(len, lines)) <= 60
+    assert lines[-1] == "longer  One."
+    assert all(line.startswith(" " * 8) for line in lines[1:-1])
+
+
+def test_what_is_about_one_path_is_handed_on(handed):
+    assert cli.main(["own-valve", "my case", "--check", "seed=2"]) == 0
+    assert cli.main(["volume", "v.nrrd", "imaged.pressure_mmHg=120", "figures=false"]) == 0
+    assert cli.main(["run", "-m", "experiment=table1", "seed=1,2"]) == 0
+    assert handed == [
+        ["experiment=own_valve", "case='my case'", "check=true", "seed=2"],
+        ["experiment=volume", "volume='v.nrrd'", "imaged.pressure_mmHg=120", "figures=false"],
+        ["-m", "experiment=table1", "seed=1,2"],
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["plain", "with space, comma=equal", "it's", r"a\b", r"a\'b", "end\\", "${seed}", "(x)"]
+)
+def test_a_path_is_taken_literally(text):
+    (override,) = OverridesParser.create().parse_overrides([f"case={cli.quoted(text)}"])
+    value = override.value()
+    assert value.replace(r"\${", "${") == text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lsit"], "lsit: no such command; did you mean list?"),
+        (["xyz"], "xyz: no such command; known: list, run"),
+        (["own-valve"], "required: FOLDER"),
+        (["own-valve", "a", "b"], "b: expected NAME=VALUE"),
+        (["volume", "a", "--chekc"], "unrecognized arguments: --chekc"),
+        (["list", "more"], "unrecognized arguments: more"),
+        (["tables", "a", "b"], "unrecognized arguments: b"),
+    ],
+)
+def test_a_wrong_request_is_one_line_and_status_2(arguments, message, capsys, handed):
+    try:
+        status = cli.main(arguments)
+    except SystemExit as left:
+        status = left.code
+    assert status == 2
+    assert handed == []
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+
+
+def test_help_names_every_command(capsys):
+    assert cli.main([]) == cli.main(["--help"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"mvest {name}" in said for name in cli.COMMANDS)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["own-valve", "--help"]])
+def test_words_alone_load_nothing(arguments, tmp_path):
+    code = (
+        "import sys\nfrom experiments.cli import main\n"
+        f"try: main({arguments})\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'hydra', 'yaml', 'mlflow'} & set(sys.modules)\nassert not heavy, heavy"
+    )
+    subprocess.run(
+        [sys.executable, "-c", code], check=True, cwd=tmp_path, env=here(), capture_output=True
+    )
+
+
+def here() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+# --- as a new user would ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The command of a wheel in an environment of its own, to be run in an empty folder.
+
+    What the wheel depends on is lent by the environment of the tests; this project itself is not:
+    the path that lends it leaves out the links of editable installations.
+    """
+    place = tmp_path_factory.mktemp("new_user")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(place)]
+    subprocess.run(build, check=True, cwd=ROOT, capture_output=True)
+    (wheel,) = place.glob("*.whl")
+    venv.create(place / "env", with_pip=False)
+    python = place / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    packages = sysconfig.get_path("purelib", vars={"base": str(place / "env")})
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--no-deps", str(wheel)]
+    subprocess.run(pip, check=True, capture_output=True)
+    lent = Path(packages) / "lent.pth"
+    lent.write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    folder = place / "empty"
+    folder.mkdir()
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [python.with_name("mvest"), *arguments],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=900,
+        )
+
+    return run, folder
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_lists_its_experiments(installed):
+    run, _ = installed
+    done = run("list")
+    assert done.returncode == 0, done.stderr
+    assert "table1" in done.stdout
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_runs_the_chain_and_says_that_no_commit_made_it(installed):
+    run, folder = installed
+    done = run("run", "experiment=debug")
+    assert done.returncode == 0, done.stderr
+    (record,) = folder.glob("outputs/debug/*/result.json")
+    assert re.search(r'"sha": null', record.read_text(encoding="utf-8"))
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_sweeps(installed):
+    run, folder = installed
+    done = run("run", "-m", "experiment=debug", "seed=2,3")
+    assert done.returncode == 0, done.stderr
+    assert len(list(folder.glob("outputs/debug/*/result.json"))) >= 2
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_checks_an_own_valve(installed):
+    run, folder = installed
+    write_case(folder / "my valve", made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    done = run("own-valve", "my valve", "--check", "personal.mesh.source=structured")
+    assert done.returncode == 0, done.stderr
+    assert list(folder.glob("outputs/own_valve/*/*.png"))
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_says_in_one_line_what_is_wrong(installed):
+    run, _ = installed
+    for arguments in (("run", "experiment=tabel1"), ("own-valve", "nowhere", "--check")):
+        done = run(*arguments)
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+        assert done.stderr.startswith("error: ")
