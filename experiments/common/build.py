@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 from experiments.common.mirror import build
 from experiments.common.truth import StoredModel, truth_key
 from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import REFERENCE, GateCase
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
 from mvest.estimation.filters.ensemble import EnsembleFilter
@@ -45,10 +46,17 @@ from mvest.valve.mesh.structured import structured_mesh
 from mvest.valve.mesh.tetrahedral_leaflets import tetrahedral_leaflets
 from mvest.valve.mesh.tetrahedralize import TetwildSettings
 
-__all__ = ["Twin", "build_mesh", "build_twin", "filter_of", "mechanics_of", "template_of"]
+__all__ = [
+    "Twin",
+    "build_mesh",
+    "build_twin",
+    "closure_model",
+    "filter_of",
+    "mechanics_of",
+    "template_of",
+]
 
 Values = Mapping[str, Any]
-OnStep = Callable[[float, int], None]
 
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""
@@ -61,6 +69,50 @@ MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo"
 
 UNSTRUCTURED_SURFACE = (112, 29)
 """Vertices of the surface that an unstructured mesh fills, whatever is observed."""
+
+
+def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureModel:
+    """The configured model of the closure, with one variation.
+
+    It closes the open valve each time; whoever continues from closed states says so.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible; the message names it.
+    """
+    template = template_of(config)
+    settings = mechanics_of(config)
+    protocol = replace(settings.protocol, dt=settings.protocol.dt * variation.dt)
+    distance = settings.contact.activation_distance * variation.activation
+    settings = replace(
+        settings,
+        protocol=protocol,
+        contact=replace(settings.contact, activation_distance=distance),
+    )
+    observed, points = config["observation"], config["mechanics"]["contact_points"]
+    mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh)
+    return ClosureModel(
+        template.valve(observed["columns"], observed["rows"]),
+        template.valve(**_varied(points, variation.sampling)),
+        build_mesh(template, mesh, config["mechanics"]["element"], _meshes(config)),
+        settings,
+        tuple(config["parameters"]),
+        dict(config["fixed"]),
+    )
+
+
+def _varied(grid: Values, factor: float) -> dict[str, int]:
+    """Columns, an even number, and rows multiplied by a factor."""
+    columns, rows = grid["columns"], grid["rows"]
+    if factor == 1.0:
+        return {"columns": columns, "rows": rows}
+    return {"columns": 2 * round(0.5 * columns * factor), "rows": round(rows * factor)}
+
+
+def _meshes(config: Values) -> Path:
+    """Where unstructured meshes are kept."""
+    return Path(config["paths"]["outputs"]) / "meshes"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,38 +189,28 @@ def build_twin(config: Values) -> Twin:
     observation = config["observation"]
     valve = template.valve(observation["columns"], observation["rows"])
     check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
-    points = config["mechanics"]["contact_points"]
-    contact_valve = template.valve(points["columns"], points["rows"])
     correlations = Correlations(valve.surface)
     errors = observation_errors(observation, correlations)
     told_length = config["filter"]["R_correlation_mm"]
     correlation = correlations(told_length) if told_length else None
-    element = config["mechanics"]["element"]
-    store = Path(config["paths"]["outputs"]) / "meshes"
-    mesh = build_mesh(template, config["mesh"], element, store)
-    model = ClosureModel(
-        valve,
-        contact_valve,
-        mesh,
-        settings,
-        parameters,
-        dict(config["fixed"]),
+    plain = closure_model(config)
+    model = replace(
+        plain,
         continuation=config["continuation"],
         reach=np.inf if config["continuation_reach"] is None else config["continuation_reach"],
     )
     if config["guided"]:
         model.guide = guide_of(model, template, config["mesh"])
 
+    element = config["mechanics"]["element"]
     changed = truth_mesh(config["mesh"], truth)
     other = truth["element"] or element
     same = changed == dict(config["mesh"]) and other == element
-    truth_model = ClosureModel(
-        valve,
-        contact_valve,
-        mesh if same else build_mesh(template, changed, other, store),
-        true_settings,
-        parameters,
-        {**config["fixed"], **truth["fixed"]},
+    truth_model = replace(
+        plain,
+        mesh=plain.mesh if same else build_mesh(template, changed, other, _meshes(config)),
+        settings=true_settings,
+        fixed={**config["fixed"], **truth["fixed"]},
     )
     described = {
         "valve": config["valve"],

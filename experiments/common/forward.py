@@ -1,56 +1,20 @@
-"""What the studies of the forward model share: the configured model, and what its record says."""
+"""What the studies of the forward model share: what its record says."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.build import build_mesh, mechanics_of, template_of
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GateCase
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
-__all__ = ["forward_record", "model_of", "without_nan"]
+__all__ = ["forward_record", "without_nan"]
 
 Values = Mapping[str, Any]
-
-
-def model_of(config: Values, case: GateCase) -> ClosureModel:
-    """The configured model with one variation."""
-    template = template_of(config)
-    settings = mechanics_of(config)
-    protocol = replace(settings.protocol, dt=settings.protocol.dt * case.dt)
-    distance = settings.contact.activation_distance * case.activation
-    settings = replace(
-        settings,
-        protocol=protocol,
-        contact=replace(settings.contact, activation_distance=distance),
-    )
-    mesh = dict(config["mesh"])
-    mesh["columns"] = 2 * round(0.5 * mesh["columns"] * case.mesh)
-    mesh["rows"] = round(mesh["rows"] * case.mesh)
-    points = config["mechanics"]["contact_points"]
-    columns = 2 * round(0.5 * points["columns"] * case.sampling)
-    observed = config["observation"]
-    return ClosureModel(
-        template.valve(observed["columns"], observed["rows"]),
-        template.valve(columns, round(points["rows"] * case.sampling)),
-        build_mesh(
-            template,
-            mesh,
-            config["mechanics"]["element"],
-            Path(config["paths"]["outputs"]) / "meshes",
-        ),
-        settings,
-        tuple(config["parameters"]),
-        dict(config["fixed"]),
-    )
 
 
 def forward_record(

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.forward import model_of
+from experiments.common.build import closure_model
 from experiments.common.mirror import build
 from experiments.common.truth import StoredModel, truth_key
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.closure.cycle.protocol import CycleProtocol
-from mvest.closure.robustness import GateCase
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
@@ -42,7 +41,7 @@ Values = Mapping[str, Any]
 def cycle_model(config: Values, **changes: Any) -> CycleModel:
     """The configured model of a cycle, its protocol with ``changes``."""
     protocol = build(CycleProtocol, {**config["cycle"]["protocol"], **changes})
-    return CycleModel(model_of(config, GateCase("reference")), protocol)
+    return CycleModel(closure_model(config), protocol)
 
 
 def closed_frame(protocol: CycleProtocol) -> int:

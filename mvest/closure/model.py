@@ -112,6 +112,8 @@ class ClosureModel:
         Progress: called with (time, Newton iterations).
     ties : TiedPoints, optional
         Pairs of points that are held together while the valve closes, as by a clip.
+    closures : int
+        How many closed states have been looked for, those between others included.
     """
 
     valve: Valve
@@ -128,6 +130,7 @@ class ClosureModel:
     on_step: Callable[[float, int], None] | None = None
     ties: TiedPoints | None = None
 
+    closures: int = field(default=0, init=False)
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
     _in_guide: Embedding | None = field(default=None, init=False, repr=False)
     _system: System | None = field(default=None, init=False, repr=False)
@@ -236,6 +239,7 @@ class ClosureModel:
                 result = self.close(between, sensitivities=False)
                 if not result.simulation.converged:
                     return result
+        self.closures += 1
         system, parameters = self.tuned(m)
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)

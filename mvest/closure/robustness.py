@@ -18,7 +18,7 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.typing import FloatArray
 
-__all__ = ["GATE_CASES", "GateCase", "GateReport", "GateRow", "run_gate"]
+__all__ = ["GATE_CASES", "REFERENCE", "GateCase", "GateReport", "GateRow", "run_gate"]
 
 MEAN_LIMIT = 0.1
 MAX_LIMIT = 0.5

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import template_of
-from experiments.common.forward import forward_record, model_of, without_nan
+from experiments.common.build import closure_model, template_of
+from experiments.common.forward import forward_record, without_nan
 from mvest.closure.measures import measure_steps
-from mvest.closure.robustness import GateCase
 from mvest.typing import FloatArray
 from mvest.valve.geometry.surfaces import thicken
 from mvest.valve.mesh.embedding import embed
@@ -29,7 +28,7 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
     from mvest.reporting.figures import save_figure
 
     values = np.array(config["truth"]["values"], dtype=float)
-    model = model_of(config, GateCase("reference"))
+    model = closure_model(config)
     result = model.close(values, sensitivities=False, every_frame=True)
     thickness = float(model.valve.surface.thickness.mean())
     distance = (

@@ -28,6 +28,7 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform
+from mvest.estimation.wrappers import Remembered
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.problem.study import Case, Observation, StudyResult, estimate
@@ -79,7 +80,7 @@ class DonorStudy:
     continuation : bool
         Whether closures after the first start from the last closed state.
     largest_change : float
-        See :class:`Walk`.
+        See :class:`mvest.closure.model.ClosureModel`.
     """
 
     recording: DonorRecording
@@ -106,71 +107,8 @@ class DonorStudy:
             self.parameters,
             continuation=self.continuation,
             repeat=False,
+            largest_change=self.largest_change,
         )
-
-
-class Walk:
-    """A model that goes from one closed valve to the next in small changes of the moduli.
-
-    Soft leaflets are drawn far into the valve, and Newton's method does not find an equilibrium
-    that lies millimetres away. Predictions are kept, so that none is computed twice.
-
-    Parameters
-    ----------
-    model : ClosureModel
-        With ``continuation``, or every step closes the open valve.
-    largest_change : float
-        Of the logarithm of any modulus between two equilibria.
-    """
-
-    def __init__(self, model: ClosureModel, largest_change: float) -> None:
-        self.model = model
-        self.largest_change = largest_change
-        self.known: list[tuple[FloatArray, Prediction]] = []
-        self.last: FloatArray | None = None
-        self.equilibria = 0
-
-    def branch(self) -> Walk:
-        """A walk of its own from where this one stands."""
-        other = Walk(copy(self.model), self.largest_change)
-        other.known, other.last = list(self.known), self.last
-        return other
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        """Prediction at ``m (p,)``."""
-        known = self.at(m)
-        if known is None:
-            known = self._predict(np.array(m, dtype=np.float64))
-            self.known.append((np.array(m), known))
-        return known
-
-    def at(self, m: FloatArray) -> Prediction | None:
-        """What is known at ``m (p,)``, up to the rounding of a logarithm and its inverse."""
-        found = (
-            prediction for at, prediction in self.known if np.allclose(at, m, rtol=1e-12, atol=0.0)
-        )
-        return next(found, None)
-
-    def _predict(self, m: FloatArray) -> Prediction:
-        for between in self._way_to(m):
-            self.equilibria += 1
-            closure = self.model.close(between, sensitivities=False).simulation
-            if not closure.converged:
-                return Prediction.failed(f"{closure.reason.value} (on the way, at {between})")
-            self.last = between
-        self.equilibria += 1
-        prediction = self.model(m)
-        if prediction.converged:
-            self.last = m
-        return prediction
-
-    def _way_to(self, m: FloatArray) -> list[FloatArray]:
-        """Moduli between the last closed valve and ``m``."""
-        if self.last is None or not self.model.continuation:
-            return []
-        change = np.log(m / self.last)
-        n = int(np.ceil(np.abs(change).max() / self.largest_change))
-        return [self.last * np.exp(change * k / n) for k in range(1, n)]
 
 
 def build_donor(config: Values) -> DonorStudy:
@@ -313,26 +251,30 @@ class Fits:
 def _fit(study: DonorStudy) -> Fits:
     """Close the open valve with the generic moduli, and fit it from there from every start."""
     steps = len(study.settings.protocol.steps())
-    results, walks = [], []
+    results, models = [], []
     with SolveBar("donor", steps, TYPICAL_SOLVES * len(study.starts)) as bar:
         started = time.perf_counter()
-        first = Walk(study.model(), study.largest_change)
-        first.model.on_step = bar.step
-        generic = first(study.prior.mean)
+        first = study.model()
+        first.on_step = bar.step
+        # A start is met again by rounding of its logarithm.
+        known = Remembered(first, rtol=1e-12)
+        generic = known(study.prior.mean)
         seconds = time.perf_counter() - started
         for start in study.starts:
-            walk = first.branch()
-            walks.append(walk)
+            # Each goes on from the generic closed valve.
+            model = copy(first)
+            model.closures = 0
+            models.append(model)
             case = Case(
                 study.parameters,
-                walk,
+                Remembered(model, known.runs, known.rtol),
                 study.prior,
                 replace(study.filter, start=tuple(map(float, start))),
                 study.transform,
                 study.settings.tissue,
             )
             results.append(estimate(case, study.observation))
-    return Fits(generic, seconds, tuple(results), tuple(walk.equilibria for walk in walks))
+    return Fits(generic, seconds, tuple(results), tuple(model.closures for model in models))
 
 
 def _closed(prediction: Prediction) -> FloatArray:

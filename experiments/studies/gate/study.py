@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.forward import forward_record, model_of, without_nan
-from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateCase, GateRow, run_gate
+from experiments.common.build import closure_model
+from experiments.common.forward import forward_record, without_nan
+from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateRow, run_gate
 
 __all__ = ["run_gate_study"]
 
@@ -31,8 +32,8 @@ def run_gate_study(config: Values, config_hash: str, folder: Path, started: floa
         )
 
     values = np.array(config["truth"]["values"], dtype=float)
-    reference = model_of(config, GateCase("reference"))
-    report = run_gate(lambda case: model_of(config, case), values, on_case=tell)
+    reference = closure_model(config)
+    report = run_gate(lambda case: closure_model(config, case), values, on_case=tell)
     rows = [without_nan(asdict(row)) for row in report.rows]
     record = forward_record(config, config_hash, reference, values, started, len(rows))
     record |= {

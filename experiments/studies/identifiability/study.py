@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.forward import forward_record, model_of
+from experiments.common.build import closure_model
+from experiments.common.forward import forward_record
 from experiments.studies.identifiability.figures import write_identifiability_figures
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GateCase
 from mvest.errors import ConfigurationError
 from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.profile import Profile, profile
@@ -92,7 +92,7 @@ def run_identifiability(
 
 
 def _closure(config: Values, names: tuple[str, ...], pressure: float) -> ClosureModel:
-    model = model_of(config, GateCase("design"))
+    model = closure_model(config)
     protocol = replace(model.settings.protocol, pressure_mmHg=pressure)
     return replace(
         model,

@@ -67,7 +67,7 @@ def settings(*overrides: str) -> dict:
 
 def reader_tests() -> ModuleType:
     """The tests of the reader, which make up a recording."""
-    path = ROOT / "tests" / "valve" / "test_donor.py"
+    path = ROOT / "tests" / "valve" / "io" / "test_donor.py"
     spec = importlib.util.spec_from_file_location("tests_valve_donor", path)
     assert spec is not None
     assert spec.loader is not None

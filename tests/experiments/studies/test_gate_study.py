@@ -9,11 +9,11 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from experiments.common.build import closure_model
 from experiments.common.config import register
-from experiments.common.forward import model_of
 from experiments.run import main
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import GATE_CASES, GateCase
+from mvest.closure.robustness import GATE_CASES
 from mvest.estimation import Prediction
 from tests.places import CONF
 
@@ -62,7 +62,7 @@ def composed(*overrides: str) -> dict:
 
 def test_each_case_changes_its_own_setting_only():
     config = composed("experiment=gate", "mesh.columns=12", "mesh.rows=2")
-    base = model_of(config, GateCase("reference"))
+    base = closure_model(config)
 
     def described(model: ClosureModel) -> dict:
         settings = model.settings
@@ -76,10 +76,10 @@ def test_each_case_changes_its_own_setting_only():
         }
 
     reference = described(base)
-    changed = {
-        case.name: {k for k, v in described(model_of(config, case)).items() if v != reference[k]}
-        for case in GATE_CASES
-    }
+    changed = {}
+    for case in GATE_CASES:
+        varied = described(closure_model(config, case))
+        changed[case.name] = {k for k, v in varied.items() if v != reference[k]}
     assert list(changed.values())[:6] == [
         {"dt"},
         {"dt"},
@@ -89,9 +89,9 @@ def test_each_case_changes_its_own_setting_only():
         {"mesh"},
     ]
     assert set(map(frozenset, list(changed.values())[6:])) == {frozenset()}
-    finer = model_of(config, GATE_CASES[5]).mesh
+    finer = closure_model(config, GATE_CASES[5]).mesh
     assert len(finer.elements) == 18 * 3
-    assert model_of(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
+    assert closure_model(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
         0.5 * reference["dt"]
     )
 
