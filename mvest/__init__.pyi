@@ -16,8 +16,8 @@ from .estimation.filters.unscented import UnscentedFilter as UnscentedFilter
 from .estimation.gaussian import Gaussian as Gaussian
 from .estimation.information.identifiability import identifiability as identifiability
 from .estimation.prediction import Prediction as Prediction
-from .imaging.detection.model import default_model as default_model
 from .imaging.detection.tracking import detect_valve as detect_valve
+from .imaging.detection.trained_model import default_model as default_model
 from .imaging.reading.reader import read_volume as read_volume
 from .imaging.volume import Modality as Modality
 from .mechanics.body import simulate_body as simulate_body

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.valve.anatomy.template import Template
 

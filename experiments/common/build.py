@@ -43,8 +43,8 @@ from mvest.valve.anatomy.template import Template, TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral_leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedralize import TetwildSettings
+from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
+from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
 __all__ = [
     "Twin",

@@ -20,8 +20,8 @@ from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import MonteCarloFilter
 from mvest.estimation.filters.sampler import SamplerSettings
-from mvest.imaging.detection.model import MODEL_FILE
 from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.detection.trained_model import MODEL_FILE
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.personalise.settings import CaseMesh, PaperSettings

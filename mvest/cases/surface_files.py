@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from mvest.cases.schema import LARGEST_NUMBER
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.io.surface_files import SurfaceFile, read_surface
+from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
 
 __all__ = ["MERGE_TOLERANCE", "RegionSurface", "read_regions"]
 

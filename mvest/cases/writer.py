@@ -16,7 +16,7 @@ from mvest.cases.schema import VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.valve.io.surface_files import write_surface
+from mvest.valve.io.leaflet_surfaces import write_surface
 
 __all__ = ["write_case"]
 

@@ -6,7 +6,7 @@ from typing import Final
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
 __all__ = ["LANDMARKS", "landmark_vertices", "landmarks"]
@@ -60,7 +60,7 @@ def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
     if not 0 <= frame < len(sequence.times):
         raise InputError(f"landmarks: frame {frame}, expected 0 to {len(sequence.times) - 1}")
     vertices = sequence.vertices[frame]
-    found = {name: vertices[v].copy() for name, v in landmark_vertices(sequence.layout).items()}
+    positions = {name: vertices[v].copy() for name, v in landmark_vertices(sequence.layout).items()}
     for name, tip in zip(_TIPS, sequence.tips[frame], strict=True):
-        found[name] = tip.copy()
-    return found
+        positions[name] = tip.copy()
+    return positions

@@ -17,7 +17,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.reading.stated import fault
-from mvest.imaging.writing.files import checked_path
+from mvest.imaging.writing.slicer import checked_path
 from mvest.typing import FloatArray
 
 __all__ = ["PointList", "read_markups", "write_markups"]
@@ -28,7 +28,7 @@ SCHEMA = (
 )
 KINDS = ("Fiducial", "Curve", "ClosedCurve")
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
-LARGEST_BYTES = 2**24
+MAX_BYTES = 2**24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,8 +136,8 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
     source = Path(path)
     if not source.is_file():
         raise InputError(f"{source}: no such file")
-    if source.stat().st_size > LARGEST_BYTES:
-        raise fault(source, "size", f"{source.stat().st_size} bytes", f"at most {LARGEST_BYTES}")
+    if source.stat().st_size > MAX_BYTES:
+        raise fault(source, "size", f"{source.stat().st_size} bytes", f"at most {MAX_BYTES}")
     try:
         content = json.loads(source.read_bytes())
     except (ValueError, RecursionError) as error:

@@ -58,8 +58,8 @@ class MovingValve:
             ("chord_s", (c,)),
             ("chord_tip", (c,)),
         ):
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise InputError(f"moving valve {self.name}, {name}: shape {found}, not {shape}")
+            given = np.shape(getattr(self, name))
+            if given != shape:
+                raise InputError(f"moving valve {self.name}, {name}: shape {given}, not {shape}")
         if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
             raise InputError(f"moving valve {self.name}: times {self.times} s do not increase")

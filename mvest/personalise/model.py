@@ -15,8 +15,8 @@ from mvest.valve.anatomy.band import Band
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral_leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedralize import TetwildSettings
+from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
+from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
 __all__ = ["build_coarse", "build_model"]
 

@@ -7,7 +7,7 @@ import yaml
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.valve.anatomy.template import Template
-from mvest.valve.io.surface_files import write_surface
+from mvest.valve.io.leaflet_surfaces import write_surface
 
 TIPS = [[16.0, -0.24, -25.0], [-16.0, -0.24, -25.0]]
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection.frame import standard_frame
-from mvest.imaging.detection.model import STAGES, Accuracy, DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.shape_model import fit_shape_model
+from mvest.imaging.detection.trained_model import STAGES, DetectionAccuracy, DetectionModel
 from mvest.imaging.learning.boosting import BoostSettings
 from mvest.imaging.learning.training import (
     SampleCounts,
@@ -43,7 +43,7 @@ def settings():
     return TrainingSettings(
         modes=14,
         samples=SampleCounts(*(24 for _ in fields(SampleCounts))),
-        boosting=BoostSettings(trees=3, leaves=4, least=3, share_features=0.2),
+        boosting=BoostSettings(trees=3, leaves=4, min_leaf_samples=3, share_features=0.2),
         many_trees=4,
         volumes=2,
     )
@@ -56,7 +56,7 @@ def trained(shape, seen_valve, settings):
     boosters = {name: train_stage(name, *found[name], settings, 5) for name in STAGES}
     n = shape.layout.size
     rng = np.random.default_rng(1)
-    accuracy = Accuracy(
+    accuracy = DetectionAccuracy(
         rng.uniform(0.5, 2, n), 6.5, rng.standard_normal((3, 2, n, 3)),
         rng.standard_normal((3, 2, 2, 3)),
     )  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 from mvest.errors import InputError
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices, landmarks
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 
 
 def coordinates(layout: ValveLayout, frames: int = 2) -> ValveSequence:

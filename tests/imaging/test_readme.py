@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 
 from experiments.common.config import ImagedConfig, ImagingConfig
-from mvest.imaging.detection.model import STAGES
+from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from tests.places import ROOT

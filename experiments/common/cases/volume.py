@@ -24,17 +24,17 @@ from mvest.cases.pressure_curve import PressureCurve
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.imaging.detection.model import (
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.trained_model import (
     MODEL_FILE,
     DetectionModel,
     default_model,
     load_model,
 )
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.markups import read_markups
 from mvest.imaging.reading.reader import read_volume
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.figures import measures_figure
@@ -136,7 +136,7 @@ def find_valve(config: Values) -> FoundValve:
             f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
             f"{', '.join(model.shape.layout.region_names)}"
         )
-    tracking = TrackingSettings(least_confidence=told["valve_confidence"])
+    tracking = TrackingSettings(min_confidence=told["valve_confidence"])
     with PartBar("valve in the frames", len(volume.times), "frame") as bar:
         valve = detect_valve(
             volume,
@@ -319,7 +319,7 @@ def _frames(
     rows: list[Row],
 ) -> CaseFrames:
     pressure, closed, count = told["pressure_mmHg"], told["closed_frame"], len(valve.times)
-    least = told["least_confidence"]
+    least = told["min_confidence"]
     if curve is not None:
         if closed is None:
             sure = [row for row in rows if (row["confidence"] or 0.0) >= least]
@@ -334,7 +334,7 @@ def _frames(
         open_=told["open_frame"],
         closed=closed,
         held_out=held,
-        least_confidence=least,
+        min_confidence=least,
     )
 
 

@@ -34,8 +34,8 @@ from mvest.observation.surfaces import mean_surface_distance
 from mvest.problem.study import Case, Observation, StudyResult, estimate
 from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
-from mvest.valve.io.donor import DonorRecording, read_donor
-from mvest.valve.io.donor_file import CITATION, donor_file
+from mvest.valve.io.donor.arrays import CITATION, donor_file
+from mvest.valve.io.donor.recording import DonorRecording, read_donor
 from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh

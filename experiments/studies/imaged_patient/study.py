@@ -21,11 +21,11 @@ from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, GeometryError, InputError, cannot_write
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.simulator.spread import draw_acquisition
-from mvest.imaging.writing.sequence import write_sequence_nrrd
+from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.writing.slicer import write_sequence_nrrd
 from mvest.provenance import write_json
 from mvest.simulation.motion.closing import MotionSettings
 from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient

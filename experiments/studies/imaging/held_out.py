@@ -48,13 +48,13 @@ class HeldOut:
     volumes: dict[int, list[dict[str, Any]]]
     sequences: dict[str, list[tuple[dict[str, Any], dict[str, FloatArray]]]]
 
-    def found(self, kind: str, least_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
+    def found(self, kind: str, min_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
         """Only volumes over time of a kind whose valve is believed in, and is not a wrong one.
 
         Parameters
         ----------
         kind : str
-        least_confidence : float
+        min_confidence : float
             Of the best frame.
         wrong_mm : float
             Mean distance of points over all frames from which on it is a wrong one.
@@ -62,7 +62,7 @@ class HeldOut:
         kept = [
             (row, arrays)
             for row, arrays in self.sequences[kind]
-            if max(frame["confidence"] for frame in row["frames"]) >= least_confidence
+            if max(frame["confidence"] for frame in row["frames"]) >= min_confidence
             and np.mean([frame["points"] for frame in row["frames"]]) < wrong_mm
         ]
         return HeldOut(self.volumes, {kind: kept})
@@ -81,7 +81,7 @@ def hold_out(
     """Simulate all held-out volumes and search them; what was done before is read."""
     imaging = config["imaging"]
     # The verdict changes nothing of what is found.
-    settings = replace(build(TrackingSettings, imaging["detection"]), least_confidence=0.0)
+    settings = replace(build(TrackingSettings, imaging["detection"]), min_confidence=0.0)
     held_out = imaging["held_out"]
     counts = dict(zip(VOLUMES, (held_out["volumes"], held_out["shifted"]), strict=True))
     counts |= dict.fromkeys(WITHOUT_VALVE, held_out["without_valve"])

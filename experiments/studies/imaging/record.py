@@ -13,7 +13,7 @@ import numpy as np
 from experiments.studies.imaging.held_out import HeldOut
 from experiments.studies.imaging.store import ImagingStore, Spent
 from experiments.studies.imaging.trials import SEQUENCES, VOLUMES, WITHOUT_VALVE
-from mvest.imaging.detection.model import Accuracy
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.learning.accuracy import Correlogram, share_within
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
@@ -43,7 +43,7 @@ def imaging_record(
     config_hash: str,
     store: ImagingStore,
     held_out: HeldOut | None,
-    accuracy: tuple[Accuracy, Correlogram] | None,
+    accuracy: tuple[DetectionAccuracy, Correlogram] | None,
     started: float,
 ) -> dict[str, Any]:
     """Everything of a finished study in plain values, with the keys that every record has."""
@@ -102,10 +102,10 @@ def _tested(
     config: Values,
     store: ImagingStore,
     held_out: HeldOut,
-    accuracy: Accuracy,
+    accuracy: DetectionAccuracy,
     correlogram: Correlogram,
 ) -> dict[str, Any]:
-    least = float(config["imaging"]["detection"]["least_confidence"])
+    least = float(config["imaging"]["detection"]["min_confidence"])
     wrong = float(config["imaging"]["held_out"]["wrong_mm"])
     own = held_out.volumes[store.training.volumes]
     sequences = {kind: [row for row, _ in held_out.sequences[kind]] for kind in SEQUENCES}
@@ -138,9 +138,9 @@ def _tested(
     }
 
 
-def table_row(row: Row, least_confidence: float) -> dict[str, Any]:
+def table_row(row: Row, min_confidence: float) -> dict[str, Any]:
     """What a table of volumes needs of one; little where the valve is not believed in."""
-    found = row["confidence"] >= least_confidence
+    found = row["confidence"] >= min_confidence
     errors = row["errors"]
     return {
         "setting": row["kind"],
@@ -289,7 +289,7 @@ def _sequence_row(row: Row, least: float, wrong: float) -> dict[str, Any]:
 
 
 def _coverage(
-    held_out: HeldOut, kind: str, setting: str, accuracy: Accuracy
+    held_out: HeldOut, kind: str, setting: str, accuracy: DetectionAccuracy
 ) -> list[dict[str, Any]]:
     """How many coordinates lie within 1.96 of the standard deviations told, wrong ones and all."""
     if not held_out.sequences[kind]:

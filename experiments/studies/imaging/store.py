@@ -29,8 +29,8 @@ from experiments.common.truth import truth_key
 from experiments.studies.imaging.parallel import in_processes
 from mvest.errors import cannot_write
 from mvest.files import write_atomically
-from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
+from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.learning.training import (
     Draft,
@@ -68,7 +68,7 @@ NOT_SAMPLED_BY = (
     "detection/detect.py",
     "learning/evaluation.py",
     "detection/fit.py",
-    "detection/model.py",
+    "detection/trained_model.py",
     "detection/tracking.py",
 )
 """What of mvest.imaging has no part in a detector's training."""

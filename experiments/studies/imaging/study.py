@@ -19,15 +19,15 @@ from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.tables import imaging_table, imaging_words
 from mvest.errors import ConfigurationError, InputError, cannot_write
 from mvest.files import write_atomically
-from mvest.imaging.detection.model import (
+from mvest.imaging.detection.shape_start import MODES
+from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.detection.trained_model import (
     MODEL_FILE,
-    Accuracy,
+    DetectionAccuracy,
     DetectionModel,
     load_model,
     save_model,
 )
-from mvest.imaging.detection.shape_start import MODES
-from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import Correlogram, measure_accuracy
@@ -64,7 +64,7 @@ def run_imaging(
 
     model = train(store.training.volumes)
     held_out: HeldOut | None = None
-    accuracy: tuple[Accuracy, Correlogram] | None = None
+    accuracy: tuple[DetectionAccuracy, Correlogram] | None = None
     if imaging["evaluate"]:
         apart = [store.population(which).valves for which in POPULATIONS[1:]]
         require_apart(valves, *apart)
@@ -87,14 +87,14 @@ def run_imaging(
 
 def _calibrated(
     config: Values, held_out: HeldOut
-) -> tuple[tuple[Accuracy, Correlogram], list[str]]:
+) -> tuple[tuple[DetectionAccuracy, Correlogram], list[str]]:
     """Errors in the volumes in which the valve was found, and the names of these valves.
 
     Where it was not, or where something else was taken for it, no standard deviation tells how far.
     """
     kind = "calibration"
     least, wrong = (
-        config["imaging"]["detection"]["least_confidence"],
+        config["imaging"]["detection"]["min_confidence"],
         config["imaging"]["held_out"]["wrong_mm"],
     )
     found = held_out.found(kind, least, wrong)

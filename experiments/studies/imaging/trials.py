@@ -16,18 +16,18 @@ from mvest.cases.from_images.measures import OPEN_SHARE
 from mvest.errors import GeometryError
 from mvest.imaging.detection.detect import find_frame
 from mvest.imaging.detection.frame import standard_frame
-from mvest.imaging.detection.model import DetectionModel, load_model
 from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.trained_model import DetectionModel, load_model
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.evaluation import frame_errors, surface_distances
 from mvest.imaging.learning.training import Setting, render_frame
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.simulator.spread import draw_acquisition
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane, measure_annulus
@@ -191,7 +191,7 @@ def try_sequence(
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
     began = time.process_time()
-    found = detect_valve(volume, model, replace(settings, least_confidence=0.0))
+    found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
     cpu_s = time.process_time() - began
     frames = []
     for k in range(len(true.times)):

@@ -20,7 +20,7 @@ from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 

@@ -9,7 +9,7 @@ import numpy as np
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.errors import InputError
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
 __all__ = ["samples_in_world", "valve_axes", "without_mean_error"]

@@ -12,11 +12,11 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.landmarks import landmarks
 from mvest.imaging.markups import PointList, write_markups
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.segmentation import write_segmentation
+from mvest.imaging.writing.slicer import write_segmentation
 from mvest.imaging.writing.voxels import voxelise_leaflets
-from mvest.valve.io.surface_files import region_arrays, write_surface
+from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface
 
 __all__ = ["write_for_slicer", "write_landmarks", "write_surfaces"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from mvest.cases.checks import CLOSING_PRESSURE
 from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.errors import InputError
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 
 __all__ = ["CaseFrames", "choose_frames"]
 
@@ -62,7 +62,7 @@ def choose_frames(
     open_: int | None = None,
     closed: int | None = None,
     held_out: Mapping[int, float] | None = None,
-    least_confidence: float = 0.6,
+    min_confidence: float = 0.6,
 ) -> CaseFrames:
     """Choose the frames that were not told.
 
@@ -80,7 +80,7 @@ def choose_frames(
         Where they are told.
     held_out : mapping, optional
         Frame -> pressure, mmHg.
-    least_confidence : float
+    min_confidence : float
         Of a frame that is chosen.
 
     Raises
@@ -95,10 +95,10 @@ def choose_frames(
     sure = [
         row
         for row in rows
-        if sequence.frame_confidence[int(row["frame"] or 0)] >= least_confidence
+        if sequence.frame_confidence[int(row["frame"] or 0)] >= min_confidence
         and row["orifice_mm2"] is not None
     ]
-    told = f"among {len(sure)} of {count} frames with a confidence of {least_confidence:g} or more"
+    told = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
     derived = []
     if closed is None:
         closed = closed_frame([row for row in sure if int(row["frame"] or 0) not in held])

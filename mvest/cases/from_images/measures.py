@@ -14,7 +14,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names
 

@@ -11,7 +11,7 @@ from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_shapes
 from mvest.typing import FloatArray, IntArray
 
@@ -31,7 +31,7 @@ REACH = (3, 2)
 """Columns and rows about a vertex among which its nearest true counterpart is looked for."""
 
 
-def _pattern() -> Pattern:
+def _pattern() -> SamplePattern:
     along = np.arange(-6.0, 6.1, 1.0)
     rows = [(0.0, 0.0, z, 0) for z in along] + [(0.0, 0.0, z, 1) for z in along[::2]]
     for x, y in ((2, 0), (-2, 0), (0, 2), (0, -2), (4.5, 0), (-4.5, 0), (0, 4.5), (0, -4.5)):
@@ -39,7 +39,7 @@ def _pattern() -> Pattern:
         rows += [(x, y, z, 0) for z in (-0.8, 0.8)]
     rows += [(0.0, 0.0, z, 2) for z in (-12.0, -8.0, 8.0, 12.0)]
     table = np.array(rows)
-    return Pattern.paired(table[:, :3], table[:, 3].astype(np.int64), 70, 6)
+    return SamplePattern.paired(table[:, :3], table[:, 3].astype(np.int64), 70, 6)
 
 
 PATTERN = _pattern()

@@ -10,10 +10,10 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.detection.fit import Pulls, fit_shape, relax
 from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.position import PLACES
 from mvest.imaging.detection.shape_start import MODES
+from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray, IntArray
@@ -204,15 +204,15 @@ def fit_frame(
     InputError
         If more modes are to be fitted than the model has.
     """
-    told, begin = settings or FitSettings(), pose
+    chosen, begin = settings or FitSettings(), pose
     shape, layout = model.shape, model.shape.layout
-    if max(told.modes) > len(shape.std):
+    if max(chosen.modes) > len(shape.std):
         raise InputError(
-            f"fit of {max(told.modes)} modes, expected at most the model's {len(shape.std)}"
+            f"fit of {max(chosen.modes)} modes, expected at most the model's {len(shape.std)}"
         )
     stages: dict[str, FloatArray] = {"pose": pose.world(shape.mean)[0]}
     start, found_tips = model.start(frame, pose, shape)
-    b = np.zeros(told.modes[0])
+    b = np.zeros(chosen.modes[0])
     b[:MODES] = start[0] if coefficients is None else coefficients[:MODES]
     tips = found_tips[0] if tips is None else tips
     vertices = pose.world(shape.shape(b[None]))[0]
@@ -235,11 +235,11 @@ def fit_frame(
     pose, b = fit_shape(shape, pose, b, Pulls.to_points(at, vertices[at], points[: len(at)], std))
     manual = np.array([k for k in fixed if k < len(at)], dtype=np.int64)
     pulls, confidence = None, np.zeros(layout.size)
-    for modes, reach in zip(told.modes, told.reach_mm, strict=True):
+    for modes, reach in zip(chosen.modes, chosen.reach_mm, strict=True):
         b = np.concatenate([b, np.zeros(modes - len(b))]) if modes > len(b) else b[:modes]
         vertices = pose.world(shape.shape(b[None]))[0]
         pulls, confidence = _seen(
-            frame, model, vertices, float(pose.log_scale[0]), reach, told.alike
+            frame, model, vertices, float(pose.log_scale[0]), reach, chosen.alike
         )
         hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[0])
         pulls = Pulls.joined([pulls, hand])
@@ -247,10 +247,10 @@ def fit_frame(
         stages[f"shape fit {modes}"] = pose.world(shape.shape(b[None]))[0]
     vertices = pose.world(shape.shape(b[None]))[0]
     pulls, confidence = _seen(
-        frame, model, vertices, float(pose.log_scale[0]), told.reach_mm[-1], told.alike
+        frame, model, vertices, float(pose.log_scale[0]), chosen.reach_mm[-1], chosen.alike
     )
     hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
-    vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), told.stiffness, told.hold)
+    vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), chosen.stiffness, chosen.hold)
     sure = _confidence(frame, model, pose, confidence)
     return FrameValve(begin, pose, b, vertices, tips, sure, confidence, stages)
 

@@ -25,16 +25,16 @@ LEVELS = 4
 SPARSE = 25
 """Of 255: share of voxels with an echo below which a cell of 4 x 4 x 4 voxels counts as without."""
 
-FEWEST_CELLS = 20
+MIN_CELLS = 20
 """Such cells with an echo, below which there is no image."""
 
-MOST_LEVELS = 65536
+MAX_LEVELS = 65536
 """Range of whole grey values up to which each is counted."""
 
-MOST_COMPARED = 200_000
+MAX_COMPARED = 200_000
 """Voxels of a frame in floating-point numbers that ranks are taken among."""
 
-LEAST_GREY_VALUES = 8
+MIN_GREY_VALUES = 8
 """Different values below which a frame holds no image."""
 
 
@@ -131,16 +131,16 @@ def _ranks(grey: NDArray[Any], source: str, frame: int) -> NDArray[np.uint8]:
             f"{source}, frame {frame}: hardly any voxel is brighter than {low:g}, expected an image"
         )
     seen = grey[inside]
-    if np.issubdtype(grey.dtype, np.integer) and int(high) - int(low) < MOST_LEVELS:
+    if np.issubdtype(grey.dtype, np.integer) and int(high) - int(low) < MAX_LEVELS:
         count = np.bincount(seen.astype(np.int64) - int(low), minlength=int(high) - int(low) + 1)
         different = int(np.count_nonzero(count))
         middle = ((np.cumsum(count) - 0.5 * count) / count.sum())[grey.astype(np.int64) - int(low)]
     else:
-        ordered = np.sort(seen[:: -(-len(seen) // MOST_COMPARED)])
+        ordered = np.sort(seen[:: -(-len(seen) // MAX_COMPARED)])
         different = len(np.unique(ordered))
         left, right = (np.searchsorted(ordered, grey, side) for side in ("left", "right"))
         middle = 0.5 * (left + right) / len(ordered)
-    if different < LEAST_GREY_VALUES:
+    if different < MIN_GREY_VALUES:
         raise InputError(
             f"{source}, frame {frame}: {different} different grey values, expected an image"
         )
@@ -155,7 +155,7 @@ def _field_of_view(echo: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     """
     coarse = _halved(_halved(np.where(echo, np.uint8(255), np.uint8(0)))) > SPARSE
     points = np.argwhere(coarse).astype(np.float64)
-    if len(points) < FEWEST_CELLS:
+    if len(points) < MIN_CELLS:
         return None
     try:
         planes = ConvexHull(points).equations

@@ -13,7 +13,7 @@ from mvest.imaging.detection.votes import consensus
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray, IntArray
 
@@ -27,10 +27,10 @@ GRIDS_MM = (2.6, 1.3)
 """mm between candidates in the first and second round."""
 
 
-def _pattern() -> Pattern:
+def _pattern() -> SamplePattern:
     rng = np.random.default_rng(4)
     offsets = rng.standard_normal((130, 3)) * np.repeat([3.0, 7.0, 12.0], [50, 50, 30])[:, None]
-    return Pattern.paired(offsets, np.repeat([0, 1, 2], [50, 50, 30]), 70, 4)
+    return SamplePattern.paired(offsets, np.repeat([0, 1, 2], [50, 50, 30]), 70, 4)
 
 
 PATTERN = _pattern()
@@ -83,15 +83,15 @@ class LandmarkDetector:
         which : (L,)
             Their numbers.
         """
-        found, spread = np.array(points), np.zeros(len(points))
+        refined, spread = np.array(points), np.zeros(len(points))
         for step in GRIDS_MM:
             ticks = step * np.arange(-2, 3)
             grid = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
             axes = np.broadcast_to(pose.axes, (len(grid), 3, 3))
             for k, number in enumerate(which):
-                candidates = found[k] + grid @ pose.rotation[0].T
+                candidates = refined[k] + grid @ pose.rotation[0].T
                 gap = self.boosters[number](features(frame, PATTERN, candidates, axes))
                 votes = candidates + gap @ pose.rotation[0].T
                 point, width = consensus(votes[None])
-                found[k], spread[k] = point[0], width[0]
-        return found, spread
+                refined[k], spread[k] = point[0], width[0]
+        return refined, spread

@@ -16,7 +16,7 @@ from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.pose import Poses, rotation_grid
 from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
@@ -52,14 +52,14 @@ SCALE_MM = 6.0
 """mm, a hypothesis' rating falls off over: exp(-error / SCALE)."""
 
 
-def _pattern(count: int, near: float, seed: int, reach: float = 1.0) -> Pattern:
+def _pattern(count: int, near: float, seed: int, reach: float = 1.0) -> SamplePattern:
     """Samples about the annulus' centre, denser near the leaflets."""
     rng = np.random.default_rng(seed)
     spread = reach * np.array([15.0, 14.0, 13.0])
     offsets = rng.standard_normal((count, 3)) * spread + [0, 0, -5.0]
     radius = np.linalg.norm(offsets / np.array([20.0, 18.0, 16.0]), axis=1)
     levels = np.where(radius > 1.6, 3, np.where(radius > near, 2, 1))
-    return Pattern.paired(offsets, levels, count // 2, seed)
+    return SamplePattern.paired(offsets, levels, count // 2, seed)
 
 
 COARSE = _pattern(140, 0.3, 1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, directions, features
+from mvest.imaging.learning.sampling import SamplePattern, directions, features
 from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
@@ -31,10 +31,10 @@ NEAR_MM = 6.0
 """mm, the rating of a place falls off over: exp(-d^2 / (2 NEAR^2))."""
 
 
-def _pattern() -> Pattern:
+def _pattern() -> SamplePattern:
     offsets = np.concatenate([radius * directions(DIRECTIONS) for radius in RADII_MM])
     levels = np.repeat(np.array(SHELL_LEVELS), DIRECTIONS)
-    return Pattern(offsets, levels, np.zeros((0, 2), dtype=np.int64))
+    return SamplePattern(offsets, levels, np.zeros((0, 2), dtype=np.int64))
 
 
 PATTERN = _pattern()
@@ -94,12 +94,12 @@ class PositionDetector:
         if not len(places):
             return np.zeros((0, 3)), np.zeros(0)
         rating = self.boosters(_shell_features(frame, places))[:, 0]
-        found: list[int] = []
+        kept: list[int] = []
         left = rating.copy()
         for _ in range(count):
             k = int(np.argmax(left))
             if not np.isfinite(left[k]):
                 break
-            found.append(k)
+            kept.append(k)
             left[np.linalg.norm(places - places[k], axis=1) < 0.8 * NEAR_MM] = -np.inf
-        return places[found], rating[found]
+        return places[kept], rating[kept]

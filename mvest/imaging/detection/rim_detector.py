@@ -16,7 +16,7 @@ from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.detection.votes import consensus
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_shapes
 from mvest.typing import FloatArray
 
@@ -30,10 +30,10 @@ GUESSES = 6
 """Missed shapes that training candidates of one frame are taken from."""
 
 
-def _pattern() -> Pattern:
+def _pattern() -> SamplePattern:
     rng = np.random.default_rng(5)
     offsets = rng.standard_normal((120, 3)) * np.repeat([2.2, 5.0, 10.0], [50, 45, 25])[:, None]
-    return Pattern.paired(offsets, np.repeat([0, 1, 2], [50, 45, 25]), 80, 5)
+    return SamplePattern.paired(offsets, np.repeat([0, 1, 2], [50, 45, 25]), 80, 5)
 
 
 PATTERN = _pattern()

@@ -11,7 +11,7 @@ from mvest.imaging.detection.frame import StandardFrame
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.learning.boosting import Boosters
-from mvest.imaging.learning.sampling import Pattern, features
+from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
@@ -23,12 +23,12 @@ MODES = 8
 MISSES = Misses(1.5, 5.0, 0.04)
 
 
-def _pattern() -> Pattern:
+def _pattern() -> SamplePattern:
     rng = np.random.default_rng(3)
     offsets = rng.standard_normal((260, 3)) * np.array([10.0, 9.0, 9.0]) + [0, 0, -8.0]
     offsets[200:] = rng.standard_normal((60, 3)) * 6.0 + [0, 0, -22.0]
     offsets[200:, 0] += np.repeat([15.0, -15.0], 30)  # about where papillary tips are
-    return Pattern.paired(offsets, np.where(rng.random(260) < 0.5, 1, 2), 120, 3)
+    return SamplePattern.paired(offsets, np.where(rng.random(260) < 0.5, 1, 2), 120, 3)
 
 
 PATTERN = _pattern()
@@ -65,6 +65,6 @@ class ShapeStart:
         self, frame: StandardFrame, poses: Poses, model: ShapeModel
     ) -> tuple[FloatArray, FloatArray]:
         """Coefficients ``(P, MODES)`` and tips ``(P, 2, 3)`` in world mm."""
-        found = self.boosters(features(frame, PATTERN, poses.centre, poses.axes))
-        tips = model.tips + found[:, MODES:].reshape(-1, 2, 3)
-        return found[:, :MODES] * model.std[:MODES], poses.world(tips)
+        answers = self.boosters(features(frame, PATTERN, poses.centre, poses.axes))
+        tips = model.tips + answers[:, MODES:].reshape(-1, 2, 3)
+        return answers[:, :MODES] * model.std[:MODES], poses.world(tips)

@@ -29,11 +29,11 @@ from mvest.imaging.detection.detect import (
 )
 from mvest.imaging.detection.fit import Pulls, relax
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
-from mvest.imaging.detection.model import DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.smoothing import smooth_in_time
+from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import BoolArray, FloatArray
 
@@ -66,7 +66,7 @@ class TrackingSettings:
         Standard deviation of its change between frames however short their interval: errors.
     smoothing_s : (float, float, float)
         Times over which annulus, free edge and papillary tips are smoothed; 0: not at all.
-    least_confidence : float
+    min_confidence : float
         Of the best frame: below it there is no valve.
     fit : FitSettings
     """
@@ -76,7 +76,7 @@ class TrackingSettings:
     speed_mm_s: float = 60.0
     still_mm: float = 2.0
     smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
-    least_confidence: float = 0.6
+    min_confidence: float = 0.6
     fit: FitSettings = field(default_factory=FitSettings)
 
 
@@ -107,35 +107,35 @@ def detect_valve(
     InputError
         If a frame holds no image, or landmarks name no frame or point that there is.
     """
-    told = settings or TrackingSettings()
+    chosen = settings or TrackingSettings()
     by_hand = _checked(landmarks or {}, len(volume.times), model)
     frames = [standard_frame(volume, k) for k in range(len(volume.times))]
-    poses = _trajectory(frames, np.asarray(volume.times), model, told, by_hand)
-    found: list[FrameValve] = []
+    poses = _trajectory(frames, np.asarray(volume.times), model, chosen, by_hand)
+    valves: list[FrameValve] = []
     for k, frame in enumerate(frames):
-        found.append(fit_frame(frame, model, poses[k : k + 1], told.fit, fixed=by_hand.get(k)))
+        valves.append(fit_frame(frame, model, poses[k : k + 1], chosen.fit, fixed=by_hand.get(k)))
         if progress is not None:
             progress(k + 1, len(frames))
-    confidence = np.array([valve.confidence for valve in found])
+    confidence = np.array([valve.confidence for valve in valves])
     by_eye = any(len(points) >= POSE_LANDMARKS for points in by_hand.values())
-    if confidence.max() < told.least_confidence and not by_eye:
+    if confidence.max() < chosen.min_confidence and not by_eye:
         raise NoValveError(
             f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
-            f"of {confidence.max():.2f}, expected at least {told.least_confidence:g} (a mitral "
+            f"of {confidence.max():.2f}, expected at least {chosen.min_confidence:g} (a mitral "
             "valve whole within the field of view, or landmarks placed by hand)"
         )
-    sure = np.stack([valve.vertex_confidence for valve in found])
+    sure = np.stack([valve.vertex_confidence for valve in valves])
     vertices, tips = smooth_in_time(
         np.asarray(volume.times),
-        np.stack([valve.vertices for valve in found]),
-        np.stack([valve.tips for valve in found]),
+        np.stack([valve.vertices for valve in valves]),
+        np.stack([valve.tips for valve in valves]),
         sure * confidence[:, None],
         confidence,
         model.shape.layout.s,
-        told.smoothing_s,
+        chosen.smoothing_s,
     )
     for k, points in by_hand.items():
-        vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, told.fit)
+        vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, chosen.fit)
     accuracy, layout = model.accuracy, model.shape.layout
     return ValveSequence(
         layout,
@@ -175,7 +175,7 @@ def _checked(
     landmarks: Landmarks, frames: int, model: DetectionModel
 ) -> dict[int, dict[int, FloatArray]]:
     known = {name: k for k, name in enumerate(LANDMARKS)}
-    found: dict[int, dict[int, FloatArray]] = {}
+    placed: dict[int, dict[int, FloatArray]] = {}
     for frame, points in landmarks.items():
         if not 0 <= frame < frames:
             raise InputError(f"landmarks of frame {frame}; the volume has frames 0 to {frames - 1}")
@@ -185,7 +185,7 @@ def _checked(
                 f"landmarks of frame {frame}: {', '.join(strange)}; expected some of "
                 f"{', '.join(known)}"
             )
-        found[frame] = {known[name]: np.asarray(point, float) for name, point in points.items()}
+        placed[frame] = {known[name]: np.asarray(point, float) for name, point in points.items()}
         for name, point in points.items():
             if np.shape(point) != (3,) or not np.isfinite(point).all():
                 raise InputError(
@@ -193,21 +193,21 @@ def _checked(
                     "three finite coordinates"
                 )
         if len(points) >= POSE_LANDMARKS:
-            about = np.stack(list(found[frame].values()))
+            about = np.stack(list(placed[frame].values()))
             size = np.linalg.svd(about - about.mean(axis=0), compute_uv=False)
             if size[1] < LINE_MM:
                 raise InputError(
                     f"landmarks of frame {frame} lie within {size[1]:.2g} mm of one line, expected "
                     "them about the valve"
                 )
-    return found
+    return placed
 
 
 def _trajectory(
     frames: list[StandardFrame],
     times: FloatArray,
     model: DetectionModel,
-    told: TrackingSettings,
+    chosen: TrackingSettings,
     by_hand: Mapping[int, Mapping[int, FloatArray]],
 ) -> Poses:
     """One pose for every frame."""
@@ -216,7 +216,7 @@ def _trajectory(
         placed = _pose_by_hand(by_hand.get(k, {}), model)
         if placed is None:
             poses, rating = search_frame(frame, model, CANDIDATES)
-            few = poses.apart(rating, told.hypotheses)
+            few = poses.apart(rating, chosen.hypotheses)
             own.append((poses[few], rating[few]))
         else:
             own.append((placed, np.ones(1)))
@@ -224,10 +224,10 @@ def _trajectory(
     pool = Poses.joined([poses for poses, _ in own])
     if not len(pool):
         raise NoValveError("no valve found; there is no place in any frame to look for one at")
-    best = pool[pool.apart(ratings, told.shared)]
+    best = pool[pool.apart(ratings, chosen.shared)]
     if not by_hand and np.median([rating[0] for _, rating in own if len(rating)]) < SURE:
         tried = pool[pool.apart(ratings, TRIED)]
-        likeliest = _likeliest_in_all(frames, model, tried, told.fit)
+        likeliest = _likeliest_in_all(frames, model, tried, chosen.fit)
         best = tried[likeliest : likeliest + 1]
         own = [(poses[_like(poses, best)], rating[_like(poses, best)]) for poses, rating in own]
     candidates = []
@@ -237,7 +237,7 @@ def _trajectory(
             continue
         again, rated = model.poses.refined(frame, best, len(best))
         candidates.append((Poses.joined([own[k][0], again]), np.concatenate([own[k][1], rated])))
-    path = _best_path(candidates, times, model, told)
+    path = _best_path(candidates, times, model, chosen)
     return Poses.joined([candidates[k][0][p : p + 1] for k, p in enumerate(path)])
 
 
@@ -262,7 +262,7 @@ def _best_path(
     candidates: list[tuple[Poses, FloatArray]],
     times: FloatArray,
     model: DetectionModel,
-    told: TrackingSettings,
+    chosen: TrackingSettings,
 ) -> list[int]:
     """The hypothesis of each frame on the likeliest trajectory (Viterbi)."""
     points = np.concatenate([model.shape.mean[model.shape.layout.annulus[::4]], model.shape.tips])
@@ -272,7 +272,7 @@ def _best_path(
     for k in range(1, len(candidates)):
         gap = where[k][:, None] - where[k - 1][None]
         moved = np.linalg.norm(gap, axis=3).mean(axis=2)
-        std = np.hypot(told.still_mm, told.speed_mm_s * (times[k] - times[k - 1]))
+        std = np.hypot(chosen.still_mm, chosen.speed_mm_s * (times[k] - times[k - 1]))
         # Bounded, so that one frame gone wrong does not drag the others along.
         step = np.minimum(0.5 * (moved / std) ** 2, 8.0) + total[None]
         back.append(np.argmin(step, axis=1))

@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.imaging.detection.model import Accuracy
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -95,11 +95,11 @@ def correlogram(errors: FloatArray, points: FloatArray) -> Correlogram:
     return Correlogram(mean(distance), mean(product[first, second]), pairs[some])
 
 
-def fitted_length(found: Correlogram) -> float:
+def fitted_length(correlations: Correlogram) -> float:
     """The length (mm) of the Matérn correlation that is nearest to a correlogram, bin by bin."""
 
     def miss(log_length: float) -> float:
-        gap = matern(found.distance, np.exp(log_length)) - found.correlation
+        gap = matern(correlations.distance, np.exp(log_length)) - correlations.correlation
         return float((gap**2).sum())
 
     low, high = np.log(LENGTHS_MM)
@@ -109,7 +109,7 @@ def fitted_length(found: Correlogram) -> float:
 
 def measure_accuracy(
     samples: FloatArray, tip_samples: FloatArray, rest: FloatArray
-) -> tuple[Accuracy, Correlogram]:
+) -> tuple[DetectionAccuracy, Correlogram]:
     """What held-out sequences say of the detectors' errors.
 
     Parameters
@@ -122,7 +122,7 @@ def measure_accuracy(
 
     Returns
     -------
-    Accuracy
+    DetectionAccuracy
         The standard deviation of a vertex is the root mean square over sequences, frames and
         coordinates of its errors about their mean over the sequences (in each frame and coordinate,
         so that S - 1 of S are free).
@@ -146,8 +146,8 @@ def measure_accuracy(
         raise InputError("accuracy of detectors: errors that are not finite")
     about = samples - samples.mean(axis=0)
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
-    found = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
-    return Accuracy(std, fitted_length(found), samples, tip_samples), found
+    correlations = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
+    return DetectionAccuracy(std, fitted_length(correlations), samples, tip_samples), correlations
 
 
 def share_within(errors: FloatArray, std_mm: FloatArray, mean: FloatArray | None = None) -> float:

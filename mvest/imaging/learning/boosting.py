@@ -26,7 +26,7 @@ class BoostSettings:
     trees, leaves : int
     rate : float
         Share of each tree's answer that is taken.
-    least : int
+    min_leaf_samples : int
         Samples that a leaf holds at least.
     share_features, share_rows : float
         Of what there is, drawn anew for every tree.
@@ -36,7 +36,7 @@ class BoostSettings:
     trees: int = 80
     leaves: int = 24
     rate: float = 0.12
-    least: int = 40
+    min_leaf_samples: int = 40
     share_features: float = 0.25
     share_rows: float = 0.7
     threads: int = 1
@@ -47,7 +47,7 @@ class BoostSettings:
             "objective": objective,
             "num_leaves": self.leaves,
             "learning_rate": self.rate,
-            "min_data_in_leaf": self.least,
+            "min_data_in_leaf": self.min_leaf_samples,
             "feature_fraction": self.share_features,
             "bagging_fraction": self.share_rows,
             "bagging_freq": 1,
@@ -110,16 +110,16 @@ class Boosters:
             )
         if not len(x):
             return np.zeros((0, self.outputs))
-        found = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
-        return np.stack(found, axis=1)
+        answers = [np.asarray(b.predict(x, num_threads=1)) for b in self._boosters]
+        return np.stack(answers, axis=1)
 
 
 @lru_cache(maxsize=64)
 def _as_checked(texts: tuple[str, ...], features: int, source: str) -> Boosters:
     """Trees that another process sent: those of one call after another are read once."""
-    found = Boosters.__new__(Boosters)
-    found._begin(texts, features, source)
-    return found
+    made = Boosters.__new__(Boosters)
+    made._begin(texts, features, source)
+    return made
 
 
 def train_boosters(

@@ -1,4 +1,4 @@
-"""How far a found valve is from the true one, stage by stage."""
+"""How far a detected valve is from the true one, stage by stage."""
 
 from __future__ import annotations
 
@@ -53,21 +53,25 @@ class FrameErrors:
 
 
 def frame_errors(
-    found: FrameValve, vertices: FloatArray, tips: FloatArray, true: TrueValve, layout: ValveLayout
+    detected: FrameValve,
+    vertices: FloatArray,
+    tips: FloatArray,
+    true: TrueValve,
+    layout: ValveLayout,
 ) -> FrameErrors:
     """Errors of one frame.
 
     Parameters
     ----------
-    found : FrameValve
+    detected : FrameValve
         For the stages.
     vertices, tips : (n, 3), (2, 3) mm
         As finally handed on (smoothed in time, for instance).
     true : TrueValve
     """
-    by = found.start.towards(true.pose)[0]
+    by = detected.start.towards(true.pose)[0]
     stages = {}
-    for name, points in found.stages.items():
+    for name, points in detected.stages.items():
         whole = len(points) == layout.size
         right = true.vertices if whole else landmark_points(true, layout)
         stages[name] = float(np.linalg.norm(points - right, axis=1).mean())
@@ -89,13 +93,13 @@ def frame_errors(
 
 
 def surface_distances(
-    found: FloatArray, true: FloatArray, layout: ValveLayout
+    detected: FloatArray, true: FloatArray, layout: ValveLayout
 ) -> tuple[FloatArray, FloatArray]:
     """Distances ``(n,)`` mm of the vertices of each surface from the other.
 
     A surface is stood for by its tangent planes at four times as many points in each direction.
     """
-    return _to_surface(found, true, layout), _to_surface(true, found, layout)
+    return _to_surface(detected, true, layout), _to_surface(true, detected, layout)
 
 
 def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) -> FloatArray:
@@ -117,10 +121,10 @@ def _to_surface(points: FloatArray, surface: FloatArray, layout: ValveLayout) ->
     return np.where(inside, off, gap)
 
 
-def _across(found: FloatArray, true: FloatArray) -> float:
+def _across(points: FloatArray, true: FloatArray) -> float:
     """Mean distance (mm) of a closed curve's points from another one, seen as segments."""
     a, b = true, np.roll(true, -1, 0)
     along = b - a
-    t = ((found[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
+    t = ((points[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
     foot = a + np.clip(t, 0, 1)[..., None] * along
-    return float(np.linalg.norm(found[:, None] - foot, axis=2).min(axis=1).mean())
+    return float(np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1).mean())

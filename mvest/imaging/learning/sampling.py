@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from mvest.imaging.detection.frame import StandardFrame
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Pattern", "directions", "features"]
+__all__ = ["SamplePattern", "directions", "features"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pattern:
+class SamplePattern:
     """Where and at which scale ranks are sampled about a hypothesis.
 
     Attributes
@@ -38,7 +38,9 @@ class Pattern:
     pairs: IntArray
 
     @classmethod
-    def paired(cls, offsets: FloatArray, levels: IntArray, differences: int, seed: int) -> Pattern:
+    def paired(
+        cls, offsets: FloatArray, levels: IntArray, differences: int, seed: int
+    ) -> SamplePattern:
         """Samples with differences of pairs drawn at random, near ones more often."""
         rng = np.random.default_rng(seed)
         n = len(offsets)
@@ -70,7 +72,7 @@ def directions(count: int) -> FloatArray:
 
 def features(
     frame: StandardFrame,
-    pattern: Pattern,
+    pattern: SamplePattern,
     points: FloatArray,
     axes: FloatArray,
 ) -> NDArray[np.float32]:

@@ -18,7 +18,6 @@ from mvest.errors import InputError
 from mvest.imaging.detection.boundary import boundary_samples
 from mvest.imaging.detection.frame import StandardFrame, standard_frame
 from mvest.imaging.detection.landmark_detector import landmark_samples
-from mvest.imaging.detection.model import STAGES, DetectionModel
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import (
     REFINED,
@@ -32,15 +31,16 @@ from mvest.imaging.detection.position import PLACES, PositionDetector, position_
 from mvest.imaging.detection.rim_detector import rim_samples
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.shape_start import MODES, shape_start_samples
+from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
 from mvest.imaging.learning.degrade import degrade
 from mvest.imaging.learning.truth import TrueValve
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
-from mvest.imaging.simulator.spread import draw_acquisition
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray
 
@@ -156,7 +156,7 @@ def draw_samples(
     """Samples of all stages from one frame; a draft's mistakes are among them."""
     layout = model.layout
     mistaken = None if draft is None else draft.taken_for_valves(frame, counts.mistaken, rng)
-    found: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
+    samples: dict[str, tuple[NDArray[np.float32], FloatArray]] = {
         "position": position_samples(frame, true, counts.position, rng),
         "pose_coarse": coarse_samples(frame, true, model, counts.pose_rating, rng),
         "pose_fine": fine_samples(frame, true, model, counts.pose_rating, rng, mistaken),
@@ -166,10 +166,12 @@ def draw_samples(
         "boundary": boundary_samples(frame, true, model, counts.boundary, rng),
     }
     for k in range(len(REFINEMENTS)):
-        found[f"pose_refine_{k}"] = refinement_samples(frame, true, k, counts.pose_refinement, rng)
+        samples[f"pose_refine_{k}"] = refinement_samples(
+            frame, true, k, counts.pose_refinement, rng
+        )
     for k in range(len(LANDMARKS)):
-        found[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
-    return {name: (x, y.astype(np.float32)) for name, (x, y) in found.items()}
+        samples[f"landmark_{k}"] = landmark_samples(frame, true, layout, k, counts.landmark, rng)
+    return {name: (x, y.astype(np.float32)) for name, (x, y) in samples.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,7 +264,7 @@ def train_stage(
     Parameters
     ----------
     name : str
-        One of :data:`mvest.imaging.detection.model.STAGES`.
+        One of :data:`mvest.imaging.detection.trained_model.STAGES`.
     x, y : (P, F), (P, outputs)
     settings : TrainingSettings
     seed : int
@@ -322,8 +324,8 @@ def train_model(
                 )
                 for k in numbers
             )
-            for found in drawn:
-                samples.append(found)
+            for sample in drawn:
+                samples.append(sample)
                 tell("volumes", len(samples), settings.volumes)
         grown = parallel(
             joblib.delayed(train_stage)(

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import SimpleITK
 
-from mvest.imaging.reading.checks import check_size
 from mvest.imaging.reading.data import beside, from_zlib, plainly, read_exactly
+from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, StatedVolume, fault
 
 __all__ = ["is_metaimage", "read_metaimage"]

@@ -14,8 +14,8 @@ from typing import Any
 import nibabel
 import numpy as np
 
-from mvest.imaging.reading.checks import check_size
 from mvest.imaging.reading.data import from_gzip, plainly, read_exactly
+from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.typing import FloatArray
 

@@ -19,8 +19,8 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.reading.checks import check_size
 from mvest.imaging.reading.data import beside, from_gzip, plainly, read_exactly
+from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray

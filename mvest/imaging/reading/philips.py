@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pydicom
 
-from mvest.imaging.reading.checks import check_size
+from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 

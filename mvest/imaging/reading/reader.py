@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.imaging.reading.checks import checked_sequence
 from mvest.imaging.reading.metaimage import is_metaimage, read_metaimage
 from mvest.imaging.reading.nifti import is_nifti, read_nifti
 from mvest.imaging.reading.nrrd_file import read_nrrd
 from mvest.imaging.reading.philips import is_dicom, read_philips
+from mvest.imaging.reading.plausible import checked_sequence
 from mvest.imaging.reading.stated import StatedVolume, fault
 from mvest.imaging.volume import Modality, VolumeSequence
 

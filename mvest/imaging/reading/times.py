@@ -19,7 +19,7 @@ SECONDS_PER_UNIT = {
 }
 """Units of time by the names that files give them."""
 
-SHORTEST_S, LONGEST_S = 0.002, 1.0
+MIN_INTERVAL_S, MAX_INTERVAL_S = 0.002, 1.0
 """Bounds of the interval between two frames of a beating heart, the upper one excluded.
 
 No scanner takes 500 volumes per second; a second between frames leaves one to a beat, and is what
@@ -65,11 +65,16 @@ def times_in_seconds(
     elif stated.values is None or (factor is None and time_unit is None):
         if count == 1:
             return np.zeros(1)
-        found = "no times of frames"
+        stated_so = "no times of frames"
         if stated.values is not None:
-            found = f"times in the unit {stated.unit!r}" if stated.unit else "times without a unit"
+            stated_so = (
+                f"times in the unit {stated.unit!r}" if stated.unit else "times without a unit"
+            )
         raise fault(
-            path, stated.field, found, "times in s or ms; else give time_unit or frame_interval_s"
+            path,
+            stated.field,
+            stated_so,
+            "times in s or ms; else give time_unit or frame_interval_s",
         )
     else:
         if time_unit is not None:
@@ -116,11 +121,11 @@ def _check(path: Path, field: str, times: FloatArray, count: int) -> None:
             f"{times[frame]:g} s at frame {frame}, then {times[frame + 1]:g} s",
             "increasing times",
         )
-    bad = np.flatnonzero((steps < SHORTEST_S) | (steps >= LONGEST_S))
+    bad = np.flatnonzero((steps < MIN_INTERVAL_S) | (steps >= MAX_INTERVAL_S))
     if len(bad):
         raise fault(
             path,
             field,
             f"{steps[bad[0]]:g} s between frames {bad[0]} and {bad[0] + 1}",
-            f"at least {SHORTEST_S:g} s and less than {LONGEST_S:g} s",
+            f"at least {MIN_INTERVAL_S:g} s and less than {MAX_INTERVAL_S:g} s",
         )

@@ -7,7 +7,7 @@ import numpy as np
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.chambers import Heart, waves
-from mvest.imaging.simulator.tissue import Cord, Material, Part, Sheet, normals
+from mvest.imaging.simulator.scatterers import Cord, Material, TissuePart, TissueSheet, normals
 from mvest.typing import FloatArray
 
 __all__ = ["make_parts"]
@@ -18,7 +18,7 @@ SURROUNDINGS_MM, FADE = 20.0, 2.0
 
 def make_parts(
     valve: MovingValve, heart: Heart, acquisition: Acquisition, rng: np.random.Generator
-) -> list[Part]:
+) -> list[TissuePart]:
     """Leaflets, annulus, chordae, muscles, walls of the chambers and what surrounds them."""
     return [
         *_valve_parts(valve, acquisition, rng),
@@ -27,12 +27,12 @@ def make_parts(
     ]
 
 
-def _valve_parts(valve: MovingValve, a: Acquisition, rng: np.random.Generator) -> list[Part]:
+def _valve_parts(valve: MovingValve, a: Acquisition, rng: np.random.Generator) -> list[TissuePart]:
     columns, grid = valve.layout.columns, (valve.layout.rows, valve.layout.columns)
     leaflets = valve.vertices.reshape(len(valve.times), *grid, 3)
     chord = Material("chord", a.chord_db, fineness=6.0)
-    parts: list[Part] = [
-        Sheet(
+    parts: list[TissuePart] = [
+        TissueSheet(
             Material("leaflet", a.leaflet_db, fineness=4.0),
             leaflets,
             valve.thickness.reshape(grid),
@@ -53,30 +53,34 @@ def _valve_parts(valve: MovingValve, a: Acquisition, rng: np.random.Generator) -
     return parts
 
 
-def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[Part]:
+def _wall_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[TissuePart]:
     wall, vessel = Material("wall", a.wall_db), Material("vessel", a.vessel_db)
     muscle = Material("papillary", a.papillary_db, specular=False)
-    parts: list[Part] = []
+    parts: list[TissuePart] = []
     for material, points, thickness, span in (
         (wall, heart.ventricle, heart.ventricle_thickness, (0.0, 1.0)),
         (vessel, heart.atrium, heart.atrium_thickness, (-1.0, 0.0)),
         (vessel, heart.aorta, heart.aorta_thickness, (-0.5, 0.5)),
     ):
-        parts.append(Sheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng)))
+        parts.append(
+            TissueSheet(material, points, thickness, span, _mottled(thickness.shape, 2.0, rng))
+        )
     radius = heart.muscle_radius
     parts += [Cord(muscle, m, radius, False, np.zeros(len(radius))) for m in heart.muscles]
     return parts
 
 
-def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[Part]:
+def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list[TissuePart]:
     """Pericardium, and tissue around ventricle and atrium, not towards aorta and right heart."""
     free = 1 - heart.outflow
     pericardium = Material("pericardium", a.vessel_db + 2.0)
     around = Material("surroundings", a.wall_db - 2.0, specular=False, fineness=0.5)
     outside = heart.ventricle + heart.ventricle_thickness[..., None] * normals(heart.ventricle)
     shape = heart.ventricle_thickness.shape
-    parts: list[Part] = [
-        Sheet(pericardium, outside, np.full(shape, 1.2), (0.0, 1.0), np.tile(free, (shape[0], 1)))
+    parts: list[TissuePart] = [
+        TissueSheet(
+            pericardium, outside, np.full(shape, 1.2), (0.0, 1.0), np.tile(free, (shape[0], 1))
+        )
     ]
     atrium = heart.atrium - heart.atrium_thickness[..., None] * normals(heart.atrium)
     # Close to the annulus the atrium's wall turns outward, and its normal into the ventricle.
@@ -84,7 +88,7 @@ def _outer_parts(heart: Heart, a: Acquisition, rng: np.random.Generator) -> list
         thickness = np.tile(0.02 + SURROUNDINGS_MM * free, (points.shape[1], 1))
         span = (0.0, 1.0) if side > 0 else (-1.0, 0.0)
         parts.append(
-            Sheet(around, points, thickness, span, _mottled(thickness.shape, 4.0, rng), FADE)
+            TissueSheet(around, points, thickness, span, _mottled(thickness.shape, 4.0, rng), FADE)
         )
     return parts
 

@@ -11,7 +11,7 @@ from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.chambers import make_heart
 from mvest.imaging.simulator.parts import make_parts
 from mvest.imaging.simulator.probe import Probe
-from mvest.imaging.simulator.tissue import Part
+from mvest.imaging.simulator.scatterers import TissuePart
 from mvest.typing import FloatArray
 
 __all__ = ["Echoes", "Scene", "cell_volume", "make_scene"]
@@ -42,7 +42,7 @@ class Scene:
 
     Attributes
     ----------
-    parts : tuple of Part
+    parts : tuple of TissuePart
     seeds : tuple of (n, 3)
         Material coordinates in each part.
     strengths : tuple of (n,)
@@ -52,7 +52,7 @@ class Scene:
     probe : Probe
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[TissuePart, ...]
     seeds: tuple[FloatArray, ...]
     strengths: tuple[FloatArray, ...]
     losses: tuple[FloatArray, ...]

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from mvest.errors import InputError
 from mvest.imaging.moving_valve import MovingValve
-from mvest.imaging.sequence import ValveSequence
 from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.beams import BeamGrid, Losses, render_window
 from mvest.imaging.simulator.probe import Probe
 from mvest.imaging.simulator.scan import compress, scan_convert, volume_frame
 from mvest.imaging.simulator.scene import Echoes, make_scene
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 

@@ -32,7 +32,7 @@ __all__ = [
     "population_hash",
 ]
 
-MOST_DRAWS = 20
+MAX_DRAWS = 20
 """Valves drawn in a row until one closes."""
 
 
@@ -186,7 +186,7 @@ def _draw(
     """A valve, and why others were refused before it."""
     rng = np.random.default_rng(sequence)
     reasons: list[str] = []
-    while len(reasons) < MOST_DRAWS:
+    while len(reasons) < MAX_DRAWS:
         template = Template(vary(base, rng, rng.uniform(*settings.scale)))
         values = {
             parameter: median * _factor(settings.moduli_spread, rng)
@@ -201,7 +201,7 @@ def _draw(
             return close_in_motion(name, template, values, motion, mechanics, tip_motion), reasons
         except RefusedError as error:
             reasons.append(error.reason.value)
-    raise GeometryError(f"simulated valve {name}: refused {MOST_DRAWS} times: {'; '.join(reasons)}")
+    raise GeometryError(f"simulated valve {name}: refused {MAX_DRAWS} times: {'; '.join(reasons)}")
 
 
 def _factor(spread: float, rng: np.random.Generator) -> float:

@@ -52,15 +52,14 @@ class Band:
             )
         self.valve = valve
         self.region_names = surface.region_names
-        found = surface_coordinates(
+        self._coordinates: SurfaceCoordinates = surface_coordinates(
             surface.vertices, surface.triangles, valve.annulus, valve.free_edge
         )
         # phi runs so that (along the leaflet) x (along phi) points to the ventricle: triangles,
         # whose normals do, are then run through clockwise in the plane of (phi, s).
-        corner = found.strip_triangles()
+        corner = self._coordinates.strip_triangles()
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
         self._sign = -1.0 if np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0 else 1.0
-        self._coordinates: SurfaceCoordinates = found
         self._lines = self._leaflet_lines(surface)
         self._normals = smooth_vertex_normals(
             surface.vertices, surface.triangles, _rounds(surface, NORMAL_SMOOTHING_MM)

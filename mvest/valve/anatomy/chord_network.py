@@ -105,15 +105,16 @@ def trace_cables(
             f"{loose.size} chord segments are connected to no anchor (first: {loose[:5].tolist()})"
         )
     ends = np.unique(edges[on_leaflet[edges]])
-    found = np.isfinite(distance[:, ends])
-    if not found.any(axis=1).all():
+    reachable = np.isfinite(distance[:, ends])
+    ending = reachable.any(axis=1)
+    if not ending.all():
         raise GeometryError(
-            f"chord anchor at node {int(anchors[np.argmin(found.any(axis=1))])} reaches no leaflet"
+            f"chord anchor at node {int(anchors[np.argmin(ending)])} reaches no leaflet"
         )
-    anchor_index, end_index = np.nonzero(found)
+    anchor_index, end_index = np.nonzero(reachable)
     share = np.concatenate(
         [
-            _stiffness_shares(distance[i], predecessor[i], ends[found[i]])
+            _stiffness_shares(distance[i], predecessor[i], ends[reachable[i]])
             for i in range(len(anchors))
         ]
     )

@@ -28,12 +28,12 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template, TemplateParameters
 
-__all__ = ["Variation", "draw_variation", "vary"]
+__all__ = ["VariedAnatomy", "draw_variation", "vary"]
 
 LIMIT = 2.0
 """Standard deviations beyond which nothing is drawn."""
 
-MOST_REFUSED = 100
+MAX_REFUSED = 100
 """Shapes refused in a row before the scale is held to be too large."""
 
 SIZE, AP, COMMISSURAL = 0.05, 0.035, 0.03
@@ -48,7 +48,7 @@ SAMPLING = (112, 29)
 
 
 @dataclass(frozen=True, slots=True)
-class Variation:
+class VariedAnatomy:
     """A random anatomy.
 
     Attributes
@@ -71,7 +71,7 @@ def vary(
 
 def draw_variation(
     parameters: TemplateParameters, rng: np.random.Generator, scale: float = 1.0
-) -> Variation:
+) -> VariedAnatomy:
     """Draw until the template takes the shape.
 
     Parameters
@@ -89,16 +89,16 @@ def draw_variation(
     """
     if not (np.isfinite(scale) and scale >= 0):
         raise InputError(f"scale of a variation = {scale}, expected a number >= 0")
-    for refused in range(MOST_REFUSED):
+    for refused in range(MAX_REFUSED):
         z = scale * truncnorm.rvs(-LIMIT, LIMIT, size=13, random_state=rng)
         try:
             varied = _changed(parameters, z)
             Template(varied).valve(*SAMPLING)
         except GeometryError:
             continue
-        return Variation(varied, refused)
+        return VariedAnatomy(varied, refused)
     raise InputError(
-        f"scale of a variation = {scale}: {MOST_REFUSED} shapes in a row are no valve; take a "
+        f"scale of a variation = {scale}: {MAX_REFUSED} shapes in a row are no valve; take a "
         "smaller one"
     )
 

@@ -89,8 +89,7 @@ def across_curve(curve: FloatArray, std: float) -> FloatArray:
     deviations away but no more than an eighth of the points. Where it is wrong by an angle, one of
     the components is too small by its cosine: information is lost, and none made up.
     """
-    most = max(1, len(curve) // 8)
-    for reach in range(1, most + 1):
+    for reach in range(1, max(1, len(curve) // 8) + 1):
         span = np.roll(curve, -reach, axis=0) - np.roll(curve, reach, axis=0)
         if np.median(np.linalg.norm(span, axis=1)) >= 2.0 * TANGENT_REACH * std:
             break

@@ -16,7 +16,7 @@ __all__ = ["SpanningSurface", "spanning_surface"]
 
 RINGS = 12
 """Of vertices between the curve and its centre."""
-MOST_ROUNDS = 100
+MAX_ROUNDS = 100
 TOLERANCE = 1e-7
 """Relative change of the area at which the surface is taken as minimal."""
 
@@ -75,7 +75,7 @@ def spanning_surface(annulus: FloatArray, plane: AnnulusPlane) -> SpanningSurfac
     gradient, size = _gradient(flat, triangles)
     height = np.concatenate([np.tile(loop[:, 2], RINGS), [loop[:, 2].mean()]])
     area = np.inf
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         slope = (gradient @ height).reshape(2, -1)
         stretch = np.sqrt(1.0 + (slope**2).sum(axis=0))
         before, area = area, float((size * stretch).sum())
@@ -96,13 +96,13 @@ def _disc(k: int) -> IntArray:
     """Triangles of rings of k vertices from outside inwards and a centre."""
     here = np.arange(k)
     after = (here + 1) % k
-    found = []
+    triangles = []
     for ring in range(RINGS - 1):
         a, b = here + ring * k, after + ring * k
-        found += [np.stack([a, b, b + k], 1), np.stack([a, b + k, a + k], 1)]
+        triangles += [np.stack([a, b, b + k], 1), np.stack([a, b + k, a + k], 1)]
     last = (RINGS - 1) * k
-    found.append(np.stack([here + last, after + last, np.full(k, RINGS * k)], 1))
-    return np.concatenate(found)
+    triangles.append(np.stack([here + last, after + last, np.full(k, RINGS * k)], 1))
+    return np.concatenate(triangles)
 
 
 def _gradient(points: FloatArray, triangles: IntArray) -> tuple[sp.csr_array, FloatArray]:

@@ -39,10 +39,10 @@ __all__ = [
     "surface_coordinates",
 ]
 
-SMALLEST_WEIGHT = 0.05
+MIN_WEIGHT = 0.05
 """To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
 0.58."""
-MOST_ROUNDS = 10
+MAX_ROUNDS = 10
 """How often they are raised, each time round the triangles that still fold over."""
 
 
@@ -201,7 +201,7 @@ def surface_coordinates(
     laplacian = cotangent_laplacian(vertices, triangles)
     coordinates = _solve(vertices, triangles, annulus, free_edge, laplacian)
     near = np.zeros(len(vertices), dtype=np.bool_)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         folded = coordinates.folded()
         if not folded.size:
             return coordinates
@@ -239,7 +239,7 @@ def _raised(laplacian: sp.csr_matrix, near: BoolArray) -> sp.csr_matrix:
     """The same with no weight below the smallest one at the vertices ``near (n,)``."""
     edges = sp.triu(laplacian, k=1).tocoo()
     here = near[edges.row] | near[edges.col]
-    weight = np.where(here, np.maximum(-edges.data, SMALLEST_WEIGHT), -edges.data)
+    weight = np.where(here, np.maximum(-edges.data, MIN_WEIGHT), -edges.data)
     off = sp.coo_matrix((-weight, (edges.row, edges.col)), shape=laplacian.shape)
     off = off + off.T
     return (off - sp.diags(np.asarray(off.sum(axis=1)).ravel())).tocsr()

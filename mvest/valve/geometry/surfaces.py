@@ -30,9 +30,9 @@ FACE_KINDS = ("ventricular", "atrial", "rim")
 """What a triangle of a thickened leaflet bounds."""
 
 
-def _listed(numbers: IntArray, most: int = 8) -> str:
-    shown = ", ".join(str(int(i)) for i in numbers[:most])
-    return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > most else "")
+def _listed(numbers: IntArray, count: int = 8) -> str:
+    shown = ", ".join(str(int(i)) for i in numbers[:count])
+    return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > count else "")
 
 
 def check_surface(

@@ -12,7 +12,7 @@ import base64
 import re
 import xml.etree.ElementTree as ET
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["PolyData", "read_vtp", "write_vtp"]
+__all__ = ["SurfaceFile", "read_vtp", "write_vtp"]
 
 _TYPES = {
     f"{kind}{bits}": f"{code}{bits // 8}"
@@ -38,23 +38,23 @@ _BLOCK = 32768
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PolyData:
-    """Triangles and their data as they stand in a file.
+class SurfaceFile:
+    """A triangulated surface as it stands in a file.
 
     Attributes
     ----------
-    points
-        ``(n, 3)``.
+    vertices
+        ``(n, 3)`` mm.
     triangles
         ``(m, 3)``.
     point_data, cell_data
-        Named arrays with n or m rows.
+        Named arrays with n or m rows; empty for STL and OBJ.
     """
 
-    points: FloatArray
+    vertices: FloatArray
     triangles: IntArray
-    point_data: dict[str, NDArray[np.generic]]
-    cell_data: dict[str, NDArray[np.generic]]
+    point_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+    cell_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
 
 class _Decoder:
@@ -62,11 +62,11 @@ class _Decoder:
 
     def __init__(self, content: bytes) -> None:
         head, appended = content, b""
-        found = re.search(rb"<AppendedData[^>]*>\s*_", content)
-        if found:
+        mark = re.search(rb"<AppendedData[^>]*>\s*_", content)
+        if mark:
             end = content.rfind(b"</AppendedData>")
-            appended = content[found.end() : end]
-            head = content[: found.end() - 1] + content[end:]
+            appended = content[mark.end() : end]
+            head = content[: mark.end() - 1] + content[end:]
         self.root = ET.fromstring(head)
         order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
         self.order = order
@@ -122,11 +122,11 @@ class _Decoder:
 
 def _base64_run(text: bytes) -> bytes:
     """The leading run of base64 characters: appended arrays follow each other without a gap."""
-    found = re.match(rb"[A-Za-z0-9+/]*={0,2}", text)
-    return found.group() if found else b""
+    run = re.match(rb"[A-Za-z0-9+/]*={0,2}", text)
+    return run.group() if run else b""
 
 
-def read_vtp(path: Path) -> PolyData:
+def read_vtp(path: Path) -> SurfaceFile:
     """Read a ``.vtp`` file of triangles.
 
     Raises
@@ -149,7 +149,7 @@ def read_vtp(path: Path) -> PolyData:
         raise InputError(f"{path}: damaged or no VTK XML file: {fault}") from fault
 
 
-def _piece(decoder: _Decoder, piece: ET.Element) -> PolyData:
+def _piece(decoder: _Decoder, piece: ET.Element) -> SurfaceFile:
     for kind in ("Verts", "Lines", "Strips"):
         if int(piece.get(f"NumberOf{kind}", "0")):
             raise InputError(f"holds {kind.lower()}; expected triangles only")
@@ -164,8 +164,8 @@ def _piece(decoder: _Decoder, piece: ET.Element) -> PolyData:
             f"polygon {int(np.flatnonzero(sizes != 3)[0])} has {int(sizes[sizes != 3][0])} "
             f"corners; triangulate the surface first"
         )
-    return PolyData(
-        points=decoder.array(points_node).astype(np.float64).reshape(-1, 3),
+    return SurfaceFile(
+        vertices=decoder.array(points_node).astype(np.float64).reshape(-1, 3),
         triangles=parts["connectivity"].astype(np.int64).reshape(-1, 3),
         point_data=_data(decoder, piece.find("PointData")),
         cell_data=_data(decoder, piece.find("CellData")),
@@ -173,11 +173,11 @@ def _piece(decoder: _Decoder, piece: ET.Element) -> PolyData:
 
 
 def _data(decoder: _Decoder, node: ET.Element | None) -> dict[str, NDArray[np.generic]]:
-    found = [] if node is None else node.findall("DataArray")
-    return {entry.attrib["Name"]: decoder.array(entry) for entry in found}
+    arrays = [] if node is None else node.findall("DataArray")
+    return {array.attrib["Name"]: decoder.array(array) for array in arrays}
 
 
-def write_vtp(path: Path, data: PolyData) -> None:
+def write_vtp(path: Path, data: SurfaceFile) -> None:
     """Write triangles and their data as a ``.vtp`` file (inline base64, zlib)."""
     root = ET.Element(
         "VTKFile",
@@ -191,7 +191,7 @@ def write_vtp(path: Path, data: PolyData) -> None:
     piece = ET.SubElement(
         ET.SubElement(root, "PolyData"),
         "Piece",
-        NumberOfPoints=str(len(data.points)),
+        NumberOfPoints=str(len(data.vertices)),
         NumberOfVerts="0",
         NumberOfLines="0",
         NumberOfStrips="0",
@@ -200,7 +200,7 @@ def write_vtp(path: Path, data: PolyData) -> None:
     for name, arrays in (
         ("PointData", data.point_data),
         ("CellData", data.cell_data),
-        ("Points", {"Points": data.points}),
+        ("Points", {"Points": data.vertices}),
         (
             "Polys",
             {"connectivity": data.triangles.ravel(), "offsets": 3 * np.arange(1, count + 1)},

@@ -23,7 +23,7 @@ from mvest.valve.measure.passing_ball import largest_passing_ball
 
 __all__ = ["MeasuredLeaflets", "clinical_meaning", "clinical_measurements", "clinical_names"]
 
-Found: TypeAlias = dict[str, float | None]
+Numbers: TypeAlias = dict[str, float | None]
 
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "ratio": ""}
 """By the last part of a measurement's name."""
@@ -159,20 +159,20 @@ def clinical_measurements(
         plane = annulus_plane(annulus, tips.mean(axis=0), near.mean(axis=0))
     except MvestError:
         return {}
-    found: Found = {}
+    numbers: Numbers = {}
     shape = (vertices, surface, annulus, plane)
     for measure in (_annulus, _annulus_in_space, _tenting, _prolapse):
-        found |= _tried(measure, *shape)
+        numbers |= _tried(measure, *shape)
     pair = len(surface.region_names) == 2
     if pair:
-        found |= _tried(_closure(contact_distance), *shape)
-        found |= _tried(_ball, *shape) if passing_ball else {}
+        numbers |= _tried(_closure(contact_distance), *shape)
+        numbers |= _tried(_ball, *shape) if passing_ball else {}
     for number, name in enumerate(surface.region_names):
         triangles = surface.triangles[surface.region == number]
-        found[f"{name}_area_mm2"] = surface_area(vertices, triangles)
+        numbers[f"{name}_area_mm2"] = surface_area(vertices, triangles)
         if pair:
-            found[f"{name}_length_mm"] = leaflet_length(vertices, triangles, plane)
-    return found | _tips(tips, annulus, plane, tip_names)
+            numbers[f"{name}_length_mm"] = leaflet_length(vertices, triangles, plane)
+    return numbers | _tips(tips, annulus, plane, tip_names)
 
 
 class Measure(Protocol):
@@ -185,7 +185,7 @@ class Measure(Protocol):
         annulus: FloatArray,
         plane: AnnulusPlane,
         /,
-    ) -> Found: ...
+    ) -> Numbers: ...
 
 
 def _tried(
@@ -194,7 +194,7 @@ def _tried(
     surface: MeasuredLeaflets,
     annulus: FloatArray,
     plane: AnnulusPlane,
-) -> Found:
+) -> Numbers:
     """Measurements, or none where the shape defies them."""
     try:
         return measure(vertices, surface, annulus, plane)
@@ -204,7 +204,7 @@ def _tried(
 
 def _annulus(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Found:
+) -> Numbers:
     size = measure_annulus(annulus, plane)
     return {
         "ap_diameter_mm": size.anteroposterior_diameter,
@@ -219,20 +219,20 @@ def _annulus(
 
 def _annulus_in_space(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Found:
+) -> Numbers:
     return {"annulus_area_3d_mm2": spanning_surface(annulus, plane).area}
 
 
 def _tenting(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Found:
+) -> Numbers:
     tenting = measure_tenting(vertices, surface.triangles, annulus, plane)
     return {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
 
 
 def _prolapse(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Found:
+) -> Numbers:
     above = measure_prolapse(
         vertices, surface.triangles, annulus, plane, spanning_surface(annulus, plane)
     )
@@ -247,7 +247,7 @@ def _prolapse(
 def _closure(contact_distance: float) -> Measure:
     def measure(
         vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-    ) -> Found:
+    ) -> Numbers:
         triangles, region = surface.triangles, np.asarray(surface.region)
         pair = triangles[region == 0], triangles[region == 1]
         return {
@@ -263,7 +263,7 @@ def _closure(contact_distance: float) -> Measure:
 
 def _ball(
     vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Found:
+) -> Numbers:
     ball = largest_passing_ball(
         vertices, surface.triangles, annulus, plane, thickness=surface.thickness
     )
@@ -272,15 +272,15 @@ def _ball(
 
 def _tips(
     tips: FloatArray, annulus: FloatArray, plane: AnnulusPlane, names: Sequence[str]
-) -> Found:
+) -> Numbers:
     place = measure_papillary_tips(tips, annulus, plane)
-    found: Found = {
+    numbers: Numbers = {
         "tip_depth_mm": float(place.depth.mean()),
         "tip_annulus_distance_mm": float(place.annulus_distance.mean()),
     }
     if len(tips) == 2:
-        found["tip_separation_mm"] = float(place.separation[0, 1])
+        numbers["tip_separation_mm"] = float(place.separation[0, 1])
     for k, name in enumerate(names):
-        found[f"{name}_depth_mm"] = float(place.depth[k])
-        found[f"{name}_annulus_distance_mm"] = float(place.annulus_distance[k])
-    return found
+        numbers[f"{name}_depth_mm"] = float(place.depth[k])
+        numbers[f"{name}_annulus_distance_mm"] = float(place.annulus_distance[k])
+    return numbers

@@ -58,10 +58,10 @@ def _near_distances(
     for t in range(triangles.shape[0]):
         a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
         for k in range(3):
-            least = (min(a[k], b[k], c[k]) - origin[k]) / step
-            most = (max(a[k], b[k], c[k]) - origin[k]) / step
-            low[k] = max(int(np.floor(least)) - 1, 0)
-            high[k] = min(int(np.ceil(most)) + 1, distance.shape[k] - 1)
+            first = (min(a[k], b[k], c[k]) - origin[k]) / step
+            last = (max(a[k], b[k], c[k]) - origin[k]) / step
+            low[k] = max(int(np.floor(first)) - 1, 0)
+            high[k] = min(int(np.ceil(last)) + 1, distance.shape[k] - 1)
         for i in range(low[0], high[0] + 1):
             x[0] = origin[0] + i * step
             for j in range(low[1], high[1] + 1):

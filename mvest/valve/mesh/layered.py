@@ -28,7 +28,7 @@ __all__ = ["LayeredMesh", "layered_wedges"]
 
 LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
 """Node levels that one layer of each element adds."""
-LEAST_AREA_RATIO = 0.5
+MIN_AREA_RATIO = 0.5
 """Smallest accepted ratio of least to greatest area factor in a six-node triangle. [choice]"""
 
 
@@ -200,7 +200,7 @@ def _pull_back(
         normal = np.cross(tangent[..., 0], tangent[..., 1])
         mean = _unit(normal.mean(axis=1))
         area = np.einsum("mqi,mi->mq", normal, mean)
-        bad = area.min(axis=1) < LEAST_AREA_RATIO * area.max(axis=1)
+        bad = area.min(axis=1) < MIN_AREA_RATIO * area.max(axis=1)
         edges = np.unique(sheet[bad, 3:] - len(vertices))
         if not edges.size:
             break

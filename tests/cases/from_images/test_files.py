@@ -10,7 +10,7 @@ from mvest.errors import InputError
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.markups import read_markups
-from mvest.valve.io.surface_files import read_surface
+from mvest.valve.io.leaflet_surfaces import read_surface
 from tests import made_up_sequence
 
 SMALL = ValveLayout(32, 9)

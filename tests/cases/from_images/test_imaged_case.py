@@ -21,7 +21,7 @@ from mvest.cases.from_images import (
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.valve.anatomy.template import Template
 from tests.cases.folders import closing
 from tests.cases.test_folder import assert_equal

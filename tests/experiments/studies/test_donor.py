@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from experiments.common.config import register
 from experiments.run import main
 from experiments.studies.donor.study import build_donor
-from mvest.valve.io.donor_file import CITATION, DATA_VARIABLE
+from mvest.valve.io.donor.arrays import CITATION, DATA_VARIABLE
 from mvest.valve.mesh.embedding import embed
 from tests.places import ROOT
 

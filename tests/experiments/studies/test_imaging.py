@@ -23,8 +23,8 @@ from experiments.studies.imaging.report import publish_imaging
 from experiments.studies.imaging.store import ImagingStore, StoredSamples
 from experiments.studies.imaging.trials import KINDS, Trial
 from mvest.errors import ConfigurationError, InputError
-from mvest.imaging.detection import model as detection_model
-from mvest.imaging.detection.model import STAGES, default_model, load_model
+from mvest.imaging.detection import trained_model as detection_model
+from mvest.imaging.detection.trained_model import STAGES, default_model, load_model
 from mvest.imaging.simulator import SMALL
 from tests.places import CONF
 
@@ -283,7 +283,7 @@ def test_keys_follow_what_they_are_of():
 
 def test_the_modules_that_train_are_those_of_imaging_but_some():
     every, some = imaging_store.imaging_source(()), imaging_store.imaging_source(("reading",))
-    assert "imaging/detection/training.py" in some
+    assert "imaging/learning/training.py" in some
     assert "imaging/simulator/scene.py" in some
     assert {name for name in every if name not in some} == {
         name for name in every if name.startswith("imaging/reading/")
@@ -367,7 +367,7 @@ def test_errors_are_told_of_valves_that_were_found_only():
     right = held_out.found("calibration", 0.5, 5.0)
     assert right.stacked("calibration", "errors").max() == 1.0
     assert len(held_out.found("calibration", 0.5).sequences["calibration"]) == 2
-    config = {"imaging": {"detection": {"least_confidence": 0.5}, "held_out": {"wrong_mm": 5.0}}}
+    config = {"imaging": {"detection": {"min_confidence": 0.5}, "held_out": {"wrong_mm": 5.0}}}
     with pytest.raises(InputError, match="in 1 of 3 volumes the valve was found"):
         imaging._calibrated(config, held_out)
 

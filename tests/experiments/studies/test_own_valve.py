@@ -20,7 +20,7 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.valve.anatomy.template import Template, TemplateParameters
-from mvest.valve.io.surface_files import write_surface
+from mvest.valve.io.leaflet_surfaces import write_surface
 from mvest.valve.mesh.structured import structured_mesh
 
 REGIONS = ("anterior", "posterior")

@@ -14,8 +14,8 @@ from experiments.run import main
 from mvest.cases.folder import read_case
 from mvest.cases.from_images import valve_axes
 from mvest.errors import InputError
-from mvest.imaging.detection.model import Accuracy
 from mvest.imaging.detection.tracking import NoValveError
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.imaging.writing import write_sequence_nrrd
@@ -38,7 +38,7 @@ def volume(tmp_path):
 def run(tmp_path, monkeypatch, capsys, volume):
     """Run the one command: exit status, standard output and error; what detectors were told."""
     rng = np.random.default_rng(2)
-    accuracy = Accuracy(
+    accuracy = DetectionAccuracy(
         np.full(LAYOUT.size, 0.5),
         9.0,
         0.05 * rng.standard_normal((20, 2, LAYOUT.size, 3)),
@@ -215,7 +215,7 @@ def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypa
     asked = []
 
     def detect(volume, model, settings, *, landmarks=None, progress=None):
-        asked.append(settings.least_confidence)
+        asked.append(settings.min_confidence)
         return sequence()
 
     monkeypatch.setattr("experiments.common.cases.volume.detect_valve", detect)

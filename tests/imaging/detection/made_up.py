@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.imaging.detection.detect import FitSettings
-from mvest.imaging.detection.model import STAGES, DetectionModel
 from mvest.imaging.detection.pose import Poses
+from mvest.imaging.detection.trained_model import STAGES, DetectionModel
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.truth import TrueValve

@@ -8,7 +8,6 @@ import pytest
 from mvest.imaging.detection import position, tracking
 from mvest.imaging.detection.detect import search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
-from mvest.imaging.detection.model import Accuracy
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import PoseSearch
 from mvest.imaging.detection.position import PositionDetector
@@ -17,6 +16,7 @@ from mvest.imaging.detection.tracking import (
     TrackingSettings,
     detect_valve,
 )
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence
 from tests.imaging.detection.made_up import (
@@ -91,7 +91,9 @@ def test_the_valve_is_found_in_every_frame(shape, truths):
 
 def test_what_was_measured_of_a_model_goes_with_the_sequence(shape, truths):
     n = LAYOUT.size
-    accuracy = Accuracy(np.linspace(1, 2, n), 7.5, np.zeros((1, 2, n, 3)), np.zeros((1, 2, 2, 3)))
+    accuracy = DetectionAccuracy(
+        np.linspace(1, 2, n), 7.5, np.zeros((1, 2, n, 3)), np.zeros((1, 2, 2, 3))
+    )
     found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy), TOLD)
     np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
     assert found.correlation_length_mm == 7.5
@@ -116,7 +118,7 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     assert "0.0" in message
     assert "\n" not in message
     detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05),
-                 replace(TOLD, least_confidence=0.01))  # fmt: skip
+                 replace(TOLD, min_confidence=0.01))  # fmt: skip
 
 
 # --- by hand ------------------------------------------------------------------------------------
@@ -198,7 +200,7 @@ def test_landmarks_by_hand_lead_where_the_search_goes_astray(shape, truths):
     assert np.linalg.norm(led.centre - expected, axis=1).max() < 3.0
     by_hand = {k: dict(zip(LANDMARKS, points[k], strict=True)) for k in range(4)}
     found = detect_valve(
-        volume(), model, replace(UNSMOOTHED, least_confidence=0.0),
+        volume(), model, replace(UNSMOOTHED, min_confidence=0.0),
         landmarks=by_hand,
     )  # fmt: skip
     np.testing.assert_allclose(found.tips, np.stack([t.tips for t in truths]), atol=1e-9)

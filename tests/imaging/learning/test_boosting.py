@@ -9,7 +9,7 @@ import pytest
 from mvest.errors import InputError
 from mvest.imaging.learning.boosting import Boosters, BoostSettings, train_boosters
 
-SMALL = BoostSettings(trees=12, leaves=5, rate=0.3, least=4, share_features=0.8)
+SMALL = BoostSettings(trees=12, leaves=5, rate=0.3, min_leaf_samples=4, share_features=0.8)
 
 
 def samples(count=120, outputs=2):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection.frame import StandardFrame
-from mvest.imaging.learning.sampling import Pattern, directions, features
+from mvest.imaging.learning.sampling import SamplePattern, directions, features
 from tests.imaging.detection.made_up import poses
 from tests.imaging.reading.volumes import MIRRORED, ROTATION
 
@@ -54,7 +54,7 @@ def test_a_ramp_is_read_at_turned_and_scaled_offsets(direction, level):
     some = poses(6, 1, 1.0)
     points = middle(direction) + some.centre
     offsets = np.random.default_rng(0).uniform(-4, 4, (12, 3))
-    pattern = Pattern(offsets, np.full(12, level), NO_PAIRS)
+    pattern = SamplePattern(offsets, np.full(12, level), NO_PAIRS)
     at = points[:, None] + np.einsum("pij,fj->pfi", some.axes, offsets)
     # A byte is rounded to within 0.5.
     np.testing.assert_allclose(features(frame, pattern, points, some.axes), value(at), atol=0.51)
@@ -68,14 +68,14 @@ def test_levels_of_one_pattern_are_not_mixed_up():
     for level in levels:
         points.append(ORIGIN + ROTATION @ (SPACING * ((centre + 0.5) * 2**level - 0.5)))
     for point, level in zip(points, levels, strict=True):
-        pattern = Pattern(np.zeros((3, 3)), np.array(levels), NO_PAIRS)
+        pattern = SamplePattern(np.zeros((3, 3)), np.array(levels), NO_PAIRS)
         found = features(frame, pattern, point[None], np.eye(3)[None])[0]
         assert found[level] == pytest.approx(frame.level(level)[3, 4, 5], abs=1e-3)
 
 
 def test_pairs_are_differences_of_first_minus_second():
     frame, _ = ramp(ROTATION)
-    pattern = Pattern(
+    pattern = SamplePattern(
         np.array([[0.0, 0, 0], [3.0, 0, 0], [0, 3.0, 0]]), np.zeros(3, np.int64),
         np.array([[0, 1], [2, 1]]),
     )  # fmt: skip
@@ -89,7 +89,7 @@ def test_pairs_are_differences_of_first_minus_second():
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_outside_the_volume_features_are_zero(level):
     frame = frame_of(np.full(SHAPE, 200.0))
-    pattern = Pattern(np.zeros((1, 3)), np.array([level]), NO_PAIRS)
+    pattern = SamplePattern(np.zeros((1, 3)), np.array([level]), NO_PAIRS)
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * np.array(SHAPE) - 0.5
     inwards = np.sign(np.array(SHAPE) / 2 - corners)
     for axis in range(3):
@@ -112,7 +112,7 @@ def test_a_side_of_a_single_voxel_is_read_within_its_bounds():
         np.eye(3),
         np.zeros(3),
     )
-    pattern = Pattern(np.zeros((1, 3)), np.array([0]), NO_PAIRS)
+    pattern = SamplePattern(np.zeros((1, 3)), np.array([0]), NO_PAIRS)
     places = np.array([[1.2, 1.7, 0.0], [3.0, 3.0, 0.3], [3.4, 3.4, -0.4]])
     found = features(frame, pattern, places, np.tile(np.eye(3), (3, 1, 1)))
     np.testing.assert_allclose(found[:, 0], 100, atol=1e-3)
@@ -121,21 +121,21 @@ def test_a_side_of_a_single_voxel_is_read_within_its_bounds():
 def test_places_that_are_no_numbers_are_outside():
     # A comparison with NaN is false, so "outside" has to be asked the right way round.
     frame = frame_of(np.full(SHAPE, 200.0))
-    pattern = Pattern(np.zeros((1, 3)), np.array([0]), NO_PAIRS)
+    pattern = SamplePattern(np.zeros((1, 3)), np.array([0]), NO_PAIRS)
     found = features(frame, pattern, np.full((1, 3), np.nan), np.eye(3)[None])
     assert found[0, 0] == 0
 
 
 def test_no_hypotheses_give_no_features():
     frame, _ = ramp(ROTATION)
-    pattern = Pattern.paired(np.ones((4, 3)) * np.arange(4)[:, None], np.zeros(4, int), 3, 0)
+    pattern = SamplePattern.paired(np.ones((4, 3)) * np.arange(4)[:, None], np.zeros(4, int), 3, 0)
     assert features(frame, pattern, np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0, 7)
 
 
 def test_pairs_are_of_two_samples_and_rather_near_ones():
     rng = np.random.default_rng(2)
     offsets = rng.standard_normal((60, 3)) * 8
-    pattern = Pattern.paired(offsets, np.zeros(60, np.int64), 400, 5)
+    pattern = SamplePattern.paired(offsets, np.zeros(60, np.int64), 400, 5)
     first, second = pattern.pairs.T
     assert np.all(first != second)
     assert pattern.pairs.min() >= 0
@@ -144,7 +144,7 @@ def test_pairs_are_of_two_samples_and_rather_near_ones():
     every = np.linalg.norm(offsets[:, None] - offsets, axis=2)[~np.eye(60, dtype=bool)]
     assert gap.mean() < 0.9 * every.mean()
     np.testing.assert_array_equal(
-        pattern.pairs, Pattern.paired(offsets, pattern.levels, 400, 5).pairs
+        pattern.pairs, SamplePattern.paired(offsets, pattern.levels, 400, 5).pairs
     )
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection.detect import search_frame
-from mvest.imaging.detection.model import STAGES
 from mvest.imaging.detection.pose_search import PoseSearch
+from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.learning import training
 from mvest.imaging.learning.training import (
     Draft,

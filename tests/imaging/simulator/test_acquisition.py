@@ -6,7 +6,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.simulator import SMALL, Acquisition, draw_acquisition
-from mvest.imaging.simulator.spread import SHIFTED, TRAINING, Range, Spread
+from mvest.imaging.simulator.acquisition_ranges import SHIFTED, TRAINING, AcquisitionRanges, Range
 
 # Echo strengths and compensation may be those of training in both.
 BOTH = {"wall_db", "chord_db", "papillary_db", "vessel_db", "compensation_db_per_cm_mhz"}
@@ -83,6 +83,6 @@ def test_unknown_spreads_and_settings_are_refused():
 
 
 def test_a_draw_that_makes_no_sense_is_refused_not_clipped():
-    nonsense = Spread("nonsense", (Range("dropout", "plus", ((-1.0, -0.9),)),))
+    nonsense = AcquisitionRanges("nonsense", (Range("dropout", "plus", ((-1.0, -0.9),)),))
     with pytest.raises(InputError, match="dropout"):
         draw_acquisition(np.random.default_rng(0), SMALL, nonsense)

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
-from mvest.valve.anatomy.variation import MOST_REFUSED, draw_variation, vary
+from mvest.valve.anatomy.variation import MAX_REFUSED, draw_variation, vary
 from mvest.valve.mesh.structured import structured_mesh
 
 DEFAULT = TemplateParameters()
@@ -107,5 +107,5 @@ def test_a_scale_that_leaves_no_valve_or_none_at_all_is_refused():
         with pytest.raises(InputError, match=f"scale of a variation = {scale}"):
             vary(DEFAULT, np.random.default_rng(0), scale)
     hopeless = replace(DEFAULT, length_anterior=3.0)
-    with pytest.raises(InputError, match=f"{MOST_REFUSED} shapes in a row"):
+    with pytest.raises(InputError, match=f"{MAX_REFUSED} shapes in a row"):
         vary(hopeless, np.random.default_rng(0))

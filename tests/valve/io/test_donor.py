@@ -7,13 +7,13 @@ import pytest
 
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.chord_network import trace_cables
-from mvest.valve.io.donor import (
+from mvest.valve.io.donor.arrays import CITATION, DATA_VARIABLE, REGION_NAMES, donor_file
+from mvest.valve.io.donor.recording import (
     OGDEN_CHORDAE,
     PRESSURE_MPA,
     chord_axial_stiffness,
     read_donor,
 )
-from mvest.valve.io.donor_file import CITATION, DATA_VARIABLE, REGION_NAMES, donor_file
 from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import remesh
 from tests.places import ROOT

@@ -7,14 +7,14 @@ from mvest.elements import ELEMENTS, FACES
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
-from mvest.valve.io.solid_files import VTK_ORDER, read_solid, vtk_cells, write_solid
-from mvest.valve.io.surface_files import (
+from mvest.valve.io.leaflet_surfaces import (
     read_leaflets,
     read_surface,
     write_leaflets,
     write_series,
     write_surface,
 )
+from mvest.valve.io.solid_meshes import VTK_ORDER, read_solid, vtk_cells, write_solid
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 

@@ -55,9 +55,9 @@ class ValveSequence:
             ("vertex_confidence", (t, n)),
             ("std_mm", (n,)),
         ):
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise InputError(f"valve sequence {name}: shape {found}, expected {shape}")
+            given = np.shape(getattr(self, name))
+            if given != shape:
+                raise InputError(f"valve sequence {name}: shape {given}, expected {shape}")
         if t < 1 or not (np.isfinite(self.times).all() and np.all(np.diff(self.times) > 0)):
             raise InputError(f"valve sequence times {self.times} s, expected increasing ones")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mvest.elements import FACES, element
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.io.surface_files import (
+from mvest.valve.io.leaflet_surfaces import (
     cell_arrays,
     read_mesh,
     region_arrays,

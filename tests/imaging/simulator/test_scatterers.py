@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mvest.imaging.simulator.tissue import Cord, Material, Sheet
+from mvest.imaging.simulator.scatterers import Cord, Material, TissueSheet
 
 MATERIAL = Material("tissue", 0.0)
 TURN = Rotation.from_euler("xyz", [20, 50, -70], degrees=True).as_matrix()
@@ -10,7 +10,7 @@ SHIFT = np.array([3.0, -2.0, 7.0])
 FAR = np.array([0.0, 0.0, 1000.0])
 
 
-def tube(radius: float = 20.0, length: float = 30.0, thickness: float = 2.0) -> Sheet:
+def tube(radius: float = 20.0, length: float = 30.0, thickness: float = 2.0) -> TissueSheet:
     """A cylinder about z, in a second frame turned and moved."""
     angle = 2 * np.pi * np.arange(90) / 90
     z = np.linspace(0, -length, 11)
@@ -19,7 +19,7 @@ def tube(radius: float = 20.0, length: float = 30.0, thickness: float = 2.0) -> 
     points[0, ..., 2] = z[:, None]
     points[1] = points[0] @ TURN.T + SHIFT
     flat = np.full((11, 90), thickness)
-    return Sheet(MATERIAL, points, flat, (0.0, 1.0), np.ones_like(flat), fade=2.0)
+    return TissueSheet(MATERIAL, points, flat, (0.0, 1.0), np.ones_like(flat), fade=2.0)
 
 
 def ring() -> Cord:
@@ -35,7 +35,7 @@ def test_scatterers_move_with_the_tissue(part):
     first, _ = part.place(0, seeds, FAR)
     second, _ = part.place(1, seeds, FAR)
     # The ring's reference direction stays in space: along its axis, turned ones stay on it.
-    if isinstance(part, Sheet):
+    if isinstance(part, TissueSheet):
         np.testing.assert_allclose(second, first @ TURN.T + SHIFT, atol=1e-9)
     else:
         back = (second - SHIFT) @ TURN

@@ -16,8 +16,8 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surfaces import FACE_KINDS, ClosedSurface, thicken
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.tetrahedra import outer_faces, promote_to_tet10, tri6_faces
-from mvest.valve.mesh.tetrahedralize import TetrahedralMesh, TetwildSettings, tetrahedralize
+from mvest.valve.mesh.tetrahedral.cells import outer_faces, promote_to_tet10, tri6_faces
+from mvest.valve.mesh.tetrahedral.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
 
 __all__ = ["label_tetrahedra", "tetrahedral_leaflets"]
 
@@ -39,7 +39,7 @@ def tetrahedral_leaflets(
     surface
         Midsurface with thickness.
     settings, store
-        See `mvest.valve.mesh.tetrahedralize.tetrahedralize`.
+        See `mvest.valve.mesh.tetrahedral.tetwild.tetrahedralize`.
     element_type
         ``"tet10"`` or ``"tet4"``.
     normals
@@ -119,10 +119,10 @@ def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> I
 def _check_pressure_area(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> None:
     ventricular = closed.triangles[closed.kind == FACE_KINDS.index("ventricular")]
     wanted = np.linalg.norm(_face_normals(closed.vertices, ventricular), axis=1).sum()
-    found = np.linalg.norm(_face_normals(nodes, faces), axis=1).sum()
-    if abs(found - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
+    area = np.linalg.norm(_face_normals(nodes, faces), axis=1).sum()
+    if abs(area - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
         raise MeshingError(
-            f"pressure faces cover {found:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
+            f"pressure faces cover {area:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
             f"side; give a shorter edge_length"
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["Cord", "Material", "Part", "Sheet", "normals"]
+__all__ = ["Cord", "Material", "TissuePart", "TissueSheet", "normals"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Material:
     fineness: float = 1.0
 
 
-class Part(Protocol):
+class TissuePart(Protocol):
     """A piece of tissue that scatterers can be sown into."""
 
     @property
@@ -78,7 +78,7 @@ def normals(points: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sheet:
+class TissueSheet:
     """A layer over a grid of moving points, closed along its columns.
 
     Attributes

@@ -10,7 +10,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition
 
-__all__ = ["SHIFTED", "TRAINING", "Range", "Spread", "draw_acquisition"]
+__all__ = ["SHIFTED", "TRAINING", "AcquisitionRanges", "Range", "draw_acquisition"]
 
 Interval: TypeAlias = tuple[float, float]
 
@@ -46,7 +46,7 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class AcquisitionRanges:
     """Ranges of settings, drawn independently of each other.
 
     Attributes
@@ -63,7 +63,7 @@ def _range(setting: str, how: Literal["times", "plus"], *intervals: Interval) ->
     return Range(setting, how, intervals)
 
 
-TRAINING = Spread(
+TRAINING = AcquisitionRanges(
     "training",
     (
         _range("frequency_mhz", "times", (0.8, 1.2)),
@@ -95,7 +95,7 @@ TRAINING = Spread(
 )
 """What detectors are trained on; widths of ranges are a choice."""
 
-SHIFTED = Spread(
+SHIFTED = AcquisitionRanges(
     "shifted",
     (
         _range("frequency_mhz", "times", (0.65, 0.75), (1.25, 1.4)),
@@ -132,7 +132,7 @@ from that of training, and mostly on the worse side."""
 def draw_acquisition(
     rng: np.random.Generator,
     base: Acquisition | None = None,
-    spread: Spread | Literal["training", "shifted"] = "training",
+    spread: AcquisitionRanges | Literal["training", "shifted"] = "training",
 ) -> Acquisition:
     """An acquisition drawn about a base; the result records every value.
 
@@ -141,7 +141,7 @@ def draw_acquisition(
     rng : numpy Generator
     base : Acquisition, optional
         The default one if none is given.
-    spread : Spread or its name
+    spread : AcquisitionRanges or its name
         What is drawn, and from where.
 
     Raises

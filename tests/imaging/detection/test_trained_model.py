@@ -10,7 +10,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.detection.detect import fit_frame, search_frame
-from mvest.imaging.detection.model import STAGES, DetectionModel, load_model, save_model
+from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from tests.imaging.detection.made_up import FIT
 
 

@@ -30,7 +30,14 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
 from mvest.typing import FloatArray
 
-__all__ = ["MODEL_FILE", "Accuracy", "DetectionModel", "default_model", "load_model", "save_model"]
+__all__ = [
+    "MODEL_FILE",
+    "DetectionAccuracy",
+    "DetectionModel",
+    "default_model",
+    "load_model",
+    "save_model",
+]
 
 MODEL_FILE = Path(__file__).resolve().parent.parent / "models" / "tee.npz"
 """The trained model that comes with the package."""
@@ -66,12 +73,12 @@ UNREADABLE = (
 """What a file that is no model, or a damaged one, raises when it is read."""
 
 
-LONGEST_REASON = 200
+MAX_REASON = 200
 """Characters of another library's message that are passed on; some quote the file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Accuracy:
+class DetectionAccuracy:
     """How the detectors err on simulated volumes that they have not seen.
 
     Attributes
@@ -100,7 +107,7 @@ class DetectionModel:
         One for each of :data:`STAGES`.
     trained_on : mapping
         Plain values: what made it (configuration, seeds, numbers of valves and volumes, versions).
-    accuracy : Accuracy, optional
+    accuracy : DetectionAccuracy, optional
         Measured on held-out data; None for a model that was never tested.
     sha256 : str
         Of the file it was read from.
@@ -111,7 +118,7 @@ class DetectionModel:
         shape: ShapeModel,
         boosters: Mapping[str, Boosters],
         trained_on: Mapping[str, Any],
-        accuracy: Accuracy | None = None,
+        accuracy: DetectionAccuracy | None = None,
         sha256: str = "",
     ) -> None:
         missing = [name for name in STAGES if name not in boosters]
@@ -169,11 +176,11 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         for k, text in enumerate(model.boosters[name].texts):
             arrays[f"trees.{name}.{k}"] = _bytes(text)
     if model.accuracy is not None:
-        told = model.accuracy
-        arrays["accuracy.std_mm"] = told.std_mm
-        arrays["accuracy.correlation_length_mm"] = np.array(told.correlation_length_mm)
-        arrays["accuracy.samples"] = told.samples.astype(np.float32)
-        arrays["accuracy.tip_samples"] = told.tip_samples.astype(np.float32)
+        accuracy = model.accuracy
+        arrays["accuracy.std_mm"] = accuracy.std_mm
+        arrays["accuracy.correlation_length_mm"] = np.array(accuracy.correlation_length_mm)
+        arrays["accuracy.samples"] = accuracy.samples.astype(np.float32)
+        arrays["accuracy.tip_samples"] = accuracy.tip_samples.astype(np.float32)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -203,7 +210,7 @@ def load_model(path: Path | str) -> DetectionModel:
     except UNREADABLE as fault:
         if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
-        why = str(fault)[:LONGEST_REASON]
+        why = str(fault)[:MAX_REASON]
         raise InputError(f"{source}: {why}; expected a {FORMAT} of version {VERSION}") from fault
 
 
@@ -258,7 +265,7 @@ def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
     accuracy = None
     if "accuracy.std_mm" in stored.files:
         count = np.shape(stored["accuracy.samples"])[:2]
-        accuracy = Accuracy(
+        accuracy = DetectionAccuracy(
             _numbers(stored, "accuracy.std_mm", (n,)),
             float(_numbers(stored, "accuracy.correlation_length_mm", ())),
             _numbers(stored, "accuracy.samples", (*count, n, 3)),
@@ -268,10 +275,10 @@ def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
 
 
 def _numbers(stored: NpzFile, name: str, shape: tuple[int, ...]) -> FloatArray:
-    found = np.asarray(stored[name])
-    if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
-        raise ValueError(f"{name} has shape {found.shape}, or is not finite; expected {shape}")
-    return np.asarray(found, dtype=np.float64)
+    values = np.asarray(stored[name])
+    if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
+        raise ValueError(f"{name} has shape {values.shape}, or is not finite; expected {shape}")
+    return np.asarray(values, dtype=np.float64)
 
 
 def _bytes(text: str) -> NDArray[np.uint8]:

@@ -1,7 +1,7 @@
 """Run fTetWild on one surface, in a process of its own: it may crash without a Python exception.
 
-Started by `mvest.valve.mesh.tetrahedralize` as ``python _tetwild_worker.py INPUT.npz OUTPUT.npz``,
-in a temporary folder because fTetWild writes files of its own into the current one.
+Started by `mvest.valve.mesh.tetrahedral.tetwild` as ``_tetwild_worker.py INPUT.npz OUTPUT.npz``, in
+a temporary folder because fTetWild writes files of its own into the current one.
 """
 
 import sys

@@ -24,11 +24,11 @@ SPACING_MM = (0.05, 5.0)
 """Between neighbouring voxels; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
 EXTENT_MM = (20.0, 500.0)
 """Of the volume along each axis: from an annulus to a whole chest."""
-FEWEST_VOXELS = 16
+MIN_VOXELS = 16
 """Along each axis."""
-LARGEST_BYTES = 4 * 2**30
+MAX_BYTES = 4 * 2**30
 """Of all frames, decoded."""
-LARGEST_OFFSET_MM = 1e4
+MAX_OFFSET_MM = 1e4
 """Of the origin from the world's zero."""
 ORTHOGONAL = 1e-3
 """Largest cosine between axes, which files give with three digits or more."""
@@ -46,22 +46,22 @@ def check_size(path: Path, field: str, shape: Sequence[int], itemsize: int) -> N
     itemsize
         Bytes per voxel.
     """
-    found = " x ".join(str(n) for n in shape)
+    counted = " x ".join(str(n) for n in shape)
     if shape[0] < 1:
-        raise fault(path, field, f"{found} frames and voxels", "at least one frame")
-    if min(shape[1:]) < FEWEST_VOXELS:
+        raise fault(path, field, f"{counted} frames and voxels", "at least one frame")
+    if min(shape[1:]) < MIN_VOXELS:
         raise fault(
-            path, field, f"{found} frames and voxels", f"at least {FEWEST_VOXELS} along each axis"
+            path, field, f"{counted} frames and voxels", f"at least {MIN_VOXELS} along each axis"
         )
     total = itemsize
     for n in shape:
         total *= int(n)
-    if total > LARGEST_BYTES:
+    if total > MAX_BYTES:
         raise fault(
             path,
             field,
-            f"{found} frames and voxels of {itemsize} bytes, together {total / 2**30:.1f} GiB",
-            f"at most {LARGEST_BYTES / 2**30:.0f} GiB",
+            f"{counted} frames and voxels of {itemsize} bytes, together {total / 2**30:.1f} GiB",
+            f"at most {MAX_BYTES / 2**30:.0f} GiB",
         )
 
 
@@ -85,12 +85,12 @@ def checked_sequence(
     spacing, direction = _axes(path, names, stated.steps)
     _check_extent(path, names, spacing, stated.frames.shape[1:])
     origin = np.asarray(stated.origin, dtype=np.float64)
-    if not np.isfinite(origin).all() or np.abs(origin).max() > LARGEST_OFFSET_MM:
+    if not np.isfinite(origin).all() or np.abs(origin).max() > MAX_OFFSET_MM:
         raise fault(
             path,
             names.origin,
             _numbers(origin),
-            f"coordinates in mm, none beyond {LARGEST_OFFSET_MM:g}",
+            f"coordinates in mm, none beyond {MAX_OFFSET_MM:g}",
         )
     times = times_in_seconds(path, stated.times, len(stated.frames), frame_interval_s, time_unit)
     kind = _modality(path, stated.modality, modality)

@@ -41,8 +41,8 @@ _FILE = "healthy.npz"
 _ORIGIN = (
     "The donor valve is not part of this package. Download Texas TriValve 1.1 "
     f"({CITATION}), extract its healthy case to {_FILE} (arrays listed in "
-    "mvest/valve/io/donor_file.py) and name the folder as data_dir or in the environment variable "
-    f"{DATA_VARIABLE}"
+    "mvest/valve/io/donor/arrays.py) and name the folder as data_dir or in the environment "
+    f"variable {DATA_VARIABLE}"
 )
 
 

@@ -27,7 +27,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
 from mvest.valve.mesh.quality import QualityReport, mesh_quality
-from mvest.valve.mesh.tetrahedra import (
+from mvest.valve.mesh.tetrahedral.cells import (
     content_sha256,
     drop_unused_nodes,
     orient,

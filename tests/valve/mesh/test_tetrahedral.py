@@ -4,9 +4,9 @@ import pytest
 from mvest.elements import element
 from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.mesh import tetrahedralize as module
 from mvest.valve.mesh.quality import mesh_quality
-from mvest.valve.mesh.tetrahedra import (
+from mvest.valve.mesh.tetrahedral import tetwild as module
+from mvest.valve.mesh.tetrahedral.cells import (
     content_sha256,
     orient,
     outer_faces,
@@ -14,8 +14,8 @@ from mvest.valve.mesh.tetrahedra import (
     tri6_faces,
     volumes,
 )
-from mvest.valve.mesh.tetrahedral_leaflets import label_tetrahedra, tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedralize import TetwildSettings, tetrahedralize
+from mvest.valve.mesh.tetrahedral.leaflets import label_tetrahedra, tetrahedral_leaflets
+from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings, tetrahedralize
 
 COARSE = TetwildSettings(edge_length=1.0, envelope=0.01)
 

@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.sequence import ValveSequence
+from mvest.imaging.valve_sequence import ValveSequence
 
 LAYOUT = ValveLayout(8, 3)
 

@@ -1,19 +1,26 @@
-"""Segmentations that 3D Slicer reads (``.seg.nrrd``)."""
+"""Sequences and segmentations as 3D Slicer reads them (``.seq.nrrd``, ``.seg.nrrd``)."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import nrrd
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.errors import InputError
+from mvest.files import write_atomically
+from mvest.imaging.reading.nrrd_file import MODALITY_KEY
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.files import checked_path, write_nrrd
 from mvest.typing import IntArray
 
-__all__ = ["write_segmentation"]
+__all__ = ["checked_path", "write_segmentation", "write_sequence_nrrd"]
+
+TYPES = ("uint8", "int16", "float32")
+
 
 COLOURS = (
     (0.9, 0.4, 0.3),
@@ -24,6 +31,59 @@ COLOURS = (
     (0.5, 0.5, 0.5),
 )
 """Red, green and blue, in turn."""
+
+
+def checked_path(path: Path | str, suffix: str) -> Path:
+    """The path, which must end in `suffix`."""
+    target = Path(path)
+    if not target.name.endswith(suffix) or target.name == suffix:
+        raise InputError(f"{target}: name {target.name!r}, expected one that ends in {suffix}")
+    return target
+
+
+def write_sequence_nrrd(
+    path: Path | str, sequence: VolumeSequence, *, compressed: bool = True
+) -> Path:
+    """Write a volume over time with its times, evenly spaced or not, and its modality.
+
+    The axis of frames comes first, as all versions of Slicer read it; times are s. `read_volume`
+    gives the same sequence back, its source and hash aside.
+
+    Parameters
+    ----------
+    path
+        Ends in ``.seq.nrrd``.
+    sequence
+        Of uint8, int16 or float32.
+    compressed
+        With gzip; quick rather than small.
+
+    Raises
+    ------
+    InputError
+        Another name or type, or a file that cannot be written.
+    """
+    target = checked_path(path, ".seq.nrrd")
+    if sequence.frames.dtype.name not in TYPES:
+        raise InputError(
+            f"{target}: frames of type {sequence.frames.dtype}, expected {', '.join(TYPES)}"
+        )
+    steps = (sequence.direction * sequence.spacing).T
+    header: dict[str, Any] = {
+        "space": "left-posterior-superior",
+        "space directions": np.vstack([np.full(3, np.nan), steps]),
+        "space origin": np.asarray(sequence.origin, dtype=np.float64),
+        "kinds": ["list", "domain", "domain", "domain"],
+        "labels": ["time", "", "", ""],
+        "units": ["s", "", "", ""],
+        "encoding": "gzip" if compressed else "raw",
+        "DataNodeClassName": "vtkMRMLScalarVolumeNode",
+        "axis 0 index type": "numeric",
+        "axis 0 index values": " ".join(repr(float(time)) for time in sequence.times),
+        MODALITY_KEY: sequence.modality.value,
+    }
+    _write_nrrd(target, sequence.frames, header)
+    return target
 
 
 def write_segmentation(
@@ -56,10 +116,10 @@ def write_segmentation(
         raise InputError(
             f"{target}: labels {labels.dtype} of shape {labels.shape}, expected integers {expected}"
         )
-    found = {int(label) for label in np.unique(labels)} - {0}
-    if not names or min(names) < 1 or max(names) > 255 or not found <= set(names):
+    used = {int(label) for label in np.unique(labels)} - {0}
+    if not names or min(names) < 1 or max(names) > 255 or not used <= set(names):
         raise InputError(
-            f"{target}: labels {sorted(found)} and names of {sorted(names)}, expected a name for "
+            f"{target}: labels {sorted(used)} and names of {sorted(names)}, expected a name for "
             "every label from 1 to 255"
         )
     header: dict[str, Any] = {
@@ -87,7 +147,7 @@ def write_segmentation(
             prefix + "Layer": "0",
             prefix + "Extent": " ".join(map(str, _extent(labels == label))),
         }
-    write_nrrd(target, labels.astype(np.uint8), header)
+    _write_nrrd(target, labels.astype(np.uint8), header)
     return target
 
 
@@ -107,3 +167,22 @@ def _extent(mask: np.ndarray) -> list[int]:
         occupied = np.flatnonzero(mask.any(axis=others))
         result += [int(occupied[0]), int(occupied[-1])]
     return result
+
+
+def _write_nrrd(path: Path, data: NDArray[np.generic], header: Mapping[str, Any]) -> None:
+    """Write an array, first axis fastest, with pynrrd: the same bytes for the same content.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    content = io.BytesIO()
+    nrrd.write(content, data, dict(header), compression_level=1)
+    content.seek(0)
+    lines: list[bytes] = []
+    while (line := content.readline()) != b"\n":
+        # pynrrd's comments hold the time of writing.
+        if not line.startswith(b"#"):
+            lines.append(line)
+    write_atomically(path, b"".join([*lines, b"\n", content.read()]))

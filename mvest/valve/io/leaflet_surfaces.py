@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.io.vtp import PolyData, read_vtp, write_vtp
+from mvest.valve.io.vtp import SurfaceFile, read_vtp, write_vtp
 
 __all__ = [
     "SurfaceFile",
@@ -59,26 +58,6 @@ _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.p
 REGION_PREFIX = "region."
 BINARY_PLY = " (properties of faces are read from text files only: write an ascii PLY, or VTP)"
 """What meshio's reader of binary PLY files does not do."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SurfaceFile:
-    """A triangulated surface as it stands in a file.
-
-    Attributes
-    ----------
-    vertices
-        ``(n, 3)`` mm.
-    triangles
-        ``(m, 3)``.
-    point_data, cell_data
-        Named arrays with n or m rows; empty for STL and OBJ.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
-    point_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
-    cell_data: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
 
 def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
@@ -129,8 +108,7 @@ def read_surface(path: Path | str) -> SurfaceFile:
     """
     source = _input_path(path, SURFACE_SUFFIXES)
     if source.suffix.lower() == ".vtp":
-        found = read_vtp(source)
-        surface = SurfaceFile(found.points, found.triangles, found.point_data, found.cell_data)
+        surface = read_vtp(source)
         bad = np.flatnonzero(~np.isfinite(surface.vertices).all(axis=1))
         if len(bad):
             raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
@@ -202,7 +180,7 @@ def write_surface(
         mesh = meshio.Mesh(points, [("triangle", faces.astype(np.int32))])
         write_atomically(target, lambda file: _WRITERS[suffix](str(file), mesh))
     elif suffix == ".vtp":
-        content = PolyData(points, faces, at_points, at_cells)
+        content = SurfaceFile(points, faces, at_points, at_cells)
         write_atomically(target, lambda file: write_vtp(file, content))
     else:
         write_cells(target, points, [("triangle", faces)], at_points, cell_arrays([at_cells]))
@@ -286,11 +264,11 @@ def read_leaflets(path: Path | str) -> LeafletSurface:
         As `read_surface`, data that are missing, or an inadmissible midsurface.
     """
     source = _input_path(path, (".vtu", ".vtp"))
-    found = read_surface(source)
+    file = read_surface(source)
     for name, data in (
-        ("fibre", found.point_data),
-        ("thickness", found.point_data),
-        ("region", found.cell_data),
+        ("fibre", file.point_data),
+        ("thickness", file.point_data),
+        ("region", file.cell_data),
     ):
         if name not in data:
             kind = "cell" if name == "region" else "point"
@@ -299,12 +277,12 @@ def read_leaflets(path: Path | str) -> LeafletSurface:
             )
     try:
         return LeafletSurface(
-            vertices=found.vertices,
-            triangles=found.triangles,
-            region=found.cell_data["region"].astype(np.int64),
-            region_names=region_names(found.cell_data, source),
-            fibre=found.point_data["fibre"].astype(np.float64),
-            thickness=found.point_data["thickness"].astype(np.float64),
+            vertices=file.vertices,
+            triangles=file.triangles,
+            region=file.cell_data["region"].astype(np.int64),
+            region_names=region_names(file.cell_data, source),
+            fibre=file.point_data["fibre"].astype(np.float64),
+            thickness=file.point_data["thickness"].astype(np.float64),
         )
     except InputError as fault:
         raise type(fault)(f"{source}: {fault}") from fault
@@ -333,7 +311,7 @@ def write_series(
         ``(f, n, 3)`` mm.
     cells
         Blocks of cells in VTK's node order, such as ``[("triangle", triangles)]``; for a solid
-        mesh those of `mvest.valve.io.solid_files.vtk_cells`.
+        mesh those of `mvest.valve.io.solid_meshes.vtk_cells`.
     point_data
         Named arrays ``(f, n)`` or ``(f, n, c)``.
     cell_data

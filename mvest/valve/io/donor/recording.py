@@ -28,7 +28,7 @@ from mvest.valve.anatomy.chord_network import ChordPaths, trace_cables
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
-from mvest.valve.io.donor_file import REGION_NAMES, DonorArrays, donor_file, load_arrays
+from mvest.valve.io.donor.arrays import REGION_NAMES, DonorArrays, donor_file, load_arrays
 from mvest.valve.mesh.remesh import Remeshed
 
 __all__ = [
@@ -123,8 +123,8 @@ class DonorRecording:
 
     def locate(self, points: FloatArray) -> tuple[IntArray, FloatArray]:
         """Triangles and weights of the material points closest to ``points (k, 3)`` at rest."""
-        found = closest_points(points, self.surface.vertices, self.surface.triangles)
-        return found.triangle, found.barycentric
+        closest = closest_points(points, self.surface.vertices, self.surface.triangles)
+        return closest.triangle, closest.barycentric
 
     def valve(
         self,

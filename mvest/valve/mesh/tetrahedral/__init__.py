@@ -1,0 +1,1 @@
+"""Solid meshes of tetrahedra by fTetWild."""
