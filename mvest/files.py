@@ -32,7 +32,7 @@ def write_atomically(
         Text is written as UTF-8; a callable is given the temporary path, which ends as ``path``
         does, and makes a file or a folder there.
     sync : bool
-        Whether the file is on the disk, and not merely on its way, before it takes its name.
+        Whether all of it is on the disk, and not merely on its way, before it takes its name.
 
     Returns
     -------
@@ -52,8 +52,8 @@ def write_atomically(
                 content(part)
             else:
                 part.write_bytes(content.encode() if isinstance(content, str) else content)
-            if sync:
-                with part.open("rb+") as stream:
+            for file in _files(part) if sync else ():
+                with file.open("rb+") as stream:
                     os.fsync(stream.fileno())
             if part.is_dir() and target.is_dir():
                 shutil.rmtree(target)
@@ -73,6 +73,10 @@ def remove_parts(folder: Path, name: str = "") -> None:
     for part in folder.glob(f"{PREFIX}*"):
         if part.name.endswith(f"-{name}" if name else ""):
             _remove(part)
+
+
+def _files(part: Path) -> list[Path]:
+    return [file for file in [part, *part.rglob("*")] if file.is_file()]
 
 
 def _remove(part: Path) -> None:

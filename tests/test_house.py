@@ -20,7 +20,14 @@ from packaging.utils import canonicalize_name
 import mvest
 from tests.places import ROOT
 
-LEAVES = ("mvest.errors", "mvest.files", "mvest.units", "mvest.typing", "mvest.elements")
+LEAVES = (
+    "mvest.errors",
+    "mvest.files",
+    "mvest.kept",
+    "mvest.units",
+    "mvest.typing",
+    "mvest.elements",
+)
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
     "mvest.valve.mesh.solid_mesh",
@@ -33,6 +40,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest": (),
     "mvest.errors": LEAVES,
     "mvest.files": LEAVES,
+    "mvest.kept": LEAVES,
     "mvest.units": LEAVES,
     "mvest.typing": LEAVES,
     "mvest.elements": LEAVES,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.mirror import build
-from experiments.common.truth import StoredModel, truth_key
+from experiments.common.store import Store, StoredModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import REFERENCE, GateCase
 from mvest.errors import ConfigurationError, InputError
@@ -223,13 +223,12 @@ def build_twin(config: Values) -> Twin:
         "observed": [observation["columns"], observation["rows"]],
         "parameters": list(parameters),
     }
-    folder = Path(config["paths"]["outputs"]) / "truth"
     case = Case(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
         case,
         model,
         truth_model,
-        StoredModel(truth_model, folder, truth_key(described)),
+        Store(config["paths"]["outputs"]).model("truth", truth_model, described, MADE_BY),
         values,
         valve,
         variance,
@@ -442,3 +441,7 @@ def _numbers(name: str, value: Any) -> float | FloatArray:
     except (TypeError, ValueError):
         raise ConfigurationError(f"{name} = {value!r}, expected a number or numbers") from None
     return float(numbers) if numbers.ndim == 0 else numbers
+
+
+MADE_BY = (closure_model, truth_mechanics, truth_mesh)
+"""What makes the closures of a configured valve."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.common.build import closure_model
 from experiments.common.mirror import build
-from experiments.common.truth import StoredModel, truth_key
+from experiments.common.store import Store, StoredModel
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.closure.cycle.protocol import CycleProtocol
@@ -71,7 +70,7 @@ def _finite(value: float) -> float | None:
 
 def stored_cycle(config: Values, model: CycleModel) -> StoredModel:
     """A model of ``config`` whose runs are kept, so that a study goes on where it was stopped."""
-    return StoredModel(model, _store(config), _key(config, model), jacobian=True)
+    return _stored(config, model, model, jacobian=True)
 
 
 def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArray:
@@ -81,7 +80,7 @@ def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArra
         y = model.frames(values).ravel()
         return Prediction(y, np.zeros((len(y), len(values))))
 
-    found = StoredModel(positions, _store(config), _key(config, model))(m)
+    found = _stored(config, model, positions)(m)
     return found.y.reshape(len(model.protocol.times), -1, 3)
 
 
@@ -146,15 +145,12 @@ def shift_by_check_mesh(
     return MeshShift(shift, float(np.linalg.norm(off.reshape(-1, 3), axis=1).mean()))
 
 
-def _store(config: Values) -> Path:
-    return Path(config["paths"]["outputs"]) / "cycles"
-
-
-def _key(config: Values, model: CycleModel) -> str:
+def _stored(
+    config: Values, model: CycleModel, predict: ObservationModel, *, jacobian: bool = False
+) -> StoredModel:
     parts = ("valve", "mechanics", "mesh", "parameters", "fixed")
     described = {name: config[name] for name in parts}
     observed = [config["observation"][name] for name in ("columns", "rows")]
-    return truth_key(
-        {**described, "observed": observed, "protocol": repr(model.protocol)},
-        more=("closure/cycle",),
-    )
+    described |= {"observed": observed, "protocol": repr(model.protocol)}
+    store = Store(config["paths"]["outputs"])
+    return store.model("cycles", predict, described, (cycle_model,), jacobian=jacobian)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_deg
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import Log, to_filter
-from mvest.files import write_atomically
+from mvest.kept import Entry
 from mvest.observation.vertices import observed_frames
 from mvest.typing import FloatArray
 
@@ -201,6 +201,10 @@ class FittedSurrogate:
     largest_mm: float
 
 
+_Run = tuple[FloatArray, FloatArray]
+"""Prediction and its derivatives by the logarithms' N(0, I); empty if it failed."""
+
+
 def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurrogate:
     """A polynomial over the prior out to ``reach`` standard deviations.
 
@@ -212,8 +216,8 @@ def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurro
     sobol = qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
     # The first of Sobol's points are a design by themselves; the further ones lie between them.
     points = region.points(2.0 * sobol.random_base2((wanted - 1).bit_length())[:wanted] - 1.0)
-    _run_all(problem, points, store)
-    kept = {k: run for k in range(wanted) if (run := _read(store, k))[0].size}
+    runs = enumerate(_run_all(problem, points, store))
+    kept = {k: run for k, run in runs if run[0].size}
     number = np.array(sorted(kept), dtype=np.int64)
     at, fitted = points[number], int(np.sum(number < count))
     if fitted < 3 * p or len(number) == fitted:
@@ -233,27 +237,34 @@ def fit_to_prior(problem: Problem, settings: Values, store: Path) -> FittedSurro
     )
 
 
-def _run_all(problem: Problem, points: FloatArray, store: Path) -> None:
-    """Run the model at points of the logarithms' prior, N(0, I), that are not in the store.
+def _run_all(problem: Problem, points: FloatArray, store: Path) -> list[_Run]:
+    """Runs of the model at points of the logarithms' prior, N(0, I); those of the store are read.
 
     They are run from neighbour to neighbour, since a closure goes on from the one before.
     """
-    store.mkdir(parents=True, exist_ok=True)
     log_prior = problem.log_prior
-    left = {k for k in range(len(points)) if not (store / f"{k}.npz").is_file()}
+    entries = [Entry(store / f"{k}.npz", _read) for k in range(len(points))]
+    found = [entry.found() for entry in entries]
+    left = {k for k, run in enumerate(found) if run is None}
     at = np.zeros(points.shape[1])
+
+    def run() -> _Run:
+        m = np.exp(log_prior.mean + log_prior.std * at)
+        prediction = problem.model(m)
+        scale = m * log_prior.std if prediction.converged else 1.0
+        return prediction.y, prediction.jacobian * scale
+
+    def write(path: Path, run: _Run) -> None:
+        np.savez(path, y=run[0], by_x=run[1])
+
     while left:
         k = min(left, key=lambda i: float(np.linalg.norm(points[i] - at)))
         left.remove(k)
         at = points[k]
-        m = np.exp(log_prior.mean + log_prior.std * at)
-        prediction = problem.model(m)
-        scale = m * log_prior.std if prediction.converged else 1.0
-        write = partial(np.savez, y=prediction.y, by_x=prediction.jacobian * scale)
-        write_atomically(store / f"{k}.npz", write)
+        found[k] = entries[k].get_or_make(run, write)
+    return [run for run in found if run is not None]
 
 
-def _read(store: Path, number: int) -> tuple[FloatArray, FloatArray]:
-    """Prediction of a stored run and its derivatives; empty if it failed."""
-    with np.load(store / f"{number}.npz", allow_pickle=False) as stored:
+def _read(path: Path) -> _Run:
+    with np.load(path, allow_pickle=False) as stored:
         return stored["y"], stored["by_x"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import skew
 
-from experiments.common.build import filter_of
+from experiments.common.build import MADE_BY, filter_of
 from experiments.common.mirror import build
-from experiments.common.truth import truth_key
+from experiments.common.store import Store
 from experiments.studies.filters.problem import (
     TRANSFORM,
     FittedSurrogate,
@@ -31,6 +31,7 @@ from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import log_posterior
 from mvest.estimation.filters.sampler import SamplerSettings, draw
 from mvest.estimation.noise import observation_noise
+from mvest.kept import Entry
 from mvest.provenance import provenance, write_json
 from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
@@ -59,7 +60,7 @@ def run_filter_study(
     return record, save_figure(folder / "filters", filters_figure(record), record)
 
 
-def _store(config: Values, name: str, part: str, decisive: Any) -> Path:
+def _entry(config: Values, name: str, part: str, decisive: Any, made_by: tuple[Any, ...]) -> _Kept:
     """Where a part of what is computed of a problem is kept: under a key of all that decides it."""
     described = {k: config[k] for k in ("valve", "mesh", "mechanics", "fixed", "seed")}
     problem = config["filters"]["problems"][name]
@@ -67,17 +68,15 @@ def _store(config: Values, name: str, part: str, decisive: Any) -> Path:
     without = (*words, "truth", "noise_mm") if part == "runs" else words
     described["problem"] = {k: v for k, v in problem.items() if k not in without}
     described["decisive"] = decisive
-    key = truth_key(described, () if part == "runs" else ("estimation",))
-    return Path(config["paths"]["outputs"]) / "filter_store" / f"{name}_{part}_{key[:16]}"
+    store = Store(config["paths"]["outputs"])
+    return store.entry("filter_store", described, made_by, _read, f"{name}_{part}_{{key}}.json")
 
 
-def _kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What was made before, or is made and kept now."""
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, make())
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+_Kept = Entry[dict[str, Any]]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _solve(config: Values, name: str) -> dict[str, Any]:
@@ -91,16 +90,18 @@ def _solve(config: Values, name: str) -> dict[str, Any]:
     }
     found = {}
     for method, filter_ in filters.items():
-        path = _store(config, name, method, methods[method]).with_suffix(".json")
-        found[method] = _kept(path, partial(_estimate, problem, filter_, config["seed"]))
+        entry = _entry(config, name, method, methods[method], (_estimate, build_problem, filter_of))
+        make = partial(_estimate, problem, filter_, config["seed"])
+        found[method] = entry.get_or_make(make, write_json)
         row = found[method]
         _say(f"{name}, {method}: {row['forward_solves']} runs, {row['seconds']:.0f} s")
     design = {k: v for k, v in settings["design"].items() if k != "degree"}
-    fitted = fit_to_prior(problem, settings["design"], _store(config, name, "runs", design))
+    runs = _entry(config, name, "runs", design, (fit_to_prior, *MADE_BY)).path.with_suffix("")
+    fitted = fit_to_prior(problem, settings["design"], runs)
     decisive = {k: settings[k] for k in ("methods", "design", "repeats", "sampler")}
-    repeats = _kept(
-        _store(config, name, "repeats", decisive).with_suffix(".json"),
-        lambda: _repeats(problem, fitted, filters, settings, config["seed"]),
+    entry = _entry(config, name, "repeats", decisive, (_repeats, build_problem, fit_to_prior))
+    repeats = entry.get_or_make(
+        lambda: _repeats(problem, fitted, filters, settings, config["seed"]), write_json
     )
     described = settings["problems"][name]
     log_prior = problem.log_prior

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock
 
 from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.mirror import build
-from experiments.common.truth import truth_key
+from experiments.common.store import Store
 from mvest.cases.case import ValveCase
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError, GeometryError, InputError, cannot_write
+from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
-from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.probe import Probe, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing.slicer import write_sequence_nrrd
 from mvest.provenance import write_json
 from mvest.simulation.motion.closing import MotionSettings
@@ -38,18 +37,6 @@ from mvest.valve.anatomy.variation import vary
 __all__ = ["ImagedPlace", "make_imaged_patient", "run_imaged_patient", "volume_rows"]
 
 Values = Mapping[str, Any]
-
-MADE_BY = (
-    "simulation/virtual_patient.py",
-    "problem/registration.py",
-    "cases",
-    "imaged_case",
-    "simulation/motion",
-    "imaging/simulator",
-    "imaging/moving_valve.py",
-    "imaging/layout.py",
-)
-"""Modules that decide what an imaged patient is, besides the forward model."""
 
 VOLUME, KNOWN, TRUTH, HIDDEN = "volume.seq.nrrd", "known", "truth", "hidden.json"
 MOST_DRAWS = 10
@@ -70,6 +57,11 @@ class ImagedPlace:
 
     volume: Path
     hidden: Path
+
+    @classmethod
+    def within(cls, root: Path) -> ImagedPlace:
+        """The places in the folder of a patient."""
+        return cls(root / VOLUME, root / "hidden")
 
     @property
     def known(self) -> Path:
@@ -180,15 +172,18 @@ def make_imaged_patient(config: Values) -> ImagedPlace:
         "uncertainty": KNOWN_UNCERTAINTY,
         "seed": config["seed"],
     }
-    root = Path(config["paths"]["outputs"]) / "virtual" / truth_key(described, MADE_BY)[:16]
-    place = ImagedPlace(root / VOLUME, root / "hidden")
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(root, error) from error
-    with FileLock(root / ".lock"):
-        if not (place.truth / HIDDEN).is_file():
-            _simulate(config, described, place)
+    store = Store(config["paths"]["outputs"])
+    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+
+    def write(root: Path, made: _Made) -> None:
+        _write(ImagedPlace.within(root), made, patient, described)
+
+    return entry.get_or_make(lambda: _simulate(config), write)
+
+
+def _place(root: Path) -> ImagedPlace:
+    place = ImagedPlace.within(root)
+    json.loads((place.truth / HIDDEN).read_text(encoding="utf-8"))
     return place
 
 
@@ -196,7 +191,11 @@ KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
 """What the case of the true positions states: about what the image step does."""
 
 
-def _simulate(config: Values, described: Values, place: ImagedPlace) -> None:
+_Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
+"""A patient, how it was imaged, and how many anatomies were drawn for it."""
+
+
+def _simulate(config: Values) -> _Made:
     patient, echo = config["patient"], config["echo"]
     rng = np.random.default_rng(config["seed"])
     moduli = {
@@ -207,15 +206,16 @@ def _simulate(config: Values, described: Values, place: ImagedPlace) -> None:
     made, draws = _drawn(config, values, rng)
     acquisition = draw_acquisition(rng, spread=echo["spread"])
     probe = draw_probe(rng, acquisition)
-    volume = simulate_volume(made.valve, acquisition, probe, config["seed"])
-    # What an interrupted run left.
-    shutil.rmtree(place.hidden, ignore_errors=True)
+    return made, probe, simulate_volume(made.valve, acquisition, probe, config["seed"]), draws
+
+
+def _write(place: ImagedPlace, found: _Made, patient: Values, described: Values) -> None:
+    made, probe, volume, draws = found
     place.truth.mkdir(parents=True)
     # The source of what is simulated names the patient; a file has its name alone.
     write_sequence_nrrd(place.volume, volume)
     frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
     write_case(place.known, _known_case(true_sequence(made.valve, probe), frames, patient))
-    # Written last: where it is, the patient is whole.
     write_json(
         place.truth / HIDDEN,
         {

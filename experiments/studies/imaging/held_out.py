@@ -23,9 +23,9 @@ from experiments.studies.imaging.trials import (
     try_sequence,
     try_volume,
 )
-from mvest.files import write_atomically
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.moving_valve import MovingValve
+from mvest.kept import get_or_make
 from mvest.typing import FloatArray
 
 __all__ = ["HeldOut", "hold_out"]
@@ -117,32 +117,37 @@ def _volumes(
     settings: TrackingSettings,
 ) -> dict[int, list[dict[str, Any]]]:
     """Rows of single frames, by the number of volumes that detectors were trained on."""
-    population = store.population_key("test")
-    jobs = []
-    for trial, sizes in asked:
-        places = {
-            size: store.kept("volumes", _described(trial, population, store, size, settings))
-            for size in sizes
-        }
-        jobs.append((trial, places))
-    left = [(trial, _missing(places)) for trial, places in jobs if _missing(places)]
+    described = partial(_described, population=store.population_key("test"), store=store)
+    jobs = [(trial, size) for trial, sizes in asked for size in sizes]
+    entries = [
+        store.store.entry(
+            "volumes", described(trial, size=size, settings=settings), (try_volume,), _read
+        )
+        for trial, size in jobs
+    ]
 
-    def calls() -> Iterator[tuple[Any, ...]]:
-        for trial, places in left:
-            models = {str(size): store.model_file(size) for size in places}
-            yield valves[trial.number % len(valves)], trial, models, settings
+    def make(missing: list[int]) -> Iterator[dict[str, Any]]:
+        left: dict[Trial, list[int]] = {}
+        for trial, size in (jobs[k] for k in missing):
+            left.setdefault(trial, []).append(size)
+        calls = (
+            (
+                valves[trial.number % len(valves)],
+                trial,
+                {str(size): store.model_file(size) for size in sizes},
+                settings,
+            )
+            for trial, sizes in left.items()
+        )
+        with PartBar("held-out volumes", len(left), "volume") as bar:
+            done = in_processes(try_volume, calls, store.processes)
+            for sizes, (found, _) in zip(left.values(), done, strict=True):
+                yield from ({"row": json.dumps(found[str(size)])} for size in sizes)
+                bar.step()
 
-    with PartBar("held-out volumes", len(left), "volume") as bar:
-        done = in_processes(try_volume, calls(), store.processes)
-        for (_, places), (found, _) in zip(left, done, strict=True):
-            for size, place in places.items():
-                row = np.array(json.dumps(found[str(size)]))
-                write_atomically(place, partial(np.savez, row=row))
-            bar.step()
     rows: dict[int, list[dict[str, Any]]] = {}
-    for _, places in jobs:
-        for size, place in places.items():
-            rows.setdefault(size, []).append(_read(place)[0])
+    for (_, size), (row, _) in zip(jobs, get_or_make(entries, make, _write), strict=True):
+        rows.setdefault(size, []).append(row)
     return rows
 
 
@@ -156,23 +161,28 @@ def _sequences(
     """Rows and arrays of sequences."""
     population, size = store.population_key(which), store.training.volumes
     closed = store.population_settings.motion.frames - 1
-    places = {
-        trial: store.kept("sequences", _described(trial, population, store, size, settings))
+    entries = [
+        store.store.entry(
+            "sequences",
+            _described(trial, population, store, size, settings),
+            (try_sequence,),
+            _read,
+        )
         for trial in trials
-    }
-    left = _missing(places)
-    title = trials[0].kind if trials else "sequences"
-    if left:
+    ]
+
+    def make(missing: list[int]) -> Iterator[dict[str, Any]]:
+        left = [trials[k] for k in missing]
         calls = (
             (valves[t.number % len(valves)], t, closed, store.model_file(size), settings)
             for t in left
         )
-        with PartBar(f"volumes over time, {title}", len(left), "volume") as bar:
-            done = in_processes(try_sequence, calls, store.processes)
-            for place, (found, _) in zip(left.values(), done, strict=True):
-                write_atomically(place, partial(np.savez, **found))
+        with PartBar(f"volumes over time, {left[0].kind}", len(left), "volume") as bar:
+            for found, _ in in_processes(try_sequence, calls, store.processes):
+                yield found
                 bar.step()
-    return [_read(place) for place in places.values()]
+
+    return get_or_make(entries, make, _write)
 
 
 def _described(
@@ -186,8 +196,8 @@ def _described(
     }
 
 
-def _missing(places: Mapping[Any, Path]) -> dict[Any, Path]:
-    return {key: place for key, place in places.items() if not place.is_file()}
+def _write(place: Path, arrays: Mapping[str, Any]) -> None:
+    np.savez(place, **arrays)
 
 
 def _read(place: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:

@@ -9,26 +9,21 @@ from __future__ import annotations
 import json
 import resource
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from filelock import FileLock
 from joblib.externals.loky import get_reusable_executor
 from numpy.typing import NDArray
 
-import mvest
 from experiments.common.build import mechanics_of
 from experiments.common.mirror import build
 from experiments.common.progress import PartBar
-from experiments.common.truth import truth_key
+from experiments.common.store import Store, key_of
 from experiments.studies.imaging.parallel import in_processes
-from mvest.errors import cannot_write
-from mvest.files import write_atomically
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters
@@ -41,40 +36,26 @@ from mvest.imaging.learning.training import (
     volume_samples,
 )
 from mvest.imaging.moving_valve import MovingValve
+from mvest.kept import Entry, get_or_make
 from mvest.provenance import write_json
 from mvest.simulation.motion.files import load_population, save_population
 from mvest.simulation.motion.population import Population, PopulationSettings, draw_population
 from mvest.valve.anatomy.template import TemplateParameters
 
-__all__ = ["ImagingStore", "Spent", "imaging_source"]
+__all__ = ["ImagingStore", "Spent"]
 
 Values = Mapping[str, Any]
-
-DRAWN_BY = (
-    "simulation/motion",
-    "simulation/virtual_patient.py",
-    "imaging/layout.py",
-    "imaging/moving_valve.py",
-)
-"""What decides how a simulated valve moves, besides the forward model."""
+T = TypeVar("T")
 
 DRAFT = "draft.json"
 """File beside samples that says what their draft cost."""
 
-NOT_SAMPLED_BY = (
-    "reading",
-    "writing",
-    "learning/accuracy.py",
-    "detection/detect.py",
-    "learning/evaluation.py",
-    "detection/fit.py",
-    "detection/trained_model.py",
-    "detection/tracking.py",
-)
-"""What of mvest.imaging has no part in a detector's training."""
+SPENT = "spent.json"
+"""In the folder of an entry: what it cost."""
 
-NOT_DETECTED_BY = ("reading", "writing", "learning/accuracy.py")
-"""What of mvest.imaging has no part in a test of detectors."""
+VALVES, DETECTORS = "valves.npz", "detectors.npz"
+
+SAMPLED_BY = (volume_samples, draft_of, fit_shape_model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,27 +73,23 @@ class Spent:
     wall_s: float | None
 
 
-def imaging_source(without: Sequence[str]) -> list[str]:
-    """Modules of mvest.imaging but some, for the key of what they make."""
-    root = Path(mvest.__file__).parent
-    left_out = [root / "imaging" / name for name in without]
-    return [
-        str(path.relative_to(root))
-        for path in sorted((root / "imaging").rglob("*.py"))
-        if not any(path == place or place in path.parents for place in left_out)
-    ]
-
-
 class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]):
     """Samples of one volume in a file, read stage by stage.
 
     Parameters
     ----------
     path : Path
+
+    Attributes
+    ----------
+    cpu_s : float
+        CPU seconds that it took to simulate the volume and to sample it.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        with np.load(path, allow_pickle=False) as stored:
+            self.cpu_s = float(stored["cpu_s"])
 
     def __getitem__(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         with np.load(self._path, allow_pickle=False) as stored:
@@ -123,12 +100,6 @@ class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]
 
     def __len__(self) -> int:
         return len(STAGES)
-
-    @property
-    def cpu_s(self) -> float:
-        """CPU seconds that it took to simulate the volume and to sample it."""
-        with np.load(self._path, allow_pickle=False) as stored:
-            return float(stored["cpu_s"])
 
 
 class ImagingStore:
@@ -142,7 +113,7 @@ class ImagingStore:
 
     def __init__(self, config: Values) -> None:
         imaging = config["imaging"]
-        self.folder = Path(config["paths"]["outputs"]) / "detectors"
+        self.store = Store(Path(config["paths"]["outputs"]) / "detectors")
         self.processes = int(imaging["processes"])
         self.seed = int(config["seed"])
         self.training = build(TrainingSettings, imaging["training"])
@@ -155,15 +126,21 @@ class ImagingStore:
         self._shapes: ShapeModel | None = None
 
     # -- valves -----------------------------------------------------------------------------------
-    def population_key(self, which: str) -> str:
-        """Key of a population: ``train``, ``calibration`` or ``test``."""
+    def _valves(self, which: str) -> Entry[Population]:
         described = {
             "drawn": self._drawn[which],
             "bases": [[name, asdict(values)] for name, values in self.bases.items()],
             "settings": asdict(self.population_settings),
             "mechanics": asdict(self.mechanics),
         }
-        return truth_key(described, DRAWN_BY)[:16]
+        made_by = (draw_population, save_population)
+        return self.store.entry(
+            "valves", described, made_by, lambda path: load_population(path / VALVES), "{key}"
+        )
+
+    def population_key(self, which: str) -> str:
+        """Key of a population: ``train``, ``calibration`` or ``test``."""
+        return self._valves(which).path.name
 
     def population(self, which: str) -> Population:
         """A population of simulated valves.
@@ -173,33 +150,32 @@ class ImagingStore:
         MvestError
             If a valve does not close in 20 draws, or the store cannot be written.
         """
-        place = self._place("valves", f"{self.population_key(which)}.npz")
-        with self._alone(place):
-            if not place.is_file():
-                about = self._drawn[which]
-                began = _cpu_s(), time.monotonic()
-                title = f"valves to {'train on' if which == 'train' else which}"
-                with PartBar(title, about["count"], "valve") as bar:
-                    made = draw_population(
-                        about["count"],
-                        about["seed"],
-                        self.bases,
-                        self.population_settings,
-                        self.mechanics,
-                        processes=self.processes,
-                        progress=lambda _number, _valve: bar.step(),
-                    )
-                save_population(place, made)
-                if self.processes > 1:
-                    # What processes have spent is known when they have ended.
-                    get_reusable_executor().shutdown(wait=True)
-                spent = Spent(_cpu_s() - began[0], time.monotonic() - began[1])
-                write_json(place.with_suffix(".json"), asdict(spent))
-        return load_population(place)
+        about = self._drawn[which]
+
+        def draw() -> tuple[Population, Spent]:
+            began = _cpu_s(), time.monotonic()
+            title = f"valves to {'train on' if which == 'train' else which}"
+            with PartBar(title, about["count"], "valve") as bar:
+                made = draw_population(
+                    about["count"],
+                    about["seed"],
+                    self.bases,
+                    self.population_settings,
+                    self.mechanics,
+                    processes=self.processes,
+                    progress=lambda _number, _valve: bar.step(),
+                )
+            if self.processes > 1:
+                # What processes have spent is known when they have ended.
+                get_reusable_executor().shutdown(wait=True)
+            return made, Spent(_cpu_s() - began[0], time.monotonic() - began[1])
+
+        write = partial(_write_with_cost, save_population, VALVES)
+        return self._valves(which).get_or_make(draw, write)
 
     def population_spent(self, which: str) -> Spent:
         """What a population cost."""
-        return _spent(self._place("valves", f"{self.population_key(which)}.json"))
+        return _spent(self._valves(which).path / SPENT)
 
     # -- training ---------------------------------------------------------------------------------
     @property
@@ -215,7 +191,7 @@ class ImagingStore:
             "settings": settings,
             "seed": self.seed,
         }
-        return truth_key(described, imaging_source(NOT_SAMPLED_BY))[:16]
+        return key_of(described, SAMPLED_BY)
 
     def model_key(self, volumes: int) -> str:
         """Key of the detectors that are trained on the first so many volumes."""
@@ -223,7 +199,7 @@ class ImagingStore:
             "samples": self.samples_key,
             "settings": asdict(self.training) | {"volumes": volumes},
         }
-        return truth_key(described, imaging_source(NOT_SAMPLED_BY))[:16]
+        return key_of(described, (*SAMPLED_BY, train_stage, save_model))
 
     def samples(self, valves: Sequence[MovingValve], count: int) -> list[StoredSamples]:
         """Samples of the first ``count`` training volumes, simulated where they are missing."""
@@ -240,24 +216,24 @@ class ImagingStore:
         drafted: Sequence[StoredSamples] | None,
     ) -> list[StoredSamples]:
         """Samples of some volumes, with the mistakes of what is learned from those ``drafted``."""
-        folder = self._place("samples", self.samples_key)
-        folder.mkdir(parents=True, exist_ok=True)
-        places = {number: folder / f"{number:05d}.npz" for number in numbers}
-        with self._alone(folder):
-            missing = [number for number, place in places.items() if not place.is_file()]
-            if missing:
-                shape = self.shapes(valves)
-                draft = self._draft(drafted, folder) if drafted else None
-                calls = (
-                    (valves[k % len(valves)], k, shape, self.training, self.seed, draft)
-                    for k in missing
-                )
-                with PartBar("training volumes", len(missing), "volume") as bar:
-                    found = in_processes(volume_samples, calls, self.processes)
-                    for number, (samples, cpu_s) in zip(missing, found, strict=True):
-                        _write_samples(places[number], samples, cpu_s)
-                        bar.step()
-        return [StoredSamples(place) for place in places.values()]
+        folder = self.store.folder / "samples" / self.samples_key
+        entries = [
+            Entry(folder / f"{k:05d}.npz", StoredSamples, counts=self.store.counts) for k in numbers
+        ]
+
+        def make(missing: list[int]) -> Iterator[tuple[Samples, float]]:
+            shape = self.shapes(valves)
+            draft = self._draft(drafted, folder) if drafted else None
+            calls = (
+                (valves[k % len(valves)], k, shape, self.training, self.seed, draft)
+                for k in (numbers[at] for at in missing)
+            )
+            with PartBar("training volumes", len(missing), "volume") as bar:
+                for found in in_processes(volume_samples, calls, self.processes):
+                    yield found
+                    bar.step()
+
+        return get_or_make(entries, make, _write_samples)
 
     def _draft(self, drafted: Sequence[StoredSamples], folder: Path) -> Draft:
         with PartBar("draft of the search", 1, "search") as bar:
@@ -272,7 +248,7 @@ class ImagingStore:
         """What the draft cost whose mistakes were learned from; nothing where there was none."""
         if self.training.volumes <= self.training.draft_volumes:
             return Spent(0.0, 0.0)
-        return _spent(self._place("samples", self.samples_key) / DRAFT)
+        return _spent(self.store.folder / "samples" / self.samples_key / DRAFT)
 
     def shapes(self, valves: Sequence[MovingValve]) -> ShapeModel:
         """The shape model of all training valves."""
@@ -290,59 +266,48 @@ class ImagingStore:
         MvestError
             If there is nothing to train on, or the store cannot be written.
         """
-        place = self.model_file(volumes)
-        with self._alone(place):
-            if not place.is_file():
-                samples = self.samples(valves, volumes)
-                began, cpu_s = time.monotonic(), 0.0
-                boosters: dict[str, Boosters] = {}
-                calls = (
-                    (
-                        name,
-                        np.concatenate([part[name][0] for part in samples]),
-                        np.concatenate([part[name][1] for part in samples]),
-                        self.training,
-                        self.seed,
-                    )
-                    for name in STAGES
+
+        def train() -> tuple[DetectionModel, Spent]:
+            samples = self.samples(valves, volumes)
+            began, cpu_s = time.monotonic(), 0.0
+            boosters: dict[str, Boosters] = {}
+            calls = (
+                (
+                    name,
+                    np.concatenate([part[name][0] for part in samples]),
+                    np.concatenate([part[name][1] for part in samples]),
+                    self.training,
+                    self.seed,
                 )
-                with PartBar(f"detectors from {volumes} volumes", len(STAGES), "stage") as bar:
-                    grown = in_processes(train_stage, calls, self.processes)
-                    for name, (trees, seconds) in zip(STAGES, grown, strict=True):
-                        boosters[name], cpu_s = trees, cpu_s + seconds
-                        bar.step()
-                save_model(place, DetectionModel(self.shapes(valves), boosters, trained_on))
-                spent = Spent(cpu_s, time.monotonic() - began)
-                write_json(place.with_suffix(".json"), asdict(spent))
-        return load_model(place), place
+                for name in STAGES
+            )
+            with PartBar(f"detectors from {volumes} volumes", len(STAGES), "stage") as bar:
+                grown = in_processes(train_stage, calls, self.processes)
+                for name, (trees, seconds) in zip(STAGES, grown, strict=True):
+                    boosters[name], cpu_s = trees, cpu_s + seconds
+                    bar.step()
+            made = DetectionModel(self.shapes(valves), boosters, trained_on)
+            return made, Spent(cpu_s, time.monotonic() - began)
+
+        file = self.model_file(volumes)
+        entry = Entry(file.parent, lambda _: load_model(file), counts=self.store.counts)
+        return entry.get_or_make(train, partial(_write_with_cost, save_model, DETECTORS)), file
 
     def model_file(self, volumes: int) -> Path:
         """Where detectors are that were trained on so many volumes."""
-        return self._place("models", f"{self.model_key(volumes)}.npz")
+        return self.store.folder / "models" / self.model_key(volumes) / DETECTORS
 
     def model_spent(self, volumes: int) -> Spent:
         """What growing the trees cost, the volumes apart."""
-        return _spent(self.model_file(volumes).with_suffix(".json"))
+        return _spent(self.model_file(volumes).with_name(SPENT))
 
-    # -- tests ------------------------------------------------------------------------------------
-    def kept(self, kind: str, described: Values) -> Path:
-        """Where the result of a trial lies: by what is tried on what, and by the code for it."""
-        key = truth_key(dict(described), imaging_source(NOT_DETECTED_BY))[:24]
-        return self._place(kind, f"{key}.npz")
 
-    # -- files ------------------------------------------------------------------------------------
-    def _place(self, part: str, name: str) -> Path:
-        try:
-            (self.folder / part).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise cannot_write(self.folder / part, error) from error
-        return self.folder / part / name
-
-    @contextmanager
-    def _alone(self, place: Path) -> Iterator[None]:
-        """Of several processes that need the same part, the first makes it and the others wait."""
-        with FileLock(place.with_name(f".{place.name}.lock")):
-            yield
+def _write_with_cost(
+    write: Callable[[Path, T], object], name: str, folder: Path, made: tuple[T, Spent]
+) -> None:
+    folder.mkdir()
+    write(folder / name, made[0])
+    write_json(folder / SPENT, asdict(made[1]))
 
 
 def _cpu_s() -> float:
@@ -351,11 +316,12 @@ def _cpu_s() -> float:
     return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
-def _write_samples(path: Path, samples: Samples, cpu_s: float) -> None:
+def _write_samples(path: Path, found: tuple[Samples, float]) -> None:
+    samples, cpu_s = found
     arrays: dict[str, Any] = {"cpu_s": np.array(cpu_s)}
     for name, (x, y) in samples.items():
         arrays |= {f"{name}.x": x, f"{name}.y": y}
-    write_atomically(path, partial(np.savez, **arrays))
+    np.savez(path, **arrays)
 
 
 def _spent(path: Path) -> Spent:

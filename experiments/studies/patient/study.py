@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock
 
 from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.record import of_all_unknowns
 from experiments.common.mirror import build
-from experiments.common.truth import truth_key
+from experiments.common.store import Store
 from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError, GeometryError, InputError, cannot_write
+from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
 from mvest.reporting.case.report import write_case_report
 from mvest.simulation.virtual_patient import (
     Deviations,
-    Hidden,
     Simulation,
+    VirtualPatient,
     draw_hidden,
     simulate_patient,
 )
@@ -36,14 +34,6 @@ from mvest.valve.anatomy.variation import vary
 __all__ = ["PatientPlace", "make_patient", "reveal", "run_patient"]
 
 Values = Mapping[str, Any]
-
-MADE_BY = (
-    "simulation/virtual_patient.py",
-    "problem/registration.py",
-    "observation/errors.py",
-    "cases",
-)
-"""Modules that decide what a virtual patient is, besides the forward model."""
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"
 MOST_DRAWS = 5
@@ -102,19 +92,23 @@ def make_patient(config: Values) -> PatientPlace:
         "mechanics": config["mechanics"],
         "seed": config["seed"],
     }
-    root = Path(config["paths"]["outputs"]) / "virtual" / truth_key(described, MADE_BY)[:16]
+    store = Store(config["paths"]["outputs"])
+    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+
+    def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
+        _write(root, *made, described)
+
+    return entry.get_or_make(lambda: _simulate(config), write)
+
+
+def _place(root: Path) -> PatientPlace:
     place = PatientPlace(root / "case", root / "hidden")
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(root, error) from error
-    with FileLock(root / ".lock"):
-        if not (place.hidden / HIDDEN).is_file():
-            _simulate(config, described, place)
+    json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
     return place
 
 
-def _simulate(config: Values, described: Values, place: PatientPlace) -> None:
+def _simulate(config: Values) -> tuple[VirtualPatient, int]:
+    """A patient, and how many anatomies were drawn for it."""
     patient = config["patient"]
     rng = np.random.default_rng(config["seed"])
     moduli = {
@@ -143,25 +137,18 @@ def _simulate(config: Values, described: Values, place: PatientPlace) -> None:
             if not patient["variation"] or draws == MOST_DRAWS:
                 raise
             continue
-        break
-    # What an interrupted run left.
-    shutil.rmtree(place.case, ignore_errors=True)
-    write_case(place.case, made.case)
-    _hide(place.hidden, made.hidden, described, draws)
+        return made, draws
 
 
-def _hide(folder: Path, hidden: Hidden, described: Values, draws: int) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        arrays: dict[str, Any] = dict(hidden.positions)
-        np.savez_compressed(folder / POSITIONS, **arrays)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    # Written last: where it is, the patient is whole.
-    write_json(
-        folder / HIDDEN,
-        {"values": dict(hidden.values), "made_from": dict(described), "anatomies_drawn": draws},
-    )
+def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> None:
+    folder = root / "hidden"
+    folder.mkdir(parents=True)
+    write_case(root / "case", made.case)
+    arrays: dict[str, Any] = dict(made.hidden.positions)
+    np.savez_compressed(folder / POSITIONS, **arrays)
+    values = dict(made.hidden.values)
+    about = {"values": values, "made_from": dict(described), "anatomies_drawn": draws}
+    write_json(folder / HIDDEN, about)
 
 
 def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def run_twin(
     record["repeats"] = [repeat_entry(s, r) for s, r in zip(seeds, results, strict=True)]
     record["confirmed_mm"] = confirmed
     record["seconds_computing"] = computing
-    record["truth_store"] = "hit" if twin.source.hits else "miss"
+    record["truth_store"] = "hit" if twin.source.counts.hits else "miss"
     if confirmed is not None:
         record["forward_solves"] += 1
     files: list[Path] = []

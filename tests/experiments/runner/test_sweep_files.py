@@ -127,7 +127,7 @@ def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration
     for overrides in jobs("discrepancy", "small"):
         _, config = composed("sweep=discrepancy", *overrides, *DEBUG, f"paths.outputs={tmp_path}")
         twin = build_twin(config)
-        keys[config["truth"]["label"]] = twin.source._key
+        keys[config["truth"]["label"]] = twin.source.key
         assert twin.model.settings.tissue["anterior"].reading == "A"
         assert twin.model.fixed == {}
         if config["truth"]["label"] == "Poisson reading C":

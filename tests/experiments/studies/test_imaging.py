@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 from experiments import tables
 from experiments.common.config import register
 from experiments.run import main
-from experiments.studies.imaging import store as imaging_store
 from experiments.studies.imaging import study as imaging
 from experiments.studies.imaging.held_out import HeldOut
 from experiments.studies.imaging.record import _confidences, _threshold, learning_rows, table_row
@@ -279,18 +278,6 @@ def test_keys_follow_what_they_are_of():
     assert other[1] != base[1]
     assert not set(keys("imaging.train.seed=9")) & set(base)
     assert ImagingStore(composed()).model_key(3) != base[2]
-
-
-def test_the_modules_that_train_are_those_of_imaging_but_some():
-    every, some = imaging_store.imaging_source(()), imaging_store.imaging_source(("reading",))
-    assert "imaging/learning/training.py" in some
-    assert "imaging/simulator/scene.py" in some
-    assert {name for name in every if name not in some} == {
-        name for name in every if name.startswith("imaging/reading/")
-    }
-    root = Path(imaging_store.mvest.__file__).parent
-    for name in (*imaging_store.NOT_SAMPLED_BY, *imaging_store.NOT_DETECTED_BY):
-        assert (root / "imaging" / name).exists()
 
 
 def test_samples_in_files_are_read_stage_by_stage(done: Path):

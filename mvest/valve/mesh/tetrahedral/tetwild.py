@@ -15,14 +15,12 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mvest.errors import ConfigurationError, GeometryError, MeshingError, cannot_write
-from mvest.files import write_atomically
+from mvest.errors import ConfigurationError, GeometryError, MeshingError
+from mvest.kept import Entry
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
@@ -164,17 +162,19 @@ def tetrahedralize(
     vertices = np.ascontiguousarray(vertices, dtype=np.float64)
     check_surface(vertices, triangles, closed=True, name="surface to mesh")
     triangles = np.ascontiguousarray(triangles, dtype=np.int64)
+
+    def make() -> TetrahedralMesh:
+        return _checked(*_mesh(vertices, triangles, settings), vertices, triangles, settings)
+
     if store is None:
-        nodes, tetrahedra = _mesh(vertices, triangles, settings)
-        return _checked(nodes, tetrahedra, vertices, triangles, settings)
+        return make()
+
+    def read(path: Path) -> TetrahedralMesh:
+        return _checked(*_load(path), vertices, triangles, settings)
+
     path = Path(store) / f"tetwild-{_key(vertices, triangles, settings)}.npz"
-    if path.exists():
-        nodes, tetrahedra = _load(path)
-        return _checked(nodes, tetrahedra, vertices, triangles, settings)
-    nodes, tetrahedra = _mesh(vertices, triangles, settings)
-    mesh = _checked(nodes, tetrahedra, vertices, triangles, settings)
-    _save(path, mesh)
-    return mesh
+    # Another mesh would not be the same again.
+    return Entry(path, read, remake=False).get_or_make(make, _save)
 
 
 def _key(vertices: FloatArray, triangles: IntArray, settings: TetwildSettings) -> str:
@@ -293,12 +293,7 @@ def _checked(
 
 
 def _save(path: Path, mesh: TetrahedralMesh) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(path.parent, error) from error
-    arrays: dict[str, Any] = {"nodes": mesh.nodes, "tetrahedra": mesh.tetrahedra}
-    write_atomically(path, partial(np.savez_compressed, **arrays, sha256=mesh.sha256))
+    np.savez_compressed(path, nodes=mesh.nodes, tetrahedra=mesh.tetrahedra, sha256=mesh.sha256)
 
 
 def _load(path: Path) -> tuple[FloatArray, IntArray]:

@@ -1,0 +1,150 @@
+"""What studies make on their way and share: simulations, cycles, virtual patients, samples.
+
+All of it is kept by one rule. An entry is named by what it was made from and by the code that made
+it (:mod:`experiments.common.source`), is made once, and appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from experiments.common.source import source_key
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
+from mvest.kept import Counts, Entry
+from mvest.provenance import config_hash
+from mvest.typing import FloatArray
+
+__all__ = ["Store", "StoredModel", "key_of"]
+
+T = TypeVar("T")
+
+DIGITS = 32
+"""Of a key."""
+
+
+def key_of(described: Mapping[str, Any], made_by: tuple[Any, ...]) -> str:
+    """Key of what is made from plain values by modules, functions or classes.
+
+    Raises
+    ------
+    InputError
+        If a value has no JSON form, or something is of another package.
+    """
+    return config_hash({"made_from": described, "source": source_key(*made_by)})[:DIGITS]
+
+
+class Store:
+    """Entries in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when something is kept.
+
+    Attributes
+    ----------
+    counts : Counts
+        Of all entries.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        self.counts = Counts()
+
+    def entry(
+        self,
+        kind: str,
+        described: Mapping[str, Any],
+        made_by: tuple[Any, ...],
+        read: Callable[[Path], T],
+        name: str = "{key}.npz",
+    ) -> Entry[T]:
+        """The entry of what is made from ``described`` by ``made_by``.
+
+        Parameters
+        ----------
+        kind : str
+            Folder within the store's.
+        described : mapping
+            Plain values: all that decides what is made, but the code.
+        made_by : tuple
+            Modules, functions or classes that make it and write it; what they import counts too.
+        read : callable
+            Reads a path, or refuses it.
+        name : str
+            Of the file or folder, with ``{key}``.
+        """
+        path = self.folder / kind / name.format(key=key_of(described, made_by))
+        return Entry(path, read, counts=self.counts)
+
+    def model(
+        self,
+        kind: str,
+        model: ObservationModel,
+        described: Mapping[str, Any],
+        made_by: tuple[Any, ...],
+        *,
+        jacobian: bool = False,
+    ) -> StoredModel:
+        """A model whose predictions are entries: see `entry` and :class:`StoredModel`."""
+        key = key_of(described, made_by)
+        return StoredModel(model, self.folder / kind, key, jacobian=jacobian)
+
+
+class StoredModel:
+    """A model whose converged predictions are kept on disk.
+
+    Parameters
+    ----------
+    model : ObservationModel
+    folder : Path
+    key : str
+        See :func:`key_of`; the parameters are added to it.
+    jacobian : bool
+        Whether the Jacobian is kept as well; that of a stored prediction is zero otherwise.
+
+    Attributes
+    ----------
+    key : str
+    counts : Counts
+    """
+
+    def __init__(
+        self, model: ObservationModel, folder: Path, key: str, *, jacobian: bool = False
+    ) -> None:
+        self._model, self._folder, self._jacobian = model, folder, jacobian
+        self.key = key
+        self.counts = Counts()
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """Prediction at ``m (p,)``, read from disk if it is there.
+
+        Raises
+        ------
+        InputError
+            If the store cannot be written.
+        """
+
+        def read(path: Path) -> Prediction:
+            # Opened here: NumPy leaves what it cannot read to the garbage collector.
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+                y = stored["y"]
+                jacobian = stored["jacobian"] if self._jacobian else np.zeros((len(y), len(m)))
+            return Prediction(y, jacobian)
+
+        def write(path: Path, prediction: Prediction) -> None:
+            arrays: dict[str, Any] = {"y": prediction.y}
+            if self._jacobian:
+                arrays["jacobian"] = prediction.jacobian
+            np.savez(path, **arrays)
+
+        about = {"key": self.key, "m": [float(v).hex() for v in m], "jacobian": self._jacobian}
+        path = self._folder / f"{config_hash(about)[:DIGITS]}.npz"
+        entry = Entry(path, read, counts=self.counts)
+        return entry.get_or_make(
+            lambda: predict(self._model, m), write, lambda made: made.converged
+        )

@@ -1,0 +1,149 @@
+"""What takes long to make is made once: entries of a store on disk."""
+
+from __future__ import annotations
+
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from filelock import FileLock
+
+from mvest.errors import cannot_write
+from mvest.files import remove_parts, write_atomically
+
+__all__ = ["Counts", "Entry", "get_or_make"]
+
+T = TypeVar("T")
+
+DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What readers raise of a file that a broken disk or a user has changed."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """How often an entry was read (``hits``) and made (``misses``)."""
+
+    hits: int = 0
+    misses: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[T]):
+    """A file or a folder that is there whole or not at all.
+
+    Attributes
+    ----------
+    path : Path
+        Named by all that decides what is in it.
+    read : callable
+        What lies at a path; refuses what is damaged.
+    remake : bool
+        Whether a damaged entry is made again. One that would not be the same again is refused.
+    counts : Counts
+    """
+
+    path: Path
+    read: Callable[[Path], T]
+    remake: bool = True
+    counts: Counts = field(default_factory=Counts)
+
+    def found(self) -> T | None:
+        """What is kept; None if there is nothing, or something damaged to be made again."""
+        if not self.path.exists():
+            return None
+        try:
+            return self.read(self.path)
+        except DAMAGE:
+            if not self.remake:
+                raise
+            return None
+
+    def get_or_make(
+        self,
+        make: Callable[[], Any],
+        write: Callable[[Path, Any], object],
+        keep: Callable[[Any], bool] = lambda _: True,
+    ) -> T:
+        """What is kept, or is made and kept now: see :func:`get_or_make`."""
+        return get_or_make([self], lambda _: [make()], write, keep)[0]
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Of several processes that need the entry, one is let in and the others wait."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(self.path.with_name(f".{self.path.name}.lock"))
+            lock.acquire()
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+        try:
+            yield
+        finally:
+            lock.release()
+
+
+def get_or_make(
+    entries: Sequence[Entry[T]],
+    make: Callable[[list[int]], Iterable[Any]],
+    write: Callable[[Path, Any], object],
+    keep: Callable[[Any], bool] = lambda _: True,
+) -> list[T]:
+    """What is kept in entries; those that are missing are made together.
+
+    Of several processes that need the same ones, the first makes them and the others wait.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+    make : callable
+        Values for the entries of these numbers, one after another; each is kept as it comes.
+    write : callable
+        Writes a value to a path, as a file or as a folder.
+    keep : callable
+        Whether a value is kept. One that is not is returned as it is.
+
+    Returns
+    -------
+    list
+        What was read, also of what was made now: no digit depends on who made it.
+
+    Raises
+    ------
+    InputError
+        If the store cannot be written.
+    """
+    values: list[Any] = [entry.found() for entry in entries]
+    left = [k for k, value in enumerate(values) if value is None]
+    with ExitStack() as locks:
+        # In one order, so that no two processes wait for each other.
+        for _, entry in sorted({entries[k].path: entries[k] for k in left}.items()):
+            locks.enter_context(entry.alone())
+        for k in left:
+            values[k] = entries[k].found()
+        left = [k for k in left if values[k] is None]
+        for k in left:
+            entry = entries[k]
+            remove_parts(entry.path.parent, entry.path.name)
+            if entry.path.exists():
+                print(f"note: {entry.path} is damaged and is made again", file=sys.stderr)
+        for k, value in zip(left, make(left) if left else (), strict=True):
+            entry = entries[k]
+            if keep(value):
+                write_atomically(entry.path, partial(_write, write, value), sync=True)
+                values[k] = entry.read(entry.path)
+            else:
+                values[k] = value
+            entry.counts.misses += 1
+    for k in set(range(len(entries))) - set(left):
+        entries[k].counts.hits += 1
+    return values
+
+
+def _write(write: Callable[[Path, Any], object], value: Any, part: Path) -> None:
+    write(part, value)

@@ -1,0 +1,163 @@
+"""Entries of a store: made once, whole, in the order in which they are asked for."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mvest.errors import InputError, MeshingError
+from mvest.kept import Counts, Entry, get_or_make
+
+
+def read(path: Path) -> str:
+    return (path / "text").read_text() if path.is_dir() else json.loads(path.read_text())
+
+
+def write(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value))
+
+
+def write_folder(path: Path, value: str) -> None:
+    path.mkdir()
+    (path / "text").write_text(value)
+
+
+def made(value):
+    """A function that makes a value and counts its calls."""
+
+    def make():
+        make.calls += 1
+        return value
+
+    make.calls = 0
+    return make
+
+
+@pytest.mark.parametrize("how", [write, write_folder])
+def test_what_is_kept_is_not_made_again(tmp_path, how):
+    make, counts = made("a"), Counts()
+    for _ in range(3):
+        entry = Entry(tmp_path / "below" / "entry", read, counts=counts)
+        assert entry.get_or_make(make, how) == "a"
+    assert make.calls == 1
+    assert counts == Counts(hits=2, misses=1)
+
+
+def test_who_makes_it_is_given_what_others_will_read(tmp_path):
+    entry = Entry(tmp_path / "entry", read)
+    assert entry.get_or_make(made((1, 2)), write) == [1, 2]
+
+
+def test_what_is_not_to_be_kept_is_made_again(tmp_path):
+    make, entry = made("a"), Entry(tmp_path / "entry", read)
+    for _ in range(2):
+        assert entry.get_or_make(make, write, lambda value: value != "a") == "a"
+    assert make.calls == 2
+    assert entry.found() is None
+
+
+@pytest.mark.parametrize("how", [write, write_folder])
+def test_a_damaged_entry_is_made_again_with_a_note(tmp_path, how, capsys):
+    make, entry = made("a"), Entry(tmp_path / "entry", read)
+    entry.get_or_make(make, how)
+    inner = entry.path / "text" if entry.path.is_dir() else entry.path
+    inner.write_bytes(b"\xff")
+    assert entry.found() is None
+    assert capsys.readouterr().err == ""
+    assert entry.get_or_make(make, how) == "a"
+    assert make.calls == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"note: {entry.path} is damaged and is made again"
+    if how is write_folder:
+        inner.unlink()
+        (entry.path / "rest").touch()
+        entry.get_or_make(make, how)
+        assert [path.name for path in entry.path.iterdir()] == ["text"]
+
+
+def test_what_would_not_be_the_same_again_is_refused(tmp_path):
+    def refuse(path):
+        raise MeshingError(f"{path} is damaged")
+
+    (tmp_path / "entry").touch()
+    entry = Entry(tmp_path / "entry", refuse, remake=False)
+    with pytest.raises(MeshingError, match="is damaged"):
+        entry.get_or_make(made("a"), write)
+
+
+def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
+    def interrupted(path, _value):
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    entry = Entry(tmp_path / "entry", read)
+    with pytest.raises(KeyboardInterrupt):
+        entry.get_or_make(made("a"), interrupted)
+    assert entry.get_or_make(made("a"), write) == "a"
+    (tmp_path / ".part-killed-entry").touch()
+    entry.path.unlink()
+    entry.get_or_make(made("a"), write)
+    assert {path.name for path in tmp_path.iterdir()} == {"entry", ".entry.lock"}
+
+
+def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_it_comes(tmp_path):
+    entries = [Entry(tmp_path / str(k), read) for k in range(4)]
+    write(entries[1].path, "old")
+    asked = []
+
+    def make(missing):
+        asked.append(missing)
+        for k in missing:
+            if k == 3:
+                assert entries[2].found() == 2
+                raise KeyboardInterrupt
+            yield k
+
+    with pytest.raises(KeyboardInterrupt):
+        get_or_make(entries, make, write)
+    assert get_or_make(entries, lambda missing: [10 * k for k in missing], write) == [
+        0, "old", 2, 30,
+    ]  # fmt: skip
+    assert asked == [[0, 2, 3]]
+    # With nothing to make, nothing is asked.
+    get_or_make(entries, lambda missing: pytest.fail("asked"), write)
+
+
+def test_too_few_values_are_no_silent_loss(tmp_path):
+    entries = [Entry(tmp_path / str(k), read) for k in range(2)]
+    with pytest.raises(ValueError, match="shorter"):
+        get_or_make(entries, lambda _: [1], write)
+
+
+def test_of_several_that_need_the_same_entries_one_makes_them_and_no_two_wait_for_each_other(
+    tmp_path,
+):
+    # Locks of threads exclude each other as those of processes do: each opens the file anew.
+    begun, calls = threading.Barrier(4), []
+
+    def make(missing):
+        for k in missing:
+            calls.append(k)
+            time.sleep(0.02)
+            yield k
+
+    def use(turn):
+        entries = [Entry(tmp_path / str(k), read) for k in (range(3), reversed(range(3)))[turn]]
+        begun.wait()
+        get_or_make(entries, make, write)
+
+    threads = [threading.Thread(target=use, args=(k % 2,), daemon=True) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
+    assert len(calls) == 3
+
+
+def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"^cannot write .*entry: "):
+        Entry(tmp_path / "file" / "entry", read).get_or_make(made("a"), write)
