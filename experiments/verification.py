@@ -25,7 +25,7 @@ from mvest.mechanics.law.biot import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import NewtonSettings
 from mvest.typing import FloatArray
 
-__all__ = ["CASES", "MATERIALS", "Bending", "Case", "bend", "main", "strip_table"]
+__all__ = ["CASES", "MATERIALS", "Bending", "StripMesh", "bend", "main", "strip_table"]
 
 MATERIALS = {
     "iso": TransverselyIsotropic.isotropic(2.0, 0.488),
@@ -46,7 +46,7 @@ LARGE_STEPS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class StripMesh:
     """One mesh: element, cells along length, width and thickness, graded towards the edges."""
 
     element: str
@@ -54,23 +54,23 @@ class Case:
     graded: bool = False
 
 
-REFERENCE = Case("hex27", (12, 8, 2), graded=True)
+REFERENCE = StripMesh("hex27", (12, 8, 2), graded=True)
 CASES = (
-    Case("tet4", (13, 10, 1)),
-    Case("tet10", (9, 7, 1)),
-    Case("hex18", (4, 3, 1)),
-    Case("hex18", (9, 7, 1)),
-    Case("hex18", (13, 10, 1)),
-    Case("hex27", (9, 7, 1)),
-    Case("wedge12", (9, 7, 1)),
-    Case("wedge18", (9, 7, 1)),
+    StripMesh("tet4", (13, 10, 1)),
+    StripMesh("tet10", (9, 7, 1)),
+    StripMesh("hex18", (4, 3, 1)),
+    StripMesh("hex18", (9, 7, 1)),
+    StripMesh("hex18", (13, 10, 1)),
+    StripMesh("hex27", (9, 7, 1)),
+    StripMesh("wedge12", (9, 7, 1)),
+    StripMesh("wedge18", (9, 7, 1)),
 )
 """One layer each."""
 FINE_CASES = (
-    Case("hex27", (16, 10, 3), graded=True),
-    Case("tet4", (26, 20, 2)),
-    Case("tet4", (39, 30, 4)),
-    Case("tet10", (13, 10, 2)),
+    StripMesh("hex27", (16, 10, 3), graded=True),
+    StripMesh("tet4", (26, 20, 2)),
+    StripMesh("tet4", (39, 30, 4)),
+    StripMesh("tet10", (13, 10, 2)),
 )
 """For the small load only. The first shows how far the reference has converged."""
 
@@ -106,7 +106,7 @@ class Bending:
 
 
 def bend(
-    case: Case, size: tuple[float, float, float], material: str, pressure: float, steps: int
+    case: StripMesh, size: tuple[float, float, float], material: str, pressure: float, steps: int
 ) -> Bending:
     """Bend a strip of the given size (mm) by a follower pressure (MPa) in equilibrium steps."""
     nodes, elements = box(case.element, case.cells, size)
@@ -144,12 +144,12 @@ def bend(
 
 
 def strip_table(
-    cases: Iterable[Case] = CASES,
+    cases: Iterable[StripMesh] = CASES,
     *,
     strips: Iterable[str] = STRIPS,
     materials: Iterable[str] = MATERIALS,
     loads: Iterable[str] = ("small", "large"),
-    reference: Case = REFERENCE,
+    reference: StripMesh = REFERENCE,
 ) -> pd.DataFrame:
     """Deflections of all cases over the reference's, one row per strip, material, load and case.
 
@@ -163,7 +163,7 @@ def strip_table(
     rows = []
     cases = (reference, *cases)
     for case in cases:  # compiled kernels are loaded before anything is timed
-        bend(Case(case.element, (1, 1, 1)), (1.0, 1.0, 1.0), "A", SMALL_LOAD, 1)
+        bend(StripMesh(case.element, (1, 1, 1)), (1.0, 1.0, 1.0), "A", SMALL_LOAD, 1)
     for strip in strips:
         for material in materials:
             for load in loads:

@@ -28,8 +28,8 @@ from .mechanics.settings import TissueSettings as TissueSettings
 from .personalise.chain import personalise_case as personalise_case
 from .personalise.settings import PersonaliseSettings as PersonaliseSettings
 from .personalise.settings import Unknown as Unknown
-from .problem.study import estimate as estimate
-from .problem.study import simulate_observation as simulate_observation
+from .problem.estimate import estimate as estimate
+from .problem.synthetic import simulate_observation as simulate_observation
 from .valve.anatomy.template import Template as Template
 from .valve.anatomy.template import TemplateParameters as TemplateParameters
 from .valve.anatomy.valve import Valve as Valve

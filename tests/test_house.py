@@ -226,23 +226,23 @@ def test_conf_is_data() -> None:
         ("mvest.units", "from .valve import anatomy"),
         # Joints: the model knows no images and no study, reporting knows no physics.
         ("mvest.closure.model", "from mvest.imaging import tracking"),
-        ("mvest.closure.model", "import mvest.problem.study"),
+        ("mvest.closure.model", "import mvest.problem.estimate"),
         ("mvest.valve.anatomy.template", "import mvest.closure.model"),
-        ("mvest.mechanics.law.biot", "from mvest.problem.study import Case"),
+        ("mvest.mechanics.law.biot", "from mvest.problem.problem import Problem"),
         ("mvest.reporting.figures", "from mvest.mechanics import law"),
         ("mvest.reporting.figures", "if TYPE_CHECKING:\n    import mvest.mechanics"),
         # The library knows nothing of how it is run.
-        ("mvest.problem.study", "import hydra"),
-        ("mvest.problem.study", "from omegaconf import OmegaConf"),
+        ("mvest.problem.estimate", "import hydra"),
+        ("mvest.problem.estimate", "from omegaconf import OmegaConf"),
         ("mvest.reporting.figures", "def f():\n    import mlflow.tracking"),
-        ("mvest.problem.study", "from experiments.run import main"),
-        ("mvest.problem.study", "import tests.test_house"),
+        ("mvest.problem.estimate", "from experiments.run import main"),
+        ("mvest.problem.estimate", "import tests.test_house"),
         ("experiments.run", "from tests.valve import shapes"),
         # The package's face imports lazily, nothing here imports the face, and a new station has to
         # be given its place.
         ("mvest", "from mvest.errors import MvestError"),
-        ("mvest.problem.study", "import mvest"),
-        ("mvest.problem.study", "from mvest import Gaussian"),
+        ("mvest.problem.estimate", "import mvest"),
+        ("mvest.problem.estimate", "from mvest import Gaussian"),
         ("mvest.helpers", "import math"),
     ],
 )  # fmt: skip
@@ -265,12 +265,12 @@ def test_a_wrong_import_is_seen(module: str, source: str) -> None:
         ("mvest.errors", "from mvest.typing import FloatArray"),
         ("mvest.closure.model", "from mvest import estimation, mechanics, valve"),
         (
-            "mvest.problem.study",
+            "mvest.problem.estimate",
             "from mvest import closure, estimation, mechanics, observation, valve",
         ),
-        ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.study import Case"),
+        ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.problem import Problem"),
         # A name that only begins alike is another package.
-        ("mvest.problem.study", "import hydrate, mlflower, testslide"),
+        ("mvest.problem.estimate", "import hydrate, mlflower, testslide"),
     ],
 )
 def test_a_right_import_passes(module: str, source: str) -> None:

@@ -37,7 +37,7 @@ from mvest.observation.errors import (
     WhiteNoise,
 )
 from mvest.observation.vertices import require_frames
-from mvest.problem.study import Case
+from mvest.problem.problem import Problem
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template, TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
@@ -121,7 +121,7 @@ class Twin:
 
     Attributes
     ----------
-    case : Case
+    problem : Problem
     model : ClosureModel
         The estimator's.
     truth_model : ClosureModel
@@ -137,7 +137,7 @@ class Twin:
     errors : tuple of ObservationError
     """
 
-    case: Case
+    problem: Problem
     model: ClosureModel
     truth_model: ClosureModel
     source: StoredModel
@@ -223,9 +223,9 @@ def build_twin(config: Values) -> Twin:
         "observed": [observation["columns"], observation["rows"]],
         "parameters": list(parameters),
     }
-    case = Case(parameters, model, prior, filter_, transform, settings.tissue)
+    problem = Problem(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
-        case,
+        problem,
         model,
         truth_model,
         Store(config["paths"]["outputs"]).model("truth", truth_model, described, MADE_BY),

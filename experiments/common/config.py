@@ -28,7 +28,7 @@ from mvest.personalise.settings import CaseMesh, PaperSettings
 from mvest.provenance import config_hash
 from mvest.scenarios.scenario import Scenario
 from mvest.simulation.motion.population import PopulationSettings
-from mvest.simulation.virtual_patient import Deviations, Simulation
+from mvest.simulation.virtual_patient import Deviations, PatientSimulation
 from mvest.valve.anatomy.template import TemplateParameters
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
@@ -58,7 +58,7 @@ NOT_THE_RESULT = (
 TemplateConfig = schema(TemplateParameters)
 CaseMeshConfig = schema(CaseMesh)
 PaperSettingsConfig = schema(PaperSettings)
-SimulationConfig = schema(Simulation)
+SimulationConfig = schema(PatientSimulation)
 DeviationsConfig = schema(Deviations)
 PopulationSettingsConfig = schema(PopulationSettings)
 CycleProtocolConfig = schema(CycleProtocol)

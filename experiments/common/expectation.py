@@ -18,7 +18,7 @@ from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
 from mvest.personalise.chain import foresee_case
 from mvest.problem.expectation import Foresight, foresee, foresee_model
-from mvest.problem.study import simulate_observation
+from mvest.problem.synthetic import simulate_observation
 from mvest.provenance import config_hash
 from mvest.reporting.expectation import foresight_text
 from mvest.typing import FloatArray
@@ -46,7 +46,7 @@ class TwinForesight:
             If a setting is inadmissible.
         """
         twin = build_twin(config)
-        start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
+        start = twin.problem.start
         observed = config["observation"]
         key = config_hash(
             {part: config[part] for part in OF_THE_MODEL}
@@ -70,7 +70,7 @@ def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Foresight | s
         return first.reason
     data = simulate_observation(
         model,
-        twin.case.parameters,
+        twin.problem.parameters,
         start,
         frames=twin.frames,
         variance=twin.variance,
@@ -79,7 +79,7 @@ def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Foresight | s
         rng=np.random.default_rng(0),
     )
     assert data.observation is not None
-    return foresee(replace(twin.case, model=model), data.observation)
+    return foresee(replace(twin.problem, model=model), data.observation)
 
 
 def _noise(config: Values) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 
 from mvest.errors import MvestError
 from mvest.files import write_atomically
-from mvest.problem.study import Observation, StudyResult
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import StudyResult
 from mvest.provenance import provenance
 from mvest.reporting.expectation import confounded_record
 from mvest.typing import FloatArray

@@ -19,8 +19,8 @@ __all__ = [
     "BOUND_FACTOR",
     "COVERAGE_RANGE",
     "LEVELS",
-    "Accuracy",
     "Coverage",
+    "EstimateAccuracy",
     "accuracy",
     "converged",
     "coverage",
@@ -44,7 +44,7 @@ LEVELS = (0.50, 0.80, 0.95)
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
+class EstimateAccuracy:
     """Errors of one parameter over a group of runs; NaN where there is nothing to take it from.
 
     Attributes
@@ -111,7 +111,7 @@ def in_basin(run: Run) -> bool:
     return run.converged and run.largest_error <= BASIN_PERCENT
 
 
-def accuracy(runs: Sequence[Run], k: int) -> Accuracy:
+def accuracy(runs: Sequence[Run], k: int) -> EstimateAccuracy:
     """Errors of parameter k over all runs of a group."""
     good = converged(runs)
     n = len(good)
@@ -121,7 +121,7 @@ def accuracy(runs: Sequence[Run], k: int) -> Accuracy:
     bound = _mean(np.array([run.bound[k] for run in good]))
     rmse = float(np.sqrt(_mean(error**2)))
     ratio = rmse / bound if bound > 0 else np.nan
-    return Accuracy(
+    return EstimateAccuracy(
         n=n,
         failed=len(runs) - n,
         mean=_mean(estimate),

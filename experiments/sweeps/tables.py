@@ -28,8 +28,8 @@ from experiments.sweeps.statistics import (
     BOUND_FACTOR,
     COVERAGE_RANGE,
     LEVELS,
-    Accuracy,
     Coverage,
+    EstimateAccuracy,
     accuracy,
     converged,
     coverage,
@@ -211,7 +211,7 @@ def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     return rows, reading
 
 
-def _accuracy_row(found: Accuracy, name: str) -> Row:
+def _accuracy_row(found: EstimateAccuracy, name: str) -> Row:
     unit = unit_of(name)
     return {
         "runs": found.n,
@@ -238,13 +238,13 @@ def _coverage_row(levels: Sequence[Coverage]) -> Row:
     return row
 
 
-def _within_bound(found: Accuracy) -> str:
+def _within_bound(found: EstimateAccuracy) -> str:
     if np.isnan(found.ratio):
         return ""
     return "yes" if found.ratio <= BOUND_FACTOR else "no"
 
 
-def _noise_reading(own: str, common: str, found: Accuracy) -> Reading:
+def _noise_reading(own: str, common: str, found: EstimateAccuracy) -> Reading:
     """Cells with a unit; it stands in the header if all parameters share it."""
     unit = own.strip().strip("[]")
     values = {

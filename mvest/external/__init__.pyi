@@ -1,5 +1,5 @@
 from .contract import Answer as Answer
-from .contract import Request as Request
+from .contract import RunRequest as RunRequest
 from .contract import read_answer as read_answer
 from .contract import read_points as read_points
 from .contract import read_request as read_request

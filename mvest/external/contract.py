@@ -39,7 +39,7 @@ __all__ = [
     "RESPONSE",
     "VERSION",
     "Answer",
-    "Request",
+    "RunRequest",
     "read_answer",
     "read_points",
     "read_request",
@@ -59,7 +59,7 @@ LARGEST_JSON = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class RunRequest:
     """What one run is asked for.
 
     Attributes
@@ -132,7 +132,7 @@ class Answer:
     jacobian: FloatArray | None = None
 
 
-def write_request(folder: Path, request: Request, points: FloatArray | None = None) -> None:
+def write_request(folder: Path, request: RunRequest, points: FloatArray | None = None) -> None:
     """Write ``request.json`` and, where points ``(n, 3)`` mm are given, ``points.csv``.
 
     Raises
@@ -145,7 +145,7 @@ def write_request(folder: Path, request: Request, points: FloatArray | None = No
     write_json(folder / REQUEST, request.data())
 
 
-def read_request(file: Path) -> Request:
+def read_request(file: Path) -> RunRequest:
     """What ``request.json`` asks for: the program's side.
 
     Raises
@@ -156,7 +156,7 @@ def read_request(file: Path) -> Request:
     data = _read_json(file)
     try:
         parameters = data["parameters"]
-        return Request(
+        return RunRequest(
             tuple(str(p["name"]) for p in parameters),
             tuple(str(p["unit"]) for p in parameters),
             tuple(float(p["value"]) for p in parameters),
@@ -187,7 +187,7 @@ def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | No
     write_json(folder / RESPONSE, answer)
 
 
-def read_answer(folder: Path, request: Request) -> Answer:
+def read_answer(folder: Path, request: RunRequest) -> Answer:
     """What a run has answered in its folder.
 
     Raises

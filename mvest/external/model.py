@@ -16,7 +16,7 @@ from filelock import FileLock
 
 from mvest.errors import ConfigurationError, InputError, cannot_write
 from mvest.estimation.prediction import Prediction
-from mvest.external.contract import ANSWERS, Answer, Request, read_answer, write_request
+from mvest.external.contract import ANSWERS, Answer, RunRequest, read_answer, write_request
 from mvest.external.differences import Differences
 from mvest.external.process import Command
 from mvest.provenance import config_hash, write_json
@@ -158,9 +158,9 @@ class ProcessModel:
                 return f"run for a difference at {values}: {answer.reason}"
         return self.differences.jacobian(m, y, [answer.y for answer in answers])
 
-    def _request(self, m: FloatArray, jacobian: bool) -> Request:
+    def _request(self, m: FloatArray, jacobian: bool) -> RunRequest:
         values = tuple(float(v) for v in m)
-        return Request(self.names, self.units, values, self.count, jacobian, self.settings)
+        return RunRequest(self.names, self.units, values, self.count, jacobian, self.settings)
 
     def _all(self, points: Iterable[FloatArray], jacobian: bool) -> list[Answer]:
         """Answers at all points, several at a time; none goes on where one is interrupted."""
@@ -182,7 +182,7 @@ class ProcessModel:
         self.seconds += sum(run.seconds for run in found)
         return [run.answer for run in found]
 
-    def _run(self, request: Request, stop: threading.Event | None) -> _Run:
+    def _run(self, request: RunRequest, stop: threading.Event | None) -> _Run:
         """One run in its folder, unless it is finished there."""
         folder = self.folder / f"run-{self._hash(request)[:24]}"
         try:
@@ -195,7 +195,7 @@ class ProcessModel:
         except (OSError, InputError) as error:
             return _Run(Answer(f"{folder.name}: {error}", np.empty(0)))
 
-    def _start(self, folder: Path, request: Request, stop: threading.Event | None) -> _Run:
+    def _start(self, folder: Path, request: RunRequest, stop: threading.Event | None) -> _Run:
         for name in (FINISHED, *ANSWERS):
             # An old answer is not to be taken for that of a program that writes none.
             (folder / name).unlink(missing_ok=True)
@@ -214,7 +214,7 @@ class ProcessModel:
             write_json(folder / FINISHED, {"sha256": _answers(folder), "seconds": ending.seconds})
         return _Run(answer, started=True, seconds=ending.seconds)
 
-    def _finished(self, folder: Path, request: Request) -> Answer | None:
+    def _finished(self, folder: Path, request: RunRequest) -> Answer | None:
         """The answer of a finished run; None if there is none, or its files were changed since."""
         try:
             marker = json.loads((folder / FINISHED).read_text(encoding="utf-8"))
@@ -224,7 +224,7 @@ class ProcessModel:
             pass
         return None
 
-    def _hash(self, request: Request) -> str:
+    def _hash(self, request: RunRequest) -> str:
         """SHA-256 of all that an answer depends on."""
         return config_hash(
             {

@@ -9,9 +9,9 @@ from .law.field import ModulusField as ModulusField
 from .law.field import StiffPatch as StiffPatch
 from .steps import Damping as Damping
 from .steps import NewtonSettings as NewtonSettings
-from .steps import Reason as Reason
 from .steps import Simulation as Simulation
 from .steps import Step as Step
+from .steps import StepReason as StepReason
 from .system import Factors as Factors
 from .system import Loads as Loads
 from .system import Parameter as Parameter

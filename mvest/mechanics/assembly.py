@@ -20,7 +20,7 @@ from scipy import sparse
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
-    "Pattern",
+    "SparsityPattern",
     "add_forces",
     "adjacency",
     "coupling",
@@ -30,7 +30,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, eq=False)
-class Pattern:
+class SparsityPattern:
     """Sparsity pattern of a matrix with 3x3 blocks.
 
     Attributes
@@ -45,7 +45,7 @@ class Pattern:
     keys: IntArray
 
     @classmethod
-    def of(cls, coupled: sparse.csr_matrix) -> Pattern:
+    def of(cls, coupled: sparse.csr_matrix) -> SparsityPattern:
         """Pattern of the entries stored in ``coupled (n, n)``."""
         coupled.sort_indices()
         n = coupled.shape[0]

@@ -31,9 +31,9 @@ from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,
     NewtonSettings,
-    Reason,
     Simulation,
     Step,
+    StepReason,
     StepRecord,
 )
 from mvest.mechanics.system import Evaluation, Loads, Parameter, System
@@ -72,7 +72,7 @@ class _Solved:
 
 
 class _StepError(Exception):
-    def __init__(self, reason: Reason) -> None:
+    def __init__(self, reason: StepReason) -> None:
         self.reason = reason
 
 
@@ -156,7 +156,7 @@ def simulate(
     stepper.last_only = final_only and steps[-1].static
     frames, sensitivities, done = [x0], [state.dx], [initial_time]
     records: list[StepRecord] = []
-    reason = Reason.COMPLETED
+    reason = StepReason.COMPLETED
     for step in steps:
         stepper.passing = stepper.last_only and step is not steps[-1]
         try:
@@ -274,7 +274,7 @@ class _Stepper:
         solved = self._newton(state, loads, rate, mass_factor, push, advance)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
-            raise _StepError(Reason.INTERSECTION)
+            raise _StepError(StepReason.INTERSECTION)
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
         advanced = 0.0 if static else dt
@@ -322,7 +322,7 @@ class _Stepper:
         residuals = [float(np.linalg.norm(current.residual)) / current.scale]
         for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
-                raise _StepError(Reason.NO_CONVERGENCE)
+                raise _StepError(StepReason.NO_CONVERGENCE)
             assert current.blocks is not None
             converged = residuals[-1] <= tolerance
             if converged and (self.passing or not self.parameters):
@@ -336,21 +336,21 @@ class _Stepper:
                 forcing = min(1e-3, max(1e-9, residuals[-1]))
                 d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
-                raise _StepError(Reason.SINGULAR) from error
+                raise _StepError(StepReason.SINGULAR) from error
             if not np.isfinite(d).all():
-                raise _StepError(Reason.SINGULAR)
+                raise _StepError(StepReason.SINGULAR)
             if converged or float(np.abs(d).max()) <= newton.smallest_move:
                 # The factor of the converged state is kept for the sensitivities.
                 return _Solved(x, current, residuals, pairs)
             x, current = self._line_search(x, d, current, pairs, evaluate)
             if float(np.abs(x - state.x).max()) > self._far:
-                raise _StepError(Reason.NO_CONVERGENCE)
+                raise _StepError(StepReason.NO_CONVERGENCE)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
                 assert current.blocks is not None
                 self.solver.factorize(system.matrix(current.blocks, mass_factor))
                 return _Solved(x, current, residuals, pairs)
-        raise _StepError(Reason.NO_CONVERGENCE)
+        raise _StepError(StepReason.NO_CONVERGENCE)
 
     def _candidates(self, x: FloatArray) -> ContactPairs | None:
         """Pairs that may touch at ``x``; the last search serves until points have moved too far."""
@@ -393,7 +393,7 @@ class _Stepper:
                     best = (new_slope, trial)
             factor *= 0.5
         if best is None:
-            raise _StepError(Reason.NO_CONVERGENCE)
+            raise _StepError(StepReason.NO_CONVERGENCE)
         # Anew, since later trials may have changed the sparsity pattern.
         return best[1], evaluate(best[1], True)
 
@@ -450,4 +450,4 @@ def _largest_step(contact: Contact, pairs: ContactPairs, y: FloatArray, dy: Floa
         return contact.largest_step(pairs, y, dy)
     except MemoryError as error:
         # What iterates that have run away sweep over is more than there is room for.
-        raise _StepError(Reason.NO_CONVERGENCE) from error
+        raise _StepError(StepReason.NO_CONVERGENCE) from error

@@ -16,8 +16,8 @@ from mvest.errors import InputError
 __all__ = [
     "KINDS",
     "Kind",
+    "NamePart",
     "Parameter",
-    "Part",
     "check_names",
     "is_positive",
     "kind_of",
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 
-class Part(Enum):
+class NamePart(Enum):
     """What the second half of a name stands for."""
 
     NONE = ""
@@ -44,7 +44,7 @@ class Kind:
         Empty for what has none.
     positive : bool
         Whether it is positive by nature, so that it is estimated by its logarithm.
-    part : Part
+    part : NamePart
         What its names are made of.
     whole : bool
         Whether it also exists without a part, for the whole valve.
@@ -53,25 +53,27 @@ class Kind:
 
     unit: str
     positive: bool
-    part: Part
+    part: NamePart
     whole: bool
     description: str
 
 
 KINDS: dict[str, Kind] = {
-    "E_f": Kind("MPa", True, Part.REGION, False, "Young's modulus along the fibre"),
-    "ratio": Kind("", True, Part.REGION, False, "E_f over E_perp, at the same E_f"),
-    "G": Kind("MPa", True, Part.REGION, False, "shear modulus, where it does not follow E_f"),
-    "field": Kind("", False, Part.MODE, False, "coefficient of a mode of log E_f within a leaflet"),
-    "pressure_scale": Kind("", True, Part.NONE, True, "factor on the pressure"),
-    "chord_stiffness": Kind("", True, Part.CHORDS, True, "factor on the axial stiffness"),
-    "chord_rest_length": Kind("", True, Part.CHORDS, True, "factor on the rest length"),
-    "damping": Kind("s", True, Part.NONE, True, "stiffness-proportional part of the damping"),
-    "c0": Kind("MPa", True, Part.REGION, False, "scale of the exponential law"),
-    "c1": Kind("", True, Part.REGION, False, "its exponent of the isochoric deformation"),
-    "c2": Kind("", True, Part.REGION, False, "its exponent of the fibres' stretch"),
-    "mu": Kind("MPa", True, Part.REGION, False, "its shear modulus at rest"),
-    "kappa": Kind("MPa", True, Part.REGION, False, "its bulk modulus"),
+    "E_f": Kind("MPa", True, NamePart.REGION, False, "Young's modulus along the fibre"),
+    "ratio": Kind("", True, NamePart.REGION, False, "E_f over E_perp, at the same E_f"),
+    "G": Kind("MPa", True, NamePart.REGION, False, "shear modulus, where it does not follow E_f"),
+    "field": Kind(
+        "", False, NamePart.MODE, False, "coefficient of a mode of log E_f within a leaflet"
+    ),
+    "pressure_scale": Kind("", True, NamePart.NONE, True, "factor on the pressure"),
+    "chord_stiffness": Kind("", True, NamePart.CHORDS, True, "factor on the axial stiffness"),
+    "chord_rest_length": Kind("", True, NamePart.CHORDS, True, "factor on the rest length"),
+    "damping": Kind("s", True, NamePart.NONE, True, "stiffness-proportional part of the damping"),
+    "c0": Kind("MPa", True, NamePart.REGION, False, "scale of the exponential law"),
+    "c1": Kind("", True, NamePart.REGION, False, "its exponent of the isochoric deformation"),
+    "c2": Kind("", True, NamePart.REGION, False, "its exponent of the fibres' stretch"),
+    "mu": Kind("MPa", True, NamePart.REGION, False, "its shear modulus at rest"),
+    "kappa": Kind("MPa", True, NamePart.REGION, False, "its bulk modulus"),
 }
 
 
@@ -115,7 +117,7 @@ def known_names(kinds: Iterable[str] = ()) -> str:
     for kind in kinds or KINDS:
         known = KINDS[kind]
         words += [kind] if known.whole else []
-        words += [f"{kind}.{known.part.value}"] if known.part is not Part.NONE else []
+        words += [f"{kind}.{known.part.value}"] if known.part is not NamePart.NONE else []
     return ", ".join(words)
 
 
@@ -130,7 +132,7 @@ def kind_of(name: str) -> Kind:
     kind, _, part = name.partition(".")
     known = KINDS.get(kind)
     fits = known is not None and (
-        known.part is not Part.NONE if part else known.whole and name == kind
+        known.part is not NamePart.NONE if part else known.whole and name == kind
     )
     if known is None or not fits:
         raise InputError(f"unknown parameter {name!r}; known: {known_names()}")
@@ -166,7 +168,7 @@ def check_names(
         If there is no such kind of parameter, or no such part of this valve.
     """
     fields = [f"{region}.{k}" for region, n in (modes or {}).items() for k in range(n)]
-    parts = {Part.REGION: list(regions), Part.CHORDS: list(chords), Part.MODE: fields}
+    parts = {NamePart.REGION: list(regions), NamePart.CHORDS: list(chords), NamePart.MODE: fields}
     for name in names:
         part = name.partition(".")[2]
         known = parts.get(kind_of(name).part, [])

@@ -11,14 +11,14 @@ from mvest.typing import FloatArray
 __all__ = [
     "Damping",
     "NewtonSettings",
-    "Reason",
     "Simulation",
     "Step",
+    "StepReason",
     "StepRecord",
 ]
 
 
-class Reason(Enum):
+class StepReason(Enum):
     """Why a simulation stopped."""
 
     COMPLETED = "completed"
@@ -126,20 +126,20 @@ class Simulation:
         ``(f, n, 3)`` mm nodal positions.
     sensitivities : ndarray
         ``(f, p, n, 3)`` mm per unit of each parameter.
-    reason : Reason
+    reason : StepReason
     records : tuple of StepRecord
     """
 
     times: FloatArray
     frames: FloatArray
     sensitivities: FloatArray
-    reason: Reason
+    reason: StepReason
     records: tuple[StepRecord, ...]
 
     @property
     def converged(self) -> bool:
         """Whether all steps were completed."""
-        return self.reason is Reason.COMPLETED
+        return self.reason is StepReason.COMPLETED
 
     @property
     def iterations(self) -> int:

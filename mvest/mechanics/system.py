@@ -14,7 +14,7 @@ from scipy import sparse
 
 from mvest.errors import InputError
 from mvest.mechanics.assembly import (
-    Pattern,
+    SparsityPattern,
     add_forces,
     adjacency,
     coupling,
@@ -25,7 +25,7 @@ from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact, ContactPairs
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import Ties
-from mvest.mechanics.parameters import Parameter, Part, kind_of
+from mvest.mechanics.parameters import NamePart, Parameter, kind_of
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import FloatArray, IntArray
 
@@ -162,7 +162,7 @@ class System:
         """Pattern with contact between the pairs of elements ``hosts (g, 2)``, in their order."""
         elements = self.solid.mesh.elements
         self._coupled = hosts[:, 0] * len(elements) + hosts[:, 1]
-        self.pattern = Pattern.of(self._static + coupling(self.n, elements, hosts))
+        self.pattern = SparsityPattern.of(self._static + coupling(self.n, elements, hosts))
         self._at_elements = self.pattern.positions(elements, elements)
         if self.pressure is not None:
             self._at_faces = self.pattern.positions(self.pressure.faces, self.pressure.faces)
@@ -301,7 +301,7 @@ class System:
         InputError
             If there is no such parameter, or none of this body.
         """
-        if kind_of(parameter.name).part not in (Part.REGION, Part.MODE):
+        if kind_of(parameter.name).part not in (NamePart.REGION, NamePart.MODE):
             return np.zeros_like(state.stress)
         mesh, names = self.solid.mesh, self.solid.mesh.region_names
         if parameter.region not in names:

@@ -22,7 +22,7 @@ from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialLaw, E
 from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.moduli import LeafletModuli
 from mvest.mechanics.law.regional import RegionalLaw
-from mvest.mechanics.parameters import Part, check_names, kind_of
+from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
@@ -34,8 +34,8 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = [
     "HeldState",
+    "ModulusVariation",
     "Pacing",
-    "Variation",
     "boundary_loading",
     "build_system",
     "check_parameters",
@@ -78,7 +78,7 @@ class HeldState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Variation:
+class ModulusVariation:
     """How the modulus varies within the leaflets, at the quadrature points of a mesh.
 
     Attributes
@@ -165,7 +165,7 @@ def check_parameters(names: Iterable[str], valve: Valve, settings: MechanicsSett
     check_names(names, valve.surface.region_names, [*valve.chordae.family_names, *tips], modes)
     for name in names:
         kind, _, region = name.partition(".")
-        tissue = settings.tissue.get(region) if kind_of(name).part is Part.REGION else None
+        tissue = settings.tissue.get(region) if kind_of(name).part is NamePart.REGION else None
         if tissue is not None and kind not in tissue.kinds:
             raise InputError(
                 f"parameter {name!r}: the tissue of {region!r} follows the {tissue.law} law, which "
@@ -177,7 +177,7 @@ def material_law(
     mesh: SolidMesh,
     settings: MechanicsSettings,
     values: Mapping[str, float],
-    variation: Variation | None = None,
+    variation: ModulusVariation | None = None,
 ) -> Law:
     """The law of the mesh.
 
@@ -188,7 +188,7 @@ def material_law(
     values : mapping
         Parameter -> value: ``E_f.REGION`` of each region that follows the linear law, and any of
         the others; those that are no parameters of tissue are passed over.
-    variation : Variation, optional
+    variation : ModulusVariation, optional
         From `variation_of`; by default every leaflet has the same moduli throughout.
 
     Raises
@@ -242,7 +242,9 @@ def _law_of_one(tissue: LeafletModuli | ExponentialTissue) -> Law:
     return ExponentialLaw.of([tissue])
 
 
-def variation_of(valve: Valve, mesh: SolidMesh, settings: MechanicsSettings) -> Variation | None:
+def variation_of(
+    valve: Valve, mesh: SolidMesh, settings: MechanicsSettings
+) -> ModulusVariation | None:
     """How the settings let the modulus vary within the leaflets, at the mesh's points."""
     if not settings.fields and not settings.patches:
         return None
@@ -254,14 +256,14 @@ def variation_of(valve: Valve, mesh: SolidMesh, settings: MechanicsSettings) -> 
         (at_quadrature(mesh, patch.region, patch.log_scale) for patch in settings.patches.values()),
         np.zeros((len(mesh.elements), len(mesh.reference.points))),
     )
-    return Variation(modes, given)
+    return ModulusVariation(modes, given)
 
 
 def retune(system: System, settings: MechanicsSettings, values: Mapping[str, float]) -> None:
     """Give a system of a valve other values of its parameters; see `build_system`."""
     assert system.cables is not None
     old = system.solid.law
-    variation = Variation(old.modes, old.given) if isinstance(old, FieldLaw) else None
+    variation = ModulusVariation(old.modes, old.given) if isinstance(old, FieldLaw) else None
     law = material_law(system.solid.mesh, settings, values, variation)
     system.retune(law, factors_of(system.cables, values))
 

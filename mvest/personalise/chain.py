@@ -41,9 +41,10 @@ from mvest.personalise.geometry_errors import (
 from mvest.personalise.model import build_model
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
+from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.expectation import Foresight, foresee
+from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
-from mvest.problem.study import Case, Observed, StudyResult, estimate
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.band import Band
 
@@ -155,7 +156,7 @@ def foresee_case(
     Errors that samples of the frames tell of are left out: each sample would be a closure.
     """
     chain = _Chain(case, settings, store, on_step)
-    return foresee(chain.study_case(chain.filter), chain.plain_observation())
+    return foresee(chain.problem(chain.filter), chain.plain_observation())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,11 +269,11 @@ class _Chain:
 
     def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
         """All unknowns."""
-        return self._widened(estimate(self.study_case(filter_), observation), observation)
+        return self._widened(estimate(self.problem(filter_), observation), observation)
 
-    def study_case(self, filter_: Filter) -> Case:
+    def problem(self, filter_: Filter) -> Problem:
         """The estimation of all unknowns, without its observation."""
-        return Case(
+        return Problem(
             self.names,
             self.shared,
             self.prior,
@@ -319,7 +320,7 @@ class _Chain:
         prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
         if variance is not None:
             prior = Gaussian.from_variance(prior.mean, variance)
-        case = Case(
+        problem = Problem(
             tuple(self.names[k] for k in moduli),
             of_some(self.shared, self.shared.start, moduli, snap=1e-14),
             prior,
@@ -327,7 +328,7 @@ class _Chain:
             Log() if log else Log((False,) * len(moduli)),
             self.settings.mechanics.tissue,
         )
-        return self._widened(estimate(case, observation), observation)
+        return self._widened(estimate(problem, observation), observation)
 
     def estimate_as_paper(self, paper: PaperSettings) -> StudyResult:
         """The moduli alone, with the paper's filter and its independent R."""

@@ -26,7 +26,7 @@ from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
 from mvest.personalise.model import build_coarse
 from mvest.personalise.settings import PersonaliseSettings
-from mvest.problem.study import Observed
+from mvest.problem.problem import Observed
 from mvest.typing import FloatArray
 
 __all__ = ["GeometryErrors", "WeighedObservation", "errors_of", "sample_geometry"]

@@ -9,7 +9,7 @@ from mvest.cases.case import ValveCase
 from mvest.estimation.gaussian import Gaussian
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
-from mvest.problem.study import StudyResult
+from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 

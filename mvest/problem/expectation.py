@@ -16,7 +16,7 @@ from mvest.estimation.information.identifiability import Identifiability, identi
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, predict
 from mvest.estimation.transform import Transform, to_filter
-from mvest.problem.study import Case, Observed
+from mvest.problem.problem import Observed, Problem
 from mvest.typing import FloatArray
 
 __all__ = ["Foresight", "foresee", "foresee_model"]
@@ -72,23 +72,23 @@ class Foresight:
         return self.transform.inverse(z - reach), self.transform.inverse(z + reach)
 
 
-def foresee(case: Case, observation: Observed) -> Foresight:
+def foresee(problem: Problem, observation: Observed) -> Foresight:
     """Expected intervals of an estimation that is not run.
 
     Parameters
     ----------
-    case : Case
+    problem : Problem
         The model is run once, at the mean of the prior.
     observation : Observed
         Which points are seen, and how well; the values that were seen play no part where points
         correspond.
     """
     return foresee_model(
-        observation.of(case.model),
-        case.prior,
+        observation.of(problem.model),
+        problem.prior,
         observation.R,
-        parameters=case.parameters,
-        transform=case.transform,
+        parameters=problem.parameters,
+        transform=problem.transform,
         frames=observation.frames,
     )
 

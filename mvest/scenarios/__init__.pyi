@@ -1,9 +1,9 @@
 from .measures import MEASURES as MEASURES
 from .measures import Measured as Measured
 from .measures import measure_closed as measure_closed
-from .posterior import Spread as Spread
+from .posterior import SampleSummary as SampleSummary
 from .posterior import posterior_samples as posterior_samples
-from .posterior import spread_of as spread_of
+from .posterior import summary_of as summary_of
 from .predict import PredictedScenario as PredictedScenario
 from .predict import Sample as Sample
 from .predict import predict_scenario as predict_scenario

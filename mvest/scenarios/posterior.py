@@ -13,11 +13,11 @@ from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate
 from mvest.typing import FloatArray
 
-__all__ = ["Spread", "posterior_samples", "spread_of"]
+__all__ = ["SampleSummary", "posterior_samples", "summary_of"]
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class SampleSummary:
     """Mean, standard deviation and central 95 % interval of a sampled number.
 
     Attributes
@@ -68,13 +68,13 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     return np.array([estimate.transform.inverse(row) for row in z])
 
 
-def spread_of(values: Sequence[float]) -> Spread:
+def summary_of(values: Sequence[float]) -> SampleSummary:
     """What samples say of a number; those that are NaN gave none."""
     known = np.array([v for v in values if np.isfinite(v)])
     if len(known) < 2:
         mean = float(known[0]) if len(known) else float("nan")
-        return Spread(mean, float("nan"), float("nan"), float("nan"), len(known))
+        return SampleSummary(mean, float("nan"), float("nan"), float("nan"), len(known))
     low, high = np.quantile(known, [0.025, 0.975], method="median_unbiased")
-    return Spread(
+    return SampleSummary(
         float(known.mean()), float(known.std(ddof=1)), float(low), float(high), len(known)
     )

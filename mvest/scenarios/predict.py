@@ -13,7 +13,7 @@ from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
 from mvest.mechanics.system import Parameter, System
 from mvest.scenarios.measures import NEVER_NEGATIVE, Measured, measure_closed
-from mvest.scenarios.posterior import Spread, spread_of
+from mvest.scenarios.posterior import SampleSummary, summary_of
 from mvest.typing import FloatArray
 
 __all__ = ["PredictedScenario", "Sample", "closed_valve", "predict_scenario"]
@@ -74,9 +74,9 @@ class PredictedScenario:
         """Reasons of the samples that gave no closed valve."""
         return tuple(sample.reason for sample in self.samples if sample.failed)
 
-    def spread(self, name: str) -> Spread:
+    def spread(self, name: str) -> SampleSummary:
         """What the samples say of a measure; failed samples say nothing, and are counted apart."""
-        return spread_of([s.measures.get(name, float("nan")) for s in self.samples])
+        return summary_of([s.measures.get(name, float("nan")) for s in self.samples])
 
     def mesh_error(self, name: str) -> float:
         """How far a measure is from that of the finer mesh; NaN where there is none.

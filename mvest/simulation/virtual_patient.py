@@ -27,7 +27,7 @@ from mvest.valve.mesh.structured import structured_mesh
 __all__ = [
     "Deviations",
     "Hidden",
-    "Simulation",
+    "PatientSimulation",
     "VirtualPatient",
     "close_patient",
     "draw_hidden",
@@ -92,7 +92,7 @@ class VirtualPatient:
 
 
 @dataclass(frozen=True, slots=True)
-class Simulation:
+class PatientSimulation:
     """How virtual patients are made.
 
     Attributes
@@ -170,7 +170,7 @@ def simulate_patient(
     description: str,
     template: Template,
     values: Mapping[str, float],
-    simulation: Simulation,
+    simulation: PatientSimulation,
     mechanics: MechanicsSettings,
     rng: np.random.Generator,
 ) -> VirtualPatient:
@@ -183,7 +183,7 @@ def simulate_patient(
     template : Template
     values : mapping
         As from :func:`draw_hidden`.
-    simulation : Simulation
+    simulation : PatientSimulation
     mechanics : MechanicsSettings
         Its pressure is what the case states.
     rng : numpy.random.Generator
@@ -212,7 +212,7 @@ def patient_model(
     seen: Valve,
     contact: Valve,
     values: Mapping[str, float],
-    simulation: Simulation,
+    simulation: PatientSimulation,
     mechanics: MechanicsSettings,
 ) -> ClosureModel:
     """The model that closes a virtual patient, with the guides that it follows.
@@ -224,7 +224,7 @@ def patient_model(
         Of that template, where it is seen and where contact is sampled.
     values : mapping
         The parameters are its names, without those of a displacement.
-    simulation : Simulation
+    simulation : PatientSimulation
     mechanics : MechanicsSettings
     """
     names = tuple(name for name in values if name not in REGISTRATION)
@@ -250,7 +250,7 @@ def patient_model(
 
 
 def close_patient(
-    name: str, model: ClosureModel, values: Mapping[str, float], simulation: Simulation
+    name: str, model: ClosureModel, values: Mapping[str, float], simulation: PatientSimulation
 ) -> dict[str, FloatArray]:
     """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
 
@@ -274,7 +274,7 @@ def close_patient(
     return true
 
 
-def held_states(simulation: Simulation, valve: Valve) -> dict[str, HeldState]:
+def held_states(simulation: PatientSimulation, valve: Valve) -> dict[str, HeldState]:
     """The frames that are held out, on the annulus of a valve.
 
     Tips that move while the valve closes return with the annulus.
@@ -299,7 +299,7 @@ def _case(
     description: str,
     seen: Valve,
     true: Mapping[str, FloatArray],
-    simulation: Simulation,
+    simulation: PatientSimulation,
     mechanics: MechanicsSettings,
     rng: np.random.Generator,
 ) -> ValveCase:

@@ -15,7 +15,7 @@ from mvest.errors import InputError
 from mvest.mechanics import valve_system
 from mvest.mechanics.forces.contact import Contact, ContactSettings
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
-from mvest.mechanics.steps import NewtonSettings, Reason
+from mvest.mechanics.steps import NewtonSettings, StepReason
 from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Motion
@@ -282,7 +282,7 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
         starts.append(options["initial_positions"])
         result = true_simulate(*arguments, **options)
         if options["initial_positions"] is not None:
-            result = replace(result, reason=Reason.NO_CONVERGENCE)
+            result = replace(result, reason=StepReason.NO_CONVERGENCE)
         return result
 
     monkeypatch.setattr(mvest.closure.model, "simulate", simulate)
@@ -297,7 +297,7 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     alone.restart(ClosedState(AT, first.frames[-1]))
     failed = alone.close(AT, sensitivities=False).simulation
     assert len(starts) == 1
-    assert failed.reason is Reason.NO_CONVERGENCE
+    assert failed.reason is StepReason.NO_CONVERGENCE
 
 
 def test_a_restarted_model_forgets_to_the_last_bit(closed):
@@ -426,7 +426,7 @@ def test_a_run_that_does_not_converge_is_a_failed_prediction_with_reason_and_tim
     newton = NewtonSettings(max_iterations=1, max_halvings=0)
     model = replace(model, settings=replace(model.settings, newton=newton))
     simulation = model.close(AT).simulation
-    assert simulation.reason is Reason.NO_CONVERGENCE
+    assert simulation.reason is StepReason.NO_CONVERGENCE
     assert len(simulation.frames) == 1
     prediction = model(AT)
     assert not prediction.converged

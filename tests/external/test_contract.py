@@ -8,7 +8,7 @@ import pytest
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.external import (
-    Request,
+    RunRequest,
     read_answer,
     read_points,
     read_request,
@@ -16,7 +16,7 @@ from mvest.external import (
     write_request,
 )
 
-REQUEST = Request(("E", "nu, local"), ("MPa", ""), (0.1 + 0.2, 1e-300), 2, settings={"law": "a"})
+REQUEST = RunRequest(("E", "nu, local"), ("MPa", ""), (0.1 + 0.2, 1e-300), 2, settings={"law": "a"})
 Y = np.array([1.0, 2.0, 3.0, 0.1 + 0.2, 5.0, -6e-30])
 JACOBIAN = np.arange(12.0).reshape(6, 2) / 7
 
@@ -114,7 +114,7 @@ def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path):
 )
 def test_an_inadmissible_request_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
-        Request(*arguments)
+        RunRequest(*arguments)
 
 
 def test_what_is_no_request_is_refused(tmp_path):

@@ -10,8 +10,8 @@ from mvest.mechanics import (
     Loads,
     NewtonSettings,
     Parameter,
-    Reason,
     Step,
+    StepReason,
     System,
     box,
     integrate,
@@ -79,7 +79,7 @@ def test_a_run_that_cannot_converge_is_a_value():
         parameters=[Parameter("E_f.0", 6.23)],
     )
     assert not result.converged
-    assert result.reason is Reason.NO_CONVERGENCE
+    assert result.reason is StepReason.NO_CONVERGENCE
     assert "did not converge" in result.reason.value
     # Only the given state: no geometry that was not reached.
     assert result.frames.shape[0] == len(result.times) == len(result.sensitivities) == 1
@@ -92,7 +92,7 @@ def test_a_failure_on_the_way_keeps_the_steps_before_it():
         times=[0.01, 0.02, 0.03, 0.04],
         newton=NewtonSettings(max_iterations=6, max_halvings=1),
     )
-    assert result.reason is Reason.NO_CONVERGENCE
+    assert result.reason is StepReason.NO_CONVERGENCE
     assert result.times.tolist() == [0.0, 0.01, 0.02, 0.03]
     assert len(result.frames) == 4
 
@@ -209,7 +209,7 @@ def test_an_equilibrium_that_is_not_found_is_tried_again_after_a_rest(monkeypatc
     def step(self, state, end, dt, static):
         if static and not refused:
             refused.append(dt)
-            raise integrate._StepError(Reason.NO_CONVERGENCE)
+            raise integrate._StepError(StepReason.NO_CONVERGENCE)
         return true_step(self, state, end, dt, static)
 
     monkeypatch.setattr(integrate._Stepper, "_step", step)
@@ -232,10 +232,10 @@ def test_an_equilibrium_that_is_never_found_is_a_failure(monkeypatch):
 
     def step(self, state, end, dt, static):
         if static:
-            raise integrate._StepError(Reason.NO_CONVERGENCE)
+            raise integrate._StepError(StepReason.NO_CONVERGENCE)
         return true_step(self, state, end, dt, static)
 
     monkeypatch.setattr(integrate._Stepper, "_step", step)
     result = sheet(static=True)
-    assert result.reason is Reason.NO_CONVERGENCE
+    assert result.reason is StepReason.NO_CONVERGENCE
     assert len(result.times) == 1

@@ -5,7 +5,7 @@ import pytest
 
 from mvest.mechanics import integrate
 from mvest.mechanics.integrate import _largest_step, _StepError
-from mvest.mechanics.steps import Reason
+from mvest.mechanics.steps import StepReason
 from tests.closure.test_model import AT, CLOSING, TINY, model_of
 
 
@@ -17,7 +17,7 @@ class NoRoom:
 def test_collision_detection_without_room_is_a_failed_step():
     with pytest.raises(_StepError) as raised:
         _largest_step(NoRoom(), None, np.zeros((1, 3)), np.ones((1, 3)))
-    assert raised.value.reason is Reason.NO_CONVERGENCE
+    assert raised.value.reason is StepReason.NO_CONVERGENCE
 
 
 def test_a_step_that_leaves_the_body_behind_is_a_failed_one(monkeypatch):
@@ -25,4 +25,4 @@ def test_a_step_that_leaves_the_body_behind_is_a_failed_one(monkeypatch):
     monkeypatch.setattr(integrate, "RUNAWAY", 1e-4)
     simulation = model_of(CLOSING, **TINY).close(AT, sensitivities=False).simulation
     assert not simulation.converged
-    assert simulation.reason is Reason.NO_CONVERGENCE
+    assert simulation.reason is StepReason.NO_CONVERGENCE

@@ -24,7 +24,8 @@ from mvest.observation.surfaces import (
     mean_surface_distance,
     surface_distance,
 )
-from mvest.problem.study import Case, estimate
+from mvest.problem.estimate import estimate
+from mvest.problem.problem import Problem
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
@@ -764,7 +765,7 @@ def test_a_study_takes_what_was_seen_without_correspondence() -> None:
     names = ("E_f.anterior", "E_f.posterior")
     prior = Gaussian.from_variance(np.array([3.0, 3.0]), 9.0)
     tissue = {"anterior": TissueSettings(2.0), "posterior": TissueSettings(2.0)}
-    case = Case(names, predict, prior, IteratedFilter(), Identity(), tissue)
+    case = Problem(names, predict, prior, IteratedFilter(), Identity(), tissue)
     result = estimate(case, observation)
     assert result.converged
     assert result.estimate is not None

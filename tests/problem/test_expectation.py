@@ -6,8 +6,9 @@ import pytest
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.vertices import Observation
+from mvest.problem.estimate import estimate
 from mvest.problem.expectation import foresee
-from mvest.problem.study import Case, estimate
+from mvest.problem.problem import Problem
 from mvest.reporting.expectation import alike_words, confounded_record, foresight_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")
@@ -35,7 +36,7 @@ class Bellies:
 def case_of(std):
     prior = Gaussian.from_variance(TRUTH, np.array(std) ** 2)
     tissue = {name: TissueSettings(2.0) for name in ("anterior", "posterior")}
-    return Case(NAMES, Bellies(), prior, IteratedFilter(1e-8), Log(), tissue)
+    return Problem(NAMES, Bellies(), prior, IteratedFilter(1e-8), Log(), tissue)
 
 
 def observation(noise):

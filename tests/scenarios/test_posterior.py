@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction, Reason, observation_noise
-from mvest.scenarios import posterior_samples, spread_of
+from mvest.scenarios import posterior_samples, summary_of
 
 MEAN, SHIFT = np.array([5.0, 2.0]), np.array([[1.0, 0.6], [0.0, 1.0]])
 
@@ -64,7 +64,7 @@ def test_an_estimate_that_did_not_converge_has_no_samples():
 
 def test_the_interval_is_that_of_the_samples():
     # Type 8 of n = 40 numbers 1 to 40: at position (n + 1/3) p + 1/3 = 1.3417 for p = 0.025.
-    spread = spread_of([*range(1, 41), float("nan")])
+    spread = summary_of([*range(1, 41), float("nan")])
     assert spread.count == 40
     assert spread.low == pytest.approx(1.3417, abs=1e-4)
     assert spread.high == pytest.approx(41 - 1.3417, abs=1e-4)
@@ -73,6 +73,6 @@ def test_the_interval_is_that_of_the_samples():
 
 
 def test_one_sample_has_no_spread():
-    spread = spread_of([3.0, float("nan")])
+    spread = summary_of([3.0, float("nan")])
     assert (spread.mean, spread.count) == (3.0, 1)
     assert np.isnan([spread.std, spread.low, spread.high]).all()

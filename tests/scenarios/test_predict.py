@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import Gaussian, Identity, IteratedFilter, Prediction, observation_noise
-from mvest.mechanics.steps import Reason
+from mvest.mechanics.steps import StepReason
 from mvest.scenarios import (
     Clip,
     Scenario,
@@ -59,7 +59,7 @@ class Linear:
         x = np.append(SLOPE @ m, 0.0)[None]
         simulation = SimpleNamespace(
             converged=reason is None,
-            reason=reason or Reason.COMPLETED,
+            reason=reason or StepReason.COMPLETED,
             frames=[x],
             sensitivities=[np.concatenate([SLOPE.T, np.zeros((2, 1))], axis=1)[:, None]],
         )
@@ -103,7 +103,7 @@ def test_failed_samples_are_told_and_not_dropped(linear):
     def refuse(m):
         if m[0] == order[-1]:
             return MaterialError("E_f = -1 MPa, expected > 0")
-        return Reason.NO_CONVERGENCE if m[0] >= order[-3] else None
+        return StepReason.NO_CONVERGENCE if m[0] >= order[-3] else None
 
     linear.refuse = refuse
     found = predict_scenario(linear, estimate, samples)
@@ -111,8 +111,8 @@ def test_failed_samples_are_told_and_not_dropped(linear):
     assert found.spread("sum_mm").count == 13
     assert sorted(found.failures) == [
         "E_f = -1 MPa, expected > 0",
-        Reason.NO_CONVERGENCE.value,
-        Reason.NO_CONVERGENCE.value,
+        StepReason.NO_CONVERGENCE.value,
+        StepReason.NO_CONVERGENCE.value,
     ]
     assert [s.failed for s in found.samples].count(True) == 3
 
@@ -161,17 +161,17 @@ def test_only_measures_that_are_never_negative_have_no_negative_interval(linear,
 
 def test_a_finer_mesh_that_does_not_close_leaves_the_error_unknown(linear):
     estimate = estimated()
-    finer = Finer(lambda m: Reason.SINGULAR)
+    finer = Finer(lambda m: StepReason.SINGULAR)
     found = predict_scenario(linear, estimate, posterior_samples(estimate, 4, 3), finer=finer)
-    assert found.finer.reason == Reason.SINGULAR.value
+    assert found.finer.reason == StepReason.SINGULAR.value
     assert np.all(np.isnan(found.interval("sum_mm")))
 
 
 def test_a_valve_that_does_not_close_at_the_estimate_is_a_result(linear):
-    linear.refuse = lambda m: Reason.SINGULAR
+    linear.refuse = lambda m: StepReason.SINGULAR
     found = predict_scenario(linear, estimated(), posterior_samples(estimated(), 2, 1))
     assert found.at_estimate.failed
-    assert found.at_estimate.reason == Reason.SINGULAR.value
+    assert found.at_estimate.reason == StepReason.SINGULAR.value
     assert found.shape is None
     assert found.first_order == {}
     assert len(found.failures) == 2

@@ -31,7 +31,7 @@ from mvest.simulation.motion import (
 from mvest.simulation.motion import patient as patients
 from mvest.simulation.motion.closing import ClosingFrames, frames_along, with_tip_motion
 from mvest.simulation.motion.refusal import check_motion
-from mvest.simulation.virtual_patient import Simulation
+from mvest.simulation.virtual_patient import PatientSimulation
 from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
 from tests import made_up_closure
 from tests.made_up_closure import MadeUpClosure
@@ -492,7 +492,7 @@ def test_a_file_of_something_else_is_refused(drawn, tmp_path):
 
 # --- patients -----------------------------------------------------------------------------------
 
-SIMULATION = Simulation(
+SIMULATION = PatientSimulation(
     held_pressure_mmHg=(80.0,), held_relaxation=(0.2,), held_tips=(0.0, 0.0, 0.0)
 )
 HIDDEN = {**VALUES, "chord_stiffness": 0.9, "chord_rest_length": 1.01}

@@ -13,7 +13,12 @@ from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueS
 from mvest.mechanics.steps import NewtonSettings
 from mvest.problem.registration import REGISTRATION, displace
 from mvest.simulation import virtual_patient
-from mvest.simulation.virtual_patient import Deviations, Simulation, draw_hidden, simulate_patient
+from mvest.simulation.virtual_patient import (
+    Deviations,
+    PatientSimulation,
+    draw_hidden,
+    simulate_patient,
+)
 from mvest.valve.anatomy.template import Template
 
 TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
@@ -21,7 +26,7 @@ CLOSING = ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04, growth=2.0, en
 MECHANICS = MechanicsSettings(TISSUE, CLOSING)
 MODULI = {"E_f.anterior": 6.0, "E_f.posterior": 4.0}
 TEMPLATE = Template()
-SMALL = Simulation(
+SMALL = PatientSimulation(
     columns=16,
     rows=2,
     dt_factor=1.0,
@@ -213,4 +218,4 @@ def test_a_valve_that_does_not_close_is_an_error(values):
 )
 def test_frames_that_are_held_out_have_a_name_each(pressures, relaxations, message):
     with pytest.raises(InputError, match=message):
-        Simulation(held_pressure_mmHg=pressures, held_relaxation=relaxations)
+        PatientSimulation(held_pressure_mmHg=pressures, held_relaxation=relaxations)

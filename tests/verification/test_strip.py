@@ -10,7 +10,7 @@ from experiments.verification import (
     REFERENCE,
     SMALL_LOAD,
     STRIPS,
-    Case,
+    StripMesh,
     bend,
     markdown,
     strip_table,
@@ -39,7 +39,11 @@ def test_the_default_element_bends_like_the_reference_under_a_small_load(materia
     # Both computed here. Without the enhanced thickness strain hex18 keeps E33 constant across the
     # thickness and is too stiff by 1 / (1 - nu^2) and more; tet4 locks in shear and volume.
     table = strip_table(
-        (Case("hex18", (9, 7, 1)), Case("hex18", (4, 3, 1)), Case("tet4", (13, 10, 1))),
+        (
+            StripMesh("hex18", (9, 7, 1)),
+            StripMesh("hex18", (4, 3, 1)),
+            StripMesh("tet4", (13, 10, 1)),
+        ),
         strips=(STRIP,),
         materials=(material,),
         loads=("small",),
@@ -56,7 +60,7 @@ def test_the_default_element_bends_like_the_reference_under_large_rotation(store
     # Against the stored reference, which the generator writes and a slow test computes again.
     expected = reference(stored, material, "large")
     pressure = LARGE_LOAD[STRIP][material]
-    computed = bend(Case("hex18", (9, 7, 1)), STRIPS[STRIP], material, pressure, LARGE_STEPS)
+    computed = bend(StripMesh("hex18", (9, 7, 1)), STRIPS[STRIP], material, pressure, LARGE_STEPS)
     assert computed.converged
     assert 60 < computed.angle < 95
     assert computed.deflection == pytest.approx(expected.deflection_mm, rel=0.05)

@@ -14,7 +14,7 @@ from experiments.common.record import make_record
 from mvest.cases.case import Role
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.result import Personalised
-from mvest.problem.study import StudyResult
+from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import surface_edges
 from mvest.valve.measure.clinical import clinical_measurements

@@ -31,7 +31,9 @@ from mvest.estimation.transform import Transform
 from mvest.estimation.wrappers import Remembered
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
-from mvest.problem.study import Case, Observation, StudyResult, estimate
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.problem import Problem
 from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
 from mvest.valve.io.donor.arrays import CITATION, donor_file
@@ -265,7 +267,7 @@ def _fit(study: DonorStudy) -> Fits:
             model = copy(first)
             model.closures = 0
             models.append(model)
-            case = Case(
+            case = Problem(
                 study.parameters,
                 Remembered(model, known.runs, known.rtol),
                 study.prior,

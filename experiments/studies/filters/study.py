@@ -19,8 +19,8 @@ from experiments.common.mirror import build
 from experiments.common.store import Store
 from experiments.studies.filters.problem import (
     TRANSFORM,
+    FilterProblem,
     FittedSurrogate,
-    Problem,
     build_problem,
     fit_to_prior,
 )
@@ -126,12 +126,12 @@ def _solve(config: Values, name: str) -> dict[str, Any]:
     }
 
 
-def _told(values: Values, problem: Problem) -> dict[str, Any]:
+def _told(values: Values, problem: FilterProblem) -> dict[str, Any]:
     """Settings of a filter, with the process noise of the paper: as large as the prior."""
     return {**values, "Q": np.diag(problem.prior.covariance)}
 
 
-def _estimate(problem: Problem, filter_: Filter, seed: int) -> dict[str, Any]:
+def _estimate(problem: FilterProblem, filter_: Filter, seed: int) -> dict[str, Any]:
     """One estimate with the model itself, from the open valve on."""
     problem.model.restart()
     y = problem.exact
@@ -174,7 +174,7 @@ def _histogram(draws: FloatArray) -> dict[str, Any]:
 
 
 def _repeats(
-    problem: Problem,
+    problem: FilterProblem,
     fitted: FittedSurrogate,
     filters: Mapping[str, Filter],
     settings: Values,
@@ -231,7 +231,7 @@ def _interval(
 
 
 def _drawn(
-    problem: Problem,
+    problem: FilterProblem,
     fitted: FittedSurrogate,
     y: FloatArray,
     sampler: SamplerSettings,

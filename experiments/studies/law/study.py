@@ -23,13 +23,8 @@ from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.solid import Law
 from mvest.mechanics.valve_system import material_law
 from mvest.observation.vertices import Observation
-from mvest.problem.study import (
-    StudyResult,
-    Truth,
-    TwinData,
-    estimate,
-    simulate_observation,
-)
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
@@ -61,11 +56,11 @@ def run_law_study(config: Values, config_hash: str, folder: Path, started: float
         end / data.observation.y.size for end in chi_square_band(data.observation.y.size)
     ]
     fits = {}
-    for name, case in (("exponential", twin.case), ("linear", linear.case)):
+    for name, problem in (("exponential", twin.problem), ("linear", linear.problem)):
         print(f"fitting the {name} law", file=sys.stderr, flush=True)
-        fits[name] = estimate(case, data.observation)
+        fits[name] = estimate(problem, data.observation)
         own = fits[name].against(data.truth) if name == "exponential" else fits[name]
-        record["fits"].append(_fit(name, own, case.prior.mean, data.observation, data.truth))
+        record["fits"].append(_fit(name, own, problem.prior.mean, data.observation, data.truth))
     if all(result.estimate is not None for result in fits.values()):
         models = (twin.model, linear.model)
         record["curves"] = _curves(models, fits, twin.truth_values, config["seed"])
@@ -102,7 +97,7 @@ def _observed(twin: Twin, closed: Prediction, seed: int) -> TwinData:
     """An observation of the true valve."""
     return simulate_observation(
         lambda m: closed,
-        twin.case.parameters,
+        twin.problem.parameters,
         twin.truth_values,
         frames=twin.frames,
         variance=twin.variance,
@@ -168,13 +163,12 @@ def _fit(
 
 def _repeats(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """Estimates with the exponential law from observations with other errors."""
-    start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
-    case = replace(twin.case, model=SharedStart(twin.model, start))
+    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
     entries = []
     for seed in seeds:
         data = _observed(twin, closed, seed)
         assert data.observation is not None
-        filtered = estimate(case, data.observation).filtered
+        filtered = estimate(problem, data.observation).filtered
         assert filtered is not None
         low, high = filtered.interval()
         entries.append(

@@ -40,7 +40,7 @@ PROGRAM, PROGRAM_ALONE = "scikit-fem as a program", "the same, by differences"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class SheetProblem:
     """What every estimate of the study has in common."""
 
     filter: Filter
@@ -67,7 +67,7 @@ def run_models(config: Values, config_hash: str, folder: Path, started: float) -
     filter_, transform, prior = build_filter(config["filter"], PARAMETERS, positive=True)
     variance = float(config["filter"]["R"])
     truth = np.array(config["truth"]["values"], dtype=float)
-    problem = Problem(filter_, transform, prior, variance, truth)
+    problem = SheetProblem(filter_, transform, prior, variance, truth)
     own, second = OwnSheet(sheet), SecondSheet(sheet)
     record = _record(config, config_hash, sheet, truth, started)
 
@@ -136,7 +136,7 @@ def sheet_program(sheet: Sheet, folder: Path, about: Values, *, derivatives: boo
 
 
 def _estimate(
-    data: str, y: FloatArray, name: str, model: ObservationModel, problem: Problem
+    data: str, y: FloatArray, name: str, model: ObservationModel, problem: SheetProblem
 ) -> dict[str, Any]:
     """Moduli that one model finds in the data of one code."""
     print(f"{name} from data of {data}", file=sys.stderr, flush=True)

@@ -22,7 +22,7 @@ from mvest.provenance import write_json
 from mvest.reporting.case.report import write_case_report
 from mvest.simulation.virtual_patient import (
     Deviations,
-    Simulation,
+    PatientSimulation,
     VirtualPatient,
     draw_hidden,
     simulate_patient,
@@ -129,7 +129,7 @@ def _simulate(config: Values) -> tuple[VirtualPatient, int]:
                 patient["description"],
                 drawn,
                 values,
-                build(Simulation, patient["simulation"]),
+                build(PatientSimulation, patient["simulation"]),
                 mechanics_of(config),
                 rng,
             )

@@ -21,7 +21,8 @@ from experiments.common.mirror import build
 from experiments.common.progress import PartBar
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
-from mvest.problem.study import StudyResult, estimate, simulate_observation
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.synthetic import simulate_observation
 from mvest.scenarios.measures import contact_reach, meaning_of
 from mvest.scenarios.posterior import posterior_samples
 from mvest.scenarios.predict import PredictedScenario, Sample, closed_valve
@@ -147,12 +148,12 @@ def _predicted(
     if spread.shape != twin.truth_values.shape:
         raise ConfigurationError(
             f"prediction.spread has {spread.size} values; expected one for each of "
-            f"{', '.join(twin.case.parameters)}"
+            f"{', '.join(twin.problem.parameters)}"
         )
     truth = twin.truth_values * np.exp(spread * rng.standard_normal(len(spread)))
     data = simulate_observation(
         twin.source,
-        twin.case.parameters,
+        twin.problem.parameters,
         truth,
         frames=twin.frames,
         variance=twin.variance,
@@ -162,10 +163,10 @@ def _predicted(
     )
     step()
     if data.observation is None:
-        return _Patient(seed, truth, StudyResult.failed(twin.case, data.reason, 0.0), {}, {})
+        return _Patient(seed, truth, StudyResult.failed(twin.problem, data.reason, 0.0), {}, {})
     # From the open valve, so that no patient depends on the one before.
     twin.model.restart(None)
-    result = estimate(twin.case, data.observation)
+    result = estimate(twin.problem, data.observation)
     if result.filtered is None or not result.converged:
         return _Patient(seed, truth, result, {}, {})
     samples = posterior_samples(result.filtered, count, seed)

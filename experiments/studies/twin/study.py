@@ -17,11 +17,8 @@ from experiments.common.record import make_record, measure_frames, repeat_entry,
 from mvest.closure.model import ClosureModel
 from mvest.estimation.wrappers import SharedStart
 from mvest.observation.vertices import observed_frames
-from mvest.problem.study import (
-    StudyResult,
-    estimate,
-    simulate_observation,
-)
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.synthetic import simulate_observation
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 
 __all__ = ["run_twin"]
@@ -91,15 +88,14 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
     with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
         twin.truth_model.on_step = bar.step
         truth = twin.source(twin.truth_values)
-    start = twin.case.transform.inverse(twin.case.transform.forward(twin.case.prior.mean))
-    case = replace(twin.case, model=SharedStart(twin.model, start))
+    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
     results = []
     with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)) as bar:
         twin.model.on_step = bar.step
         for seed in seeds:
             data = simulate_observation(
                 lambda m: truth,
-                twin.case.parameters,
+                twin.problem.parameters,
                 twin.truth_values,
                 frames=twin.frames,
                 variance=twin.variance,
@@ -108,8 +104,8 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
                 rng=np.random.default_rng(seed),
             )
             if data.observation is None:
-                return [StudyResult.failed(twin.case, data.reason, 0.0) for _ in seeds]
-            results.append(estimate(case, data.observation).against(data.truth))
+                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
+            results.append(estimate(problem, data.observation).against(data.truth))
     return results
 
 

@@ -29,7 +29,7 @@ from mvest.reporting.figures import DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
-    "Spread",
+    "FieldSummary",
     "case_figure",
     "distance_top",
     "figure3_caption",
@@ -44,7 +44,7 @@ HIGH_QUANTILE = 0.99
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class FieldSummary:
     """Mean, standard deviation and largest of a field over the vertices that have a value."""
 
     mean: float
@@ -56,7 +56,7 @@ class Spread:
         return f"{self.mean:.2f} ± {self.std:.2f} mm"
 
 
-def spread(values: FloatArray) -> Spread:
+def spread(values: FloatArray) -> FieldSummary:
     """Mean ± SD over vertices, NaN left out.
 
     Raises
@@ -67,7 +67,7 @@ def spread(values: FloatArray) -> Spread:
     known = values[np.isfinite(values)]
     if not known.size:
         raise InputError("a field of distances without a single value")
-    return Spread(float(known.mean()), float(known.std()), float(known.max()), known.size)
+    return FieldSummary(float(known.mean()), float(known.std()), float(known.max()), known.size)
 
 
 def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:

@@ -30,7 +30,7 @@ from mvest.simulation.virtual_patient import (
     CLOSED,
     REFERENCE,
     Hidden,
-    Simulation,
+    PatientSimulation,
     close_patient,
     held_states,
     patient_model,
@@ -41,7 +41,7 @@ from mvest.valve.anatomy.valve import Valve
 
 __all__ = ["IMAGED", "ImagedPatient", "simulate_imaged_patient"]
 
-IMAGED = Simulation(
+IMAGED = PatientSimulation(
     columns=54,
     rows=6,
     held_pressure_mmHg=(100.0, 80.0),
@@ -82,7 +82,7 @@ def simulate_imaged_patient(
     name: str,
     template: Template,
     values: Mapping[str, float],
-    simulation: Simulation,
+    simulation: PatientSimulation,
     settings: MotionSettings,
     mechanics: MechanicsSettings,
     tip_motion: FloatArray | None = None,
@@ -95,7 +95,7 @@ def simulate_imaged_patient(
     template : Template
     values : mapping
         As from :func:`mvest.simulation.virtual_patient.draw_hidden`; its displacement is left out.
-    simulation : Simulation
+    simulation : PatientSimulation
         Of the open, closed and held frames. What is seen, and its errors, are left out.
     settings : MotionSettings
         Layout, duration and limits; mesh and number of the frames of closing. Its held frames are

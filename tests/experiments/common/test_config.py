@@ -107,9 +107,9 @@ def test_the_usual_overrides_reach_the_objects() -> None:
     )
     twin = build_twin(config)
     assert list(twin.truth_values) == [4.5, 3.2]
-    assert list(twin.case.prior.mean) == [8.0, 1.5]
-    assert twin.case.prior.covariance.diagonal().tolist() == [1.0, 4.0]
-    assert type(twin.case.filter).__name__ == "IteratedFilter"
+    assert list(twin.problem.prior.mean) == [8.0, 1.5]
+    assert twin.problem.prior.covariance.diagonal().tolist() == [1.0, 4.0]
+    assert type(twin.problem.filter).__name__ == "IteratedFilter"
     assert twin.model.mesh.element_type == "tet4"
     assert {tissue.reading for tissue in twin.model.settings.tissue.values()} == {"C"}
     assert twin.errors == (WhiteNoise(0.5),)

@@ -11,7 +11,12 @@ from hydra import compose, initialize_config_dir
 from experiments.common.build import build_filter
 from experiments.common.config import plain, register
 from experiments.run import main
-from experiments.studies.filters.problem import Problem, SurrogateModel, TimedModel, fit_to_prior
+from experiments.studies.filters.problem import (
+    FilterProblem,
+    SurrogateModel,
+    TimedModel,
+    fit_to_prior,
+)
 from experiments.studies.filters.study import _summary
 from mvest.errors import ConfigurationError
 from mvest.estimation import (
@@ -63,9 +68,11 @@ def test_a_filter_that_does_not_exist_is_refused_with_those_that_do() -> None:
         build_filter({**filter_settings("iterated"), "mode": "particle"}, NAMES)
 
 
-def made_up(model) -> Problem:
+def made_up(model) -> FilterProblem:
     prior = Gaussian.from_variance(np.array([2.0, 3.0]), np.array([1.0, 0.81]))
-    return Problem("made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, 3, "none")
+    return FilterProblem(
+        "made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, 3, "none"
+    )
 
 
 def quadratic(m):

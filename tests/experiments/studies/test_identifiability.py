@@ -162,7 +162,7 @@ def test_sets_of_vertices():
 
 def test_a_check_tells_of_a_twin_and_estimates_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        "mvest.problem.study.estimate", lambda *a, **k: pytest.fail("something was estimated")
+        "mvest.problem.estimate.estimate", lambda *a, **k: pytest.fail("something was estimated")
     )
     status, said = call(
         tmp_path, monkeypatch, capsys, "experiment=table1", "check=true", "filter.R=0.0004",

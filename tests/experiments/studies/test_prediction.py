@@ -22,7 +22,7 @@ from experiments.studies.prediction.report import (
     write_prediction_tables,
 )
 from mvest.closure.model import ClosedState, ClosureModel
-from mvest.mechanics.steps import Reason
+from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import build_system
 from tests.experiments.runner.logged import logged
 
@@ -64,13 +64,13 @@ def stretched(self, m, *, sensitivities=True, every_frame=False):
         derivative[k, :, k] = nodes[:, k] * load * RATE[k] / m[k]
     self._closed = ClosedState(np.array(m), x)
     simulation = SimpleNamespace(
-        converged=True, reason=Reason.COMPLETED, frames=[x], sensitivities=[derivative]
+        converged=True, reason=StepReason.COMPLETED, frames=[x], sensitivities=[derivative]
     )
     return SimpleNamespace(system=self._system, simulation=simulation)
 
 
 def buckled(self, m, *, sensitivities=True, every_frame=False):
-    simulation = SimpleNamespace(converged=False, reason=Reason.SINGULAR, times=[0.0])
+    simulation = SimpleNamespace(converged=False, reason=StepReason.SINGULAR, times=[0.0])
     return SimpleNamespace(system=None, simulation=simulation)
 
 
@@ -162,11 +162,11 @@ def test_samples_that_fail_are_told(run, monkeypatch):
     status, record, folder, _ = run("prediction.patients=1")
     assert status == 0
     clip = record["patients"][0]["scenarios"]["clip"]
-    assert clip["failure"] == Reason.SINGULAR.value
-    assert clip["failures"] == [Reason.SINGULAR.value] * 4
+    assert clip["failure"] == StepReason.SINGULAR.value
+    assert clip["failures"] == [StepReason.SINGULAR.value] * 4
     assert clip["measures"] == {}
     text = prediction_text(record)
-    assert f"clip at A2–P2: 4 of 4 samples ({Reason.SINGULAR.value})" in text
+    assert f"clip at A2–P2: 4 of 4 samples ({StepReason.SINGULAR.value})" in text
     prediction_figure(record, folder / "fields.npz")
 
 
@@ -175,7 +175,7 @@ def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypa
     status, record, _, _ = run()
     assert status == 1
     assert record["status"] == "failed"
-    assert Reason.SINGULAR.value in record["reason"]
+    assert StepReason.SINGULAR.value in record["reason"]
     assert "no prediction: " in prediction_text(record)
 
 

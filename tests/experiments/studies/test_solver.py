@@ -7,7 +7,7 @@ from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
 from experiments.studies.models.sheet.solver import main
 from experiments.studies.models.study import sheet_program
-from mvest.external import Request, read_answer, write_request
+from mvest.external import RunRequest, read_answer, write_request
 
 pytest.importorskip("skfem")
 
@@ -40,7 +40,7 @@ def test_what_the_program_is_asked_wrongly_it_says(tmp_path, capsys):
 
 def test_the_program_passes_on_a_failure(tmp_path):
     about = {"length": 24.0, "cells": [2, 2], "observed": [2, 3]}
-    request = Request(
+    request = RunRequest(
         PARAMETERS, ("MPa", "MPa"), (-1.0, 1.0), 6,
         settings={"sheet": about, "law": "biot", "derivatives": True},
     )  # fmt: skip

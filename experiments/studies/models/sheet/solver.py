@@ -16,7 +16,7 @@ import numpy as np
 from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import Sheet
 from mvest.errors import MvestError
-from mvest.external.contract import Request, read_request, write_answer
+from mvest.external.contract import RunRequest, read_request, write_answer
 
 __all__ = ["main", "sheet_of"]
 
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def sheet_of(request: Request) -> Sheet:
+def sheet_of(request: RunRequest) -> Sheet:
     """The sheet that the settings of a request describe."""
     about = dict(request.settings["sheet"])
     for name in ("cells", "observed"):

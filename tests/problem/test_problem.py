@@ -11,15 +11,10 @@ from mvest.estimation import Gaussian, Identity, IteratedFilter, PaperFilter, Pr
 from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
-from mvest.problem.study import (
-    Case,
-    Observation,
-    StudyResult,
-    Truth,
-    TwinData,
-    estimate,
-    simulate_observation,
-)
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.problem import Problem
+from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 
 NAMES = ("E_f.anterior", "E_f.posterior")
 TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
@@ -61,9 +56,9 @@ def observe(model=None, noise_mm: float = 0.0, seed: int = 1, **more) -> TwinDat
     )
 
 
-def case(model=None, filter_=None) -> Case:
+def case(model=None, filter_=None) -> Problem:
     prior = Gaussian.from_variance(np.array([5.0, 3.0]), 9.0)
-    return Case(NAMES, model or Sheet(), prior, filter_ or IteratedFilter(), Identity(), TISSUE)
+    return Problem(NAMES, model or Sheet(), prior, filter_ or IteratedFilter(), Identity(), TISSUE)
 
 
 def test_paper_filter_finds_the_truth_of_a_twin() -> None:
@@ -100,7 +95,7 @@ def test_all_six_moduli_follow_through_the_fixed_ratios() -> None:
 
 
 def test_the_estimator_is_given_nothing_that_knows_the_truth() -> None:
-    fields = {f.name for cls in (Case, Observation) for f in dataclasses.fields(cls)}
+    fields = {f.name for cls in (Problem, Observation) for f in dataclasses.fields(cls)}
     assert not any("truth" in name or "true" in name for name in fields)
     data = observe()
     assert data.observation is not None
@@ -198,7 +193,7 @@ def test_a_step_to_impossible_moduli_is_shortened_and_not_raised() -> None:
     data = observe()
     assert data.observation is not None
     prior = Gaussian.from_variance(np.array([40.0, 40.0]), 1e4)
-    far = Case(NAMES, Sheet(), prior, IteratedFilter(), Identity(), TISSUE)
+    far = Problem(NAMES, Sheet(), prior, IteratedFilter(), Identity(), TISSUE)
     result = estimate(far, data.observation)
     assert result.converged
     np.testing.assert_allclose(result.estimate, TRUTH, rtol=1e-3)
@@ -232,7 +227,7 @@ def test_bad_values_and_shapes_are_refused() -> None:
     with pytest.raises(InputError, match="finite"):
         Observation(("closed",), np.full((1, 5, 3), np.nan), np.array([1.0]))
     with pytest.raises(InputError, match="prior has 1"):
-        Case(
+        Problem(
             NAMES,
             Sheet(),
             Gaussian.from_variance(np.ones(1), 1.0),

@@ -1,0 +1,193 @@
+"""The one joint of data, model and filter: problem and observation in, estimate and errors out.
+
+The truth of a synthetic study is kept apart: ``estimate`` never sees it, and only the finished
+``StudyResult`` is compared with it (``StudyResult.against``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, OnIterate
+from mvest.estimation.information.identifiability import Identifiability, identifiability
+from mvest.mechanics.settings import TissueSettings
+from mvest.problem.problem import Observed, Problem
+from mvest.problem.synthetic import Truth
+from mvest.typing import FloatArray
+
+__all__ = ["Modulus", "StudyResult", "estimate"]
+
+
+@dataclass(frozen=True, slots=True)
+class Modulus:
+    """One elastic modulus of one region; MPa, and the error as a signed part of the truth."""
+
+    region: str
+    name: str
+    estimate: float
+    std: float
+    truth: float | None = None
+
+    @property
+    def relative_error(self) -> float | None:
+        """(estimate - truth) / truth."""
+        return None if self.truth is None else (self.estimate - self.truth) / self.truth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyResult:
+    """An estimate from an observation, or the reason why there is none.
+
+    Attributes
+    ----------
+    parameters : tuple of str, (p,)
+    tissue : mapping
+        Region -> fixed ratios.
+    observation : Observed or None
+        None if it could not be simulated.
+    filtered : Estimate or None
+        What the filter returned; None if it was never run.
+    identifiability : Identifiability or None
+        Cramér-Rao bound and flat directions of the data alone, at the estimate.
+    reason, detail : str
+    converged : bool
+    seconds : float
+        Wall-clock time of the estimation.
+    fitted : (f, n, 3) mm or None
+        Observed frames as predicted at the estimate, unseen vertices included.
+    truth : Truth or None
+        Added by ``against``, after the estimation.
+    """
+
+    parameters: tuple[str, ...]
+    tissue: Mapping[str, TissueSettings]
+    observation: Observed | None
+    filtered: Estimate | None
+    identifiability: Identifiability | None
+    reason: str
+    detail: str
+    converged: bool
+    seconds: float
+    fitted: FloatArray | None = None
+    truth: Truth | None = None
+
+    @classmethod
+    def failed(cls, problem: Problem, reason: str, seconds: float) -> StudyResult:
+        """The result of a study that had nothing to estimate from."""
+        return cls(problem.parameters, problem.tissue, None, None, None, reason, "", False, seconds)
+
+    def against(self, truth: Truth | None) -> StudyResult:
+        """The same result, compared with the truth."""
+        if truth is not None and truth.parameters != self.parameters:
+            raise InputError(f"the truth is of {truth.parameters}, not of {self.parameters}")
+        return replace(self, truth=truth)
+
+    @property
+    def estimate(self) -> FloatArray | None:
+        """Estimated parameters ``(p,)``; None where the model gave no prediction there."""
+        known = self.filtered is not None and self.filtered.prediction is not None
+        return self.filtered.mean if known and self.filtered is not None else None
+
+    @property
+    def std(self) -> FloatArray | None:
+        """Standard deviations ``(p,)`` of the estimate according to the filter."""
+        if self.estimate is None or self.filtered is None:
+            return None
+        return self.filtered.std
+
+    @property
+    def relative_error(self) -> FloatArray | None:
+        """(estimate - truth) / truth, ``(p,)``."""
+        if self.truth is None or self.estimate is None:
+            return None
+        return (self.estimate - self.truth.values) / self.truth.values
+
+    @property
+    def distance(self) -> FloatArray | None:
+        """Distance ``(n,)`` mm of each vertex, fitted to observed, in the last observed frame.
+
+        NaN where a vertex is not seen. Of seen points ``(q,)`` where no vertex is known again.
+        """
+        if self.fitted is None or self.observation is None:
+            return None
+        return self.observation.distance(self.fitted)
+
+    @property
+    def distance_to_truth(self) -> FloatArray | None:
+        """As ``distance``, to the positions without errors; also of vertices that are not seen."""
+        if self.fitted is None or self.truth is None:
+            return None
+        return np.linalg.norm(self.fitted[-1] - self.truth.positions[-1], axis=1)
+
+    @property
+    def moduli(self) -> tuple[Modulus, ...]:
+        """All moduli that follow from the estimated E_f through the fixed ratios."""
+        if self.estimate is None or self.std is None:
+            return ()
+        truth = None if self.truth is None else self.truth.values
+        found = []
+        for k, parameter in enumerate(self.parameters):
+            kind, _, region = parameter.partition(".")
+            if kind != "E_f":
+                continue
+            unit = self.tissue[region].material(1.0)
+            for name, factor in (("E_f", 1.0), ("E_perp", unit.E_p), ("G", unit.G)):
+                true = None if truth is None else factor * float(truth[k])
+                found.append(
+                    Modulus(
+                        region,
+                        name,
+                        factor * float(self.estimate[k]),
+                        factor * float(self.std[k]),
+                        true,
+                    )
+                )
+        return tuple(found)
+
+
+def estimate(
+    problem: Problem, observation: Observed, *, on_iterate: OnIterate | None = None
+) -> StudyResult:
+    """Estimate the parameters of a problem from an observation.
+
+    Numerical failure is a result with its reason; only inadmissible input raises.
+    """
+    started = time.perf_counter()
+    R = observation.R
+    filtered = problem.filter(
+        observation.of(problem.model),
+        problem.prior,
+        observation.y,
+        R,
+        names=problem.parameters,
+        transform=problem.transform,
+        on_iterate=on_iterate,
+    )
+    bound = fitted = None
+    if filtered.prediction is not None:
+        aux = filtered.prediction.aux
+        fitted = aux if isinstance(aux, np.ndarray) else None
+        # What is estimated near zero has its prior for a size.
+        bound = identifiability(
+            filtered.prediction.jacobian,
+            R,
+            np.maximum(np.abs(filtered.mean), problem.prior.std),
+            names=problem.parameters,
+        )
+    return StudyResult(
+        parameters=problem.parameters,
+        tissue=problem.tissue,
+        observation=observation,
+        filtered=filtered,
+        identifiability=bound,
+        reason=filtered.reason.value,
+        detail=filtered.detail,
+        converged=filtered.converged,
+        seconds=time.perf_counter() - started,
+        fitted=fitted,
+    )
