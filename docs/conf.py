@@ -30,12 +30,17 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "api_pages",
     "study_pages",
+    "computed_tables",
 ]
 myst_enable_extensions = ["attrs_block", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build", "_extensions", "study_notes"]
 numpydoc_show_class_members = False
+default_role = "py:obj"
+autosummary_generate = ["api/index.rst"]
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 
@@ -64,7 +69,8 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "remove_config_comments": True,
     "min_reported_time": 1,
-    "image_scrapers": ("matplotlib",),
+    "image_scrapers": ("matplotlib", "figure_scraper"),
+    "ignore_pattern": "drawing",
     "within_subsection_order": "FileNameSortKey",
 }
 

@@ -102,8 +102,8 @@ class FilterRun:
     def negligible(self, change: FloatArray, z: FloatArray, P: FloatArray, limit: float) -> bool:
         """Whether a change of z moves no parameter by more than `limit`, relatively.
 
-        Relative to |m|, or to the standard deviation of m where that is larger: a change far below
-        the standard deviation is none that matters, and m may be zero.
+        Relative to ``|m|``, or to the standard deviation of m where that is larger: a change far
+        below the standard deviation is none that matters, and m may be zero.
         """
         D = np.abs(self.transform.derivative(z))
         std = D * np.sqrt(np.diagonal(P))

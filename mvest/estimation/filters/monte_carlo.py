@@ -181,7 +181,7 @@ class MonteCarloFilter:
 
 
 def log_posterior(misfit: Misfit) -> LogDensity:
-    """−½ (y − h)ᵀ R⁻¹ (y − h) − ½ |x|² where the prior is N(0, I)."""
+    """``−½ (y − h)ᵀ R⁻¹ (y − h) − ½ |x|²`` where the prior is N(0, I)."""
 
     def density(points: FloatArray) -> FloatArray:
         return -misfit(points) - 0.5 * np.einsum("kp,kp->k", points, points)

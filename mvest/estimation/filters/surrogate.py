@@ -30,7 +30,7 @@ Misfit: TypeAlias = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Region:
-    """A box with any axes, x = centre + axes u with every |u| ≤ 1.
+    """A box with any axes, x = centre + axes u with every ``|u| ≤ 1``.
 
     Attributes
     ----------
@@ -84,8 +84,9 @@ class Surrogate:
     def misfit(self, y: FloatArray, noise: ObservationNoise) -> Misfit:
         """½ (y − h)ᵀ R⁻¹ (y − h) as a function of points, infinite outside the region.
 
-        With h = Bᵀ φ and the thin factors W Bᵀ = Q T it is ½ (|Qᵀ e − T (φ − φ₀)|² + |e − Q Qᵀ e|²)
-        of the residual e = W (y − h) at the region's centre: one evaluation costs t², not n.
+        With h = Bᵀ φ and the thin factors W Bᵀ = Q T it is
+        ``½ (|Qᵀ e − T (φ − φ₀)|² + |e − Q Qᵀ e|²)`` of the residual e = W (y − h) at the region's
+        centre: one evaluation costs t², not n.
         """
         centre = self._terms(self.region.centre[None])[0]
         e = noise.whiten(y - centre @ self.coefficients)

@@ -52,8 +52,8 @@ class Profile:
     path : (g, p) in the units of the parameters
         All parameters where the misfit is least, the held one ascending: the floor of the valley.
     deviance : (g,)
-        D less its smallest value on the path, D = |W (y - h(m))|² plus the prior's part; -2 log of
-        the profile likelihood ratio.
+        D less its smallest value on the path, D = ``|W (y - h(m))|²`` plus the prior's part; -2 log
+        of the profile likelihood ratio.
     threshold : float
         Quantile of chi-square with one degree of freedom.
     low, high : float
