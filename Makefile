@@ -69,14 +69,13 @@ format: $(INSTALLED) ## rewrite the code in the house format
 	$(BIN)/ruff format .
 
 dashboard: $(INSTALLED) ## MLflow's pages, on the comparison of the last sweep (PORT=5000)
-	$(BIN)/python -m experiments.dashboard $(if $(PORT),--port $(PORT))
+	$(BIN)/python -m experiments.runner.dashboard $(if $(PORT),--port $(PORT))
 
 sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
-	$(BIN)/python -m experiments.sync
+	$(BIN)/python -m experiments.runner.sync
 
-screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium with its driver)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e .[browser]
-	$(BIN)/python -m experiments.screenshot
+screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
+	$(BIN)/python -m experiments.runner.screenshot
 
 slurm-check: $(INSTALLED) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e .[cluster]

@@ -17,10 +17,12 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments.common.config import register
 from experiments.common.places import CONF
-from experiments.runner.job import FailedRunError, run_job
-from experiments.runner.slurm import register_launcher
-from experiments.runner.sweep import StopApplication
+from experiments.runner.folder import FailedRunError, nothing_empty
+from experiments.runner.plugins import FailedSweepError, register_plugins
+from experiments.runner.request import Request
+from experiments.runner.tracking import track_job
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -42,27 +44,26 @@ def main() -> int:
 
     def task(config: DictConfig) -> None:
         try:
-            run_job(config)
+            run_alone(config)
         except (MvestError, FailedRunError) as error:
             ended.append(error)
 
-    register_launcher()
+    register()
+    register_plugins()
     # Hydra then lets exceptions through, so that they can be told in one line here.
     os.environ[TRACEBACKS] = "1"
     try:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
-    except StopApplication as stop:
-        if stop.error is None:
-            return stop.status
-        if wants_tracebacks or not isinstance(stop.error, REFUSED):
-            raise stop.error from None
-        print(f"error: {explain(stop.error)}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
-        print("interrupted: what was not finished was not kept", file=sys.stderr)
+        print(
+            "interrupted: what is finished is kept, and the same command goes on from there",
+            file=sys.stderr,
+        )
         return 130
+    except FailedSweepError:
+        return 1
     except FailedRunError as error:
         print(f"no estimate: {error}", file=sys.stderr)
         return 1
@@ -75,6 +76,36 @@ def main() -> int:
         if not wants_tracebacks:
             del os.environ[TRACEBACKS]
     return 0
+
+
+def run_alone(config: DictConfig) -> None:
+    """One run by itself: what it means, if that is all that is asked; otherwise run and log it.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible or a file cannot be written.
+    FailedRunError
+        If the computation found no estimate; the run is recorded all the same.
+    """
+    # Imports every study, for seconds: not where only help is asked for.
+    from experiments.runner.check import require_admissible
+    from experiments.runner.job import run_job
+    from experiments.runner.plan import plan_run
+
+    request = Request.of(config)
+    with nothing_empty(request.folder, Path(config.paths.outputs)):
+        if config.dry_run:
+            plan = plan_run(request)
+            require_admissible(request.values)
+            print(plan.summary(), plan.listing(), sep="\n")
+            return
+        try:
+            run_job(config)
+        except FailedRunError:
+            track_job(request.folder, request.values)
+            raise
+        track_job(request.folder, request.values)
 
 
 def explain(error: BaseException) -> str:

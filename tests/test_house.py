@@ -114,7 +114,7 @@ IMPORT_NAME = {
     "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
 }
-OPTIONAL = ("viz", "cluster", "postgres", "browser", "second-model")
+OPTIONAL = ("viz", "cluster", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
 
 

@@ -12,7 +12,7 @@ from experiments.runner.plan import Plan, PlannedJob
 from experiments.runner.request import model_settings
 from mvest.provenance import config_hash, provenance
 
-__all__ = ["collect", "overheads"]
+__all__ = ["NOT_RUN", "collect", "overheads"]
 
 SCHEMA = 1
 """Version of the layout of ``sweep.json``."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from mvest.provenance import config_hash
 
-__all__ = ["axes", "inputs", "metrics", "parameters", "short_names"]
+__all__ = ["inputs", "metrics", "parameters", "short_names"]
 
 Values = Mapping[str, Any]
 
@@ -30,9 +30,6 @@ BY_PARAMETER = {
     "truth.values": "truth",
 }  # fmt: skip
 """Names of settings that hold one value for each estimated parameter, or one for all."""
-
-AXES = ("P0", "initial.", "Q", "R", "noise", "truth.", "seed")
-"""Settings that make good axes, in the order in which a reader meets them in a study."""
 
 DIGEST_LENGTH = 36
 """Most characters of a digest that MLflow takes."""
@@ -193,53 +190,6 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
     return found
 
 
-def axes(runs: Sequence[tuple[Mapping[str, str], Iterable[str]]]) -> tuple[list[str], list[str]]:
-    """Parameters and metrics that a comparison of runs is drawn over.
-
-    Settings that are numbers in every run and that differ between runs come first, in the order of
-    a study (``P0``, initial guess, noise, ...), then what else was varied as a number; if nothing
-    differs, ``P0``, the initial guess and the noise all the same. The errors follow, or the
-    estimates and distances where there is no truth.
-
-    Parameters
-    ----------
-    runs : sequence
-        Parameters and names of metrics of each run.
-
-    Returns
-    -------
-    tuple of lists of str
-        Names of parameters, names of metrics.
-    """
-    settings = [params for params, _ in runs]
-    shared = [name for name in settings[0] if all(name in one for one in settings)]
-    numbers = [name for name in shared if all(_is_number(one[name]) for one in settings)]
-    varied = [name for name in numbers if len({float(one[name]) for one in settings}) > 1]
-
-    def ordered(names: Iterable[str]) -> list[str]:
-        names = list(names)
-        first = [n for axis in AXES for n in names if n == axis or n.startswith(axis.rstrip("."))]
-        return list(dict.fromkeys([*first, *names]))
-
-    always = [n for n in numbers if n in ("P0", "noise") or n.startswith(("initial.", "P0."))]
-    measured = {name for _, names in runs for name in names}
-    wanted = [n for n in sorted(measured) if n.startswith("error.") and n != "error.mean"]
-    if not wanted:
-        wanted = [n for n in sorted(measured) if n.startswith("estimate.")] + ["distance.mean"]
-    else:
-        wanted.append("error.mean")
-    columns = {
-        name: tuple(float(one[name]) for one in settings) for name in ordered([*always, *varied])
-    }
-    # What a sweep calls by a name of its own often is a setting that has an axis already.
-    different = [n for n in columns if n in always or n == _first(columns, columns[n])]
-    return different, [name for name in wanted if name in measured]
-
-
-def _first(columns: Mapping[str, tuple[float, ...]], column: tuple[float, ...]) -> str:
-    return next(name for name, other in columns.items() if other == column)
-
-
 def _leaves(values: Values, prefix: str = "") -> list[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
     for key, value in values.items():
@@ -266,13 +216,6 @@ def _text(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return repr(value) if isinstance(value, float) else str(value)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
 
 
 def _column(runs: Iterable[Values], key: str, k: int) -> list[float]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +24,22 @@ __all__ = [
     "CONFIG",
     "LOG",
     "RESULT",
+    "FailedRunError",
     "clear",
     "finished_record",
     "is_done",
     "last_record",
     "lock",
     "mark_done",
+    "nothing_empty",
     "read_result",
     "require_writable",
     "result_time",
     "write_failure",
 ]
 
-DONE, RESULT, CONFIG, LOG = "done", "result.json", "config.json", "log.txt"
-"""Files of a job: its marker, its record, its configuration, and what it said."""
+DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
+"""Files of a job: its marker, its record, its configuration, what it said, who is at work."""
 
 ABSENT = (
     "estimate",
@@ -54,9 +58,21 @@ ABSENT = (
 """What the record of a lost job has no value for."""
 
 
+class FailedRunError(Exception):
+    """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
+
+    def __init__(self, reason: str, folder: Path) -> None:
+        super().__init__(reason, folder)
+        self.reason = reason
+        self.folder = folder
+
+    def __str__(self) -> str:
+        return f"{self.reason} (recorded in {self.folder / RESULT})"
+
+
 def lock(folder: Path) -> FileLock:
     """Keeps a second process out of the folder; falls with the process that holds it."""
-    return FileLock(folder / ".lock")
+    return FileLock(folder / LOCK)
 
 
 def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
@@ -126,6 +142,29 @@ def require_writable(folder: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise InputError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+@contextmanager
+def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
+    """Take a job's folder away again, and those of the outputs above it, if nothing was kept in it.
+
+    Hydra makes the folder before anyone has seen whether the request is right.
+    """
+    try:
+        yield
+    finally:
+        outputs = outputs.resolve()
+        above = [place for place in folder.resolve().parents if outputs in (place, *place.parents)]
+        try:
+            if {path.name for path in folder.iterdir()} <= {LOCK}:
+                # Whoever holds the lock is at work there.
+                with lock(folder).acquire(timeout=0):
+                    (folder / LOCK).unlink()
+                for place in (folder, *above):
+                    place.rmdir()
+        except OSError:
+            # Something else is kept there.
+            pass
 
 
 def write_failure(request: Request, reason: str, started: float) -> dict[str, Any]:

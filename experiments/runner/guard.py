@@ -31,7 +31,6 @@ from experiments.runner.folder import (
     write_failure,
 )
 from experiments.runner.request import Request
-from experiments.runner.tracking import track_job
 from mvest.errors import MvestError
 from mvest.provenance import THREAD_VARIABLES
 
@@ -182,9 +181,7 @@ def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str
             if record is not None:
                 return record
             reason = "it left no record"
-        record = write_failure(request, reason, started)
-    track_job(request.folder, values)
-    return record
+        return write_failure(request, reason, started)
 
 
 def _kill(process: subprocess.Popen[str]) -> None:

@@ -23,6 +23,7 @@ from experiments.common.expectation import (
 from experiments.runner.folder import (
     CONFIG,
     RESULT,
+    FailedRunError,
     clear,
     finished_record,
     lock,
@@ -31,7 +32,7 @@ from experiments.runner.folder import (
 )
 from experiments.runner.guard import run_apart
 from experiments.runner.request import Request
-from experiments.runner.tracking import require_no_password, track_job
+from experiments.runner.tracking import require_no_password
 from experiments.studies.chord.report import chord_text, write_chord
 from experiments.studies.chord.study import run_chord_study
 from experiments.studies.closure.report import closure_text, publish_closure, write_closure_tables
@@ -82,18 +83,6 @@ __all__ = ["STUDIES", "FailedRunError", "Study", "compute", "require_study", "ru
 
 # Workers of a launcher import this module before they compose their configuration.
 register()
-
-
-class FailedRunError(Exception):
-    """A run ended without an estimate; it is recorded, with its reason, in its output folder."""
-
-    def __init__(self, reason: str, folder: Path) -> None:
-        super().__init__(reason, folder)
-        self.reason = reason
-        self.folder = folder
-
-    def __str__(self) -> str:
-        return f"{self.reason} (recorded in {self.folder / RESULT})"
 
 
 def run_job(config: DictConfig) -> None:
@@ -164,7 +153,6 @@ def compute(request: Request) -> dict[str, Any]:
     if record["status"] == "converged":
         mark_done(folder)
     study.finish(values, record, folder)
-    track_job(folder, values)
     _raise_failure(record, folder)
     return record
 

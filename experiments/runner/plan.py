@@ -10,31 +10,32 @@ from __future__ import annotations
 import json
 import os
 import time
+import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationKeyError
 
 from experiments.common.config import hash_of, plain
 from experiments.runner.folder import RESULT, last_record
-from experiments.runner.request import model_settings
+from experiments.runner.request import Request, model_settings
 from mvest.errors import ConfigurationError
 from mvest.provenance import git_state, write_json
 
-__all__ = ["Plan", "PlannedJob", "expand", "make_plan", "plan_run"]
+__all__ = ["PLAN", "Plan", "PlannedJob", "expand", "grids", "make_plan", "plan_run"]
 
-SWEEPER = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
-"""The sweeper whose syntax and products are understood here."""
+PLAN = "plan.json"
+"""File in a sweep's folder with the jobs that it consists of."""
 
-MOST_READ = 500
+MAX_READ = 500
 """Results that are read to estimate a time."""
 
 
@@ -64,10 +65,7 @@ class PlannedJob:
     @property
     def label(self) -> str:
         """What sets the job apart, for a line of text."""
-        factors = self.values["factors"]
-        if factors:
-            return ", ".join(f"{name}={value}" for name, value in factors.items())
-        return " ".join(self.overrides)
+        return ", ".join(_texts(self.values["factors"])) or " ".join(self.overrides)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,25 +99,53 @@ class Plan:
     def write(self) -> None:
         """Write ``plan.json`` into the sweep's folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        created = time.gmtime()
+        jobs = [
+            {
+                "hash": job.config_hash[:16],
+                "folder": os.path.relpath(job.folder, self.folder),
+                "name": name,
+                "overrides": list(job.overrides),
+                "factors": job.values["factors"],
+                "row": job.values["row"],
+                "repeats": job.values.get("repeats", 1),
+            }
+            for job, name in zip(self.jobs, self.names(), strict=True)
+        ]
+        sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
+        try:
+            before = json.loads((self.folder / PLAN).read_text(encoding="utf-8"))
+            # The same jobs, perhaps with more of them, are the same sweep that goes on.
+            if {job["hash"] for job in before["jobs"]} <= {job["hash"] for job in jobs}:
+                sweep_id = before["sweep_id"]
+        except (OSError, ValueError, KeyError):
+            # The first sweep here.
+            pass
         write_json(
-            self.folder / "plan.json",
+            self.folder / PLAN,
             {
                 "sweep": self.sweep.get("name", self.name),
                 "size": self.sweep.get("size"),
-                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-                "jobs": [
-                    {
-                        "hash": job.config_hash[:16],
-                        "folder": os.path.relpath(job.folder, self.folder),
-                        "overrides": list(job.overrides),
-                        "factors": job.values["factors"],
-                        "row": job.values["row"],
-                        "repeats": job.values.get("repeats", 1),
-                    }
-                    for job in self.jobs
-                ],
+                "sweep_id": sweep_id,
+                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", created),
+                "jobs": jobs,
             },
         )
+
+    def names(self) -> list[str]:
+        """What sets each job apart from all others, in a few words."""
+        factors = [_texts(job.values["factors"]) for job in self.jobs]
+        shared = set(factors[0]).intersection(*factors)
+        found = [", ".join(text for text in texts if text not in shared) for texts in factors]
+        alike: dict[str, list[PlannedJob]] = {}
+        for name, job in zip(found, self.jobs, strict=True):
+            alike.setdefault(name, []).append(job)
+        names = []
+        for name, job in zip(found, self.jobs, strict=True):
+            common = set(job.overrides).intersection(*(other.overrides for other in alike[name]))
+            own = [line for line in job.overrides if line not in common]
+            names.append(", ".join(filter(None, [name, *own])) or str(job.values["row"]))
+        return names
 
     def summary(self) -> str:
         """How much is done and how much is left, in one line."""
@@ -166,7 +192,7 @@ class Plan:
         return f" ({other} of the done ones by another commit; force=true redoes)" if other else ""
 
 
-def make_plan(config: DictConfig, loader: ConfigLoader) -> Plan:
+def make_plan(config: DictConfig, loader: ConfigLoader, arguments: Sequence[str]) -> Plan:
     """Compose every job of a sweep, in Hydra's order.
 
     Parameters
@@ -174,6 +200,8 @@ def make_plan(config: DictConfig, loader: ConfigLoader) -> Plan:
     config : DictConfig
         The sweep's own configuration, with Hydra's part.
     loader : ConfigLoader
+    arguments : sequence of str
+        Of the command line.
 
     Raises
     ------
@@ -182,24 +210,23 @@ def make_plan(config: DictConfig, loader: ConfigLoader) -> Plan:
     HydraException, OmegaConfBaseException
         If a job cannot be composed.
     """
-    sweeper = config.hydra.sweeper["_target_"]
-    if sweeper != SWEEPER:
-        raise ConfigurationError(f"hydra/sweeper = {sweeper}, expected hydra/sweeper=basic")
     jobs: list[PlannedJob] = []
-    for overrides in expand(_grids(config), config.hydra.overrides.task, loader):
-        job = _planned(loader.load_sweep_config(config, overrides), overrides)
-        jobs.append(job)
+    for overrides in expand(grids(config), arguments, loader):
+        composed = loader.load_sweep_config(config, overrides)
+        HydraConfig.instance().set_config(composed)
+        place = Path(str(composed.hydra.sweep.dir)) / str(composed.hydra.sweep.subdir)
+        jobs.append(_planned(plain(composed), hash_of(composed), place, overrides))
     _require_different(jobs)
     sweep: dict[str, Any] = OmegaConf.to_container(config.sweep, resolve=True)  # type: ignore[assignment]
     folder = Path(str(config.hydra.sweep.dir))
     return Plan(str(config.name), folder, sweep, tuple(jobs), _workers(config))
 
 
-def plan_run(config: DictConfig) -> Plan:
+def plan_run(request: Request) -> Plan:
     """The plan of a run by itself."""
-    folder = Path(str(config.hydra.run.dir))
-    job = _planned(config, config.hydra.overrides.task, folder)
-    return Plan(str(config.name), folder.parent, {}, (job,), 1)
+    overrides = tuple(HydraConfig.get().overrides.task)
+    job = _planned(request.values, request.config_hash, request.folder, overrides)
+    return Plan(str(request.values["name"]), request.folder.parent, {}, (job,), 1)
 
 
 def expand(
@@ -219,36 +246,55 @@ def expand(
     found: list[list[str]] = []
     for grid in grids:
         lines = [f"{key}={value}" for key, value in grid.items()]
-        parsed = parser.parse_overrides([*lines, *arguments])
-        found += BasicSweeper.split_arguments(parsed, None)[0]
+        # What comes later takes the place of what was said before of the same setting.
+        choices = {
+            override.get_key_element(): _choices(override)
+            for override in parser.parse_overrides([*lines, *arguments])
+        }
+        found += [list(job) for job in product(*choices.values())]
     return found
 
 
-def _grids(config: DictConfig) -> list[dict[str, Any]]:
-    """The grids that a sweep's size, or Hydra's own parameters, stand for."""
-    try:
-        params = config.hydra.sweeper.params
-    except InterpolationKeyError:
+def grids(config: DictConfig) -> list[dict[str, Any]]:
+    """The grids that a sweep's size, or the sweeper's own parameters, stand for.
+
+    Raises
+    ------
+    ConfigurationError
+        If the sweep has no such size, or what it has there is no grid.
+    """
+    found = config.hydra.sweeper.get("params")
+    if config.sweep:
         sizes = [str(key) for key, value in config.sweep.items() if OmegaConf.is_config(value)]
-        raise ConfigurationError(
-            f"sweep.size = {config.sweep.get('size')!r}, expected one of {', '.join(sizes)}"
-        ) from None
-    if params is None:
+        size = config.sweep.get("size")
+        if size not in sizes:
+            raise ConfigurationError(f"sweep.size = {size!r}, expected one of {', '.join(sizes)}")
+        found = config.sweep[size]
+    if found is None:
         return [{}]
-    plain_params: Any = OmegaConf.to_container(params, resolve=True)
-    grids = plain_params if isinstance(plain_params, list) else [plain_params]
-    if not grids or not all(isinstance(grid, dict) for grid in grids):
+    plain_grids: Any = OmegaConf.to_container(found, resolve=True)
+    listed = plain_grids if isinstance(plain_grids, list) else [plain_grids]
+    if not listed or not all(isinstance(grid, dict) for grid in listed):
         raise ConfigurationError("hydra.sweeper.params: expected a grid or a list of grids")
-    return grids
+    return listed
+
+
+def _choices(override: Override) -> list[str]:
+    """What a line of Hydra's sweep syntax stands for, one override each."""
+    key = override.get_key_element()
+    if not override.is_sweep_override():
+        return [f"{key}={override.get_value_element_as_str()}"]
+    if not override.is_discrete_sweep():
+        kind = override.value_type.name if override.value_type else "unknown"
+        raise ConfigurationError(
+            f"{override.input_line}: a plan does not support sweep type {kind}"
+        )
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
 
 
 def _planned(
-    config: DictConfig, overrides: Sequence[str], folder: Path | None = None
+    values: dict[str, Any], config_hash: str, folder: Path, overrides: Sequence[str]
 ) -> PlannedJob:
-    if folder is None:
-        HydraConfig.instance().set_config(config)
-        folder = Path(str(config.hydra.sweep.dir)) / str(config.hydra.sweep.subdir)
-    config_hash, values = hash_of(config), plain(config)
     record = last_record(folder, config_hash)
     done = record is not None and record["status"] == "converged"
     return PlannedJob(config_hash, folder, tuple(overrides), values, record, done)
@@ -278,7 +324,7 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
     places = sorted(
         folders.glob(f"*/*/{RESULT}"), key=lambda place: place.parent.parent != plan.folder
     )
-    for place in places[:MOST_READ]:
+    for place in places[:MAX_READ]:
         try:
             record = json.loads(place.read_text(encoding="utf-8"))
             kind, seconds = json.dumps(record["model"]), float(record["seconds_total"])
@@ -290,6 +336,10 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
         if converged:
             found.setdefault(kind, []).append(seconds / seeds)
     return found
+
+
+def _texts(factors: Mapping[str, Any]) -> list[str]:
+    return [f"{name}={value}" for name, value in factors.items()]
 
 
 def _duration(seconds: float) -> str:

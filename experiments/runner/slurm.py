@@ -12,10 +12,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
@@ -24,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mvest.errors import ConfigurationError, MvestError
 
-__all__ = ["JobDiedError", "SlurmLauncher", "register_launcher"]
+__all__ = ["JobDiedError", "SlurmLauncher"]
 
 WORDS = {
     "OUT_OF_MEMORY": "it ran out of memory (hydra.launcher.mem_gb)",
@@ -35,10 +33,6 @@ WORDS = {
     "FAILED": "its process died",
 }
 """Slurm's states of a job that did not complete, in words."""
-
-
-PLACE = "hydra_plugins.mvest"
-"""Where Hydra finds the launcher: it takes plugins from modules of that package only."""
 
 SHARED = (
     "timeout_min", "cpus_per_task", "gpus_per_node", "mem_gb", "nodes", "name", "tasks_per_node",
@@ -61,8 +55,6 @@ class SlurmLauncher(Launcher):
     **settings
         As for the launcher of hydra-submitit-launcher.
     """
-
-    __module__ = PLACE
 
     def __init__(self, poll_s: float = 20.0, **settings: Any) -> None:
         self._poll_s = poll_s
@@ -138,14 +130,6 @@ class SlurmLauncher(Launcher):
             _ended(job, overrides, job in lost)
             for job, overrides in zip(jobs, job_overrides, strict=True)
         ]
-
-
-def register_launcher() -> None:
-    """Make the launcher known to Hydra; may be called again."""
-    module = ModuleType(PLACE)
-    setattr(module, SlurmLauncher.__name__, SlurmLauncher)
-    sys.modules[PLACE] = module
-    Plugins.instance().register(SlurmLauncher)
 
 
 def _for_executor(settings: dict[str, Any]) -> dict[str, Any]:

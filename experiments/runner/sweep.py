@@ -1,10 +1,4 @@
-"""From a sweep's plan to its file of results: skip what is done, launch the rest, collect.
-
-Hydra's own sweeper would launch every job, also those that are done. So the jobs are planned before
-anything is launched, handed to the configured launcher here, and Hydra's sweeper is not reached.
-Hydra turns exceptions of its callbacks into warnings; what has to end the application is therefore
-no ``Exception``.
-"""
+"""From a sweep's plan to its file of results: skip what is done, launch the rest, collect, log."""
 
 from __future__ import annotations
 
@@ -12,121 +6,76 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, NoReturn
+from typing import Any
 
-from hydra._internal.callbacks import Callbacks
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
-from hydra.experimental.callback import Callback
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from experiments.common.progress import SweepBar, announce_compilation
+from experiments.common.progress import announce_compilation
 from experiments.results.page import write_report
 from experiments.runner.check import require_admissible
-from experiments.runner.collect import collect
-from experiments.runner.folder import is_done, require_writable, write_failure
+from experiments.runner.collect import NOT_RUN, collect
+from experiments.runner.folder import is_done, nothing_empty, require_writable, write_failure
 from experiments.runner.guard import run_guarded
 from experiments.runner.job import FailedRunError, require_study, run_job
-from experiments.runner.plan import Plan, PlannedJob, make_plan, plan_run
+from experiments.runner.plan import Plan, PlannedJob, make_plan
+from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request, as_published
+from experiments.runner.sync import log_sweep, open_early
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
 
-__all__ = ["LaunchSweep", "PlanRuns", "StopApplication", "sweep_task"]
+__all__ = ["run_sweep", "sweep_task"]
 
 FILE = "sweep.json"
 """The results of a sweep, in its folder."""
 
 
-PLANNED: ContextVar[Plan] = ContextVar("PLANNED")
-"""The plan of the sweep that is being started: Hydra lets callbacks share nothing else."""
-
-
-class StopApplication(BaseException):
-    """Ends the application from within a callback of Hydra's.
-
-    Attributes
-    ----------
-    status : int
-        Exit status.
-    error : Exception or None
-        What went wrong.
-    """
-
-    def __init__(self, status: int, error: Exception | None = None) -> None:
-        super().__init__(status, error)
-        self.status = status
-        self.error = error
-
-
-@contextmanager
-def _nothing_goes_on() -> Iterator[None]:
-    """Whatever is raised ends the application: Hydra would warn, and launch every job itself."""
-    try:
-        yield
-    except Exception as error:
-        raise StopApplication(2, error) from error
-
-
-class PlanRuns(Callback):
-    """Finds out what a request means, and refuses a wrong one, before anything is written."""
-
-    @_nothing_goes_on()
-    def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Say what would run, if that is all that is asked."""
-        if config.dry_run:
-            plan = plan_run(config)
-            require_admissible(plan.jobs[0].values)
-            _tell(plan)
-
-    @_nothing_goes_on()
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Compose and check every job; say what is done and what is left."""
-        plan = make_plan(config, GlobalHydra.instance().config_loader())
-        for job in plan.jobs:
-            _check(job.values, job.overrides)
-        if config.dry_run:
-            _tell(plan)
-        if config.check:
-            _foresee(plan)
-        require_writable(plan.folder)
-        plan.write()
-        print(plan.summary())
-        PLANNED.set(plan)
-
-
-class LaunchSweep(Callback):
-    """Runs a planned sweep and collects its results."""
-
-    @_nothing_goes_on()
-    def on_multirun_start(self, config: DictConfig, **more: Any) -> None:
-        """Launch what is to be run, collect, and end the application."""
-        callbacks = Callbacks(config)
-        context = HydraContext(GlobalHydra.instance().config_loader(), callbacks)
-        try:
-            status = run_sweep(config, PLANNED.get(), context)
-        finally:
-            callbacks.on_multirun_end(config=config, **more)
-        raise StopApplication(status)
-
-
-def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
-    """Launch the jobs that are not done and write ``sweep.json``, whatever becomes of them.
+def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str]) -> int:
+    """Find out what a request means, refuse a wrong one before anything is written, and run it.
 
     Parameters
     ----------
+    context : HydraContext
     config : DictConfig
         The sweep's own, with Hydra's part.
-    plan : Plan
-    context : HydraContext
+    arguments : sequence of str
+        Of the command line.
+
+    Returns
+    -------
+    int
+        Exit status: 1 if a job has no estimate.
+
+    Raises
+    ------
+    MvestError, HydraException, OmegaConfBaseException
+        If the request is wrong.
+    """
+    plan = make_plan(config, context.config_loader, arguments)
+    for job in plan.jobs:
+        _check(job.values, job.overrides)
+    if config.dry_run:
+        _tell(plan)
+        return 0
+    if config.check:
+        _foresee(plan)
+        return 0
+    with nothing_empty(plan.folder, Path(config.paths.outputs)):
+        require_writable(plan.folder)
+        plan.write()
+    print(plan.summary())
+    return run_plan(config, plan, context)
+
+
+def run_plan(config: DictConfig, plan: Plan, context: HydraContext) -> int:
+    """Launch the jobs that are not done, and write and log what became of all of them.
 
     Returns
     -------
@@ -143,8 +92,10 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
     returned: dict[str, dict[str, Any]] = {}
     left = plan.to_run
     lost = interrupted = None
+    # Before any worker starts: the store is made by one process, and a wrong address is seen now.
+    store = open_early(config, plan) if config.tracking.enabled else None
     if left:
-        announce_compilation()
+        announce_compilation("the first jobs")
         try:
             with SweepBar(plan):
                 returned = _launch(config, left, context)
@@ -159,19 +110,21 @@ def run_sweep(config: DictConfig, plan: Plan, context: HydraContext) -> int:
     path = plan.folder / FILE
     found = collect(plan, returned, _measured(path))
     write_json(path, found)
-    failed = [job for job in found["jobs"] if job["status"] != "converged"]
     if lost is not None:
         print(
             f"error: the launcher lost its jobs ({lost}); run the same command again to go on",
             file=sys.stderr,
         )
-    print(_outcome(plan, found, len(failed)))
+    print(_outcome(plan, found))
     print(f"Written to {path}")
     if interrupted is not None:
         raise interrupted
+    if config.tracking.enabled:
+        log_sweep(config, plan, store)
     if lost is None:
         _publish(config, plan, found)
-    return 1 if failed or lost is not None else 0
+    done = all(job["status"] == "converged" for job in found["jobs"])
+    return 0 if done and lost is None else 1
 
 
 def _launch(
@@ -211,12 +164,16 @@ def _completed(end: JobReturn) -> bool:
     return end.status == JobStatus.COMPLETED
 
 
-def _outcome(plan: Plan, found: Mapping[str, Any], failed: int) -> str:
+def _outcome(plan: Plan, found: Mapping[str, Any]) -> str:
     """How a sweep ended, in one line."""
     total, ran = len(plan.jobs), len(plan.to_run)
-    text = f"{plan.name}: {total - failed} of {total} jobs done ({total - ran} before), "
-    text += f"{failed} without an estimate; "
-    text += f"stored truths used {found['truth_hits']} times, {found['truth_misses']} simulated"
+    failed = [job for job in found["jobs"] if job["status"] != "converged"]
+    missing = sum(job["reason"] == NOT_RUN for job in failed)
+    text = f"{plan.name}: {total - len(failed)} of {total} jobs done ({total - ran} before), "
+    text += f"{len(failed) - missing} without an estimate"
+    if missing:
+        text += f", {missing} not finished"
+    text += f"; stored truths used {found['truth_hits']} times, {found['truth_misses']} simulated"
     overheads = [cost["overhead"] for cost in found["cost"] if cost["overhead"] is not None]
     if overheads:
         text += f"; overhead {median(overheads):.2f} s per job"
@@ -250,21 +207,19 @@ def _check(values: Mapping[str, Any], overrides: Sequence[str]) -> None:
         raise ConfigurationError(f"{error} (job {' '.join(overrides)})") from error
 
 
-def _tell(plan: Plan) -> NoReturn:
-    """Say what would run, and end."""
+def _tell(plan: Plan) -> None:
+    """Say what would run."""
     print(plan.summary())
     print(plan.listing())
-    raise StopApplication(0)
 
 
-def _foresee(plan: Plan) -> NoReturn:
-    """Say what the data of each job will tell, and end."""
+def _foresee(plan: Plan) -> None:
+    """Say what the data of each job will tell."""
     checks = require_study(plan.jobs[0].values).checks()
     for job in plan.jobs:
         if not checks or job.values["study"] != plan.jobs[0].values["study"]:
             raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")
         print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")
-    raise StopApplication(0)
 
 
 def _first_sentence(error: BaseException) -> str:

@@ -1,10 +1,10 @@
-"""Logging to MLflow: flat runs, uploaded from the folders that jobs leave behind.
+"""Logging to MLflow: flat runs, from the folders that jobs leave behind.
 
-A job writes its files and is done. The process that a user started uploads them: a single run at
-its end, a sweep's parent while the sweep runs, ``python -m experiments.sync`` at any later time. So
-workers neither import MLflow, which takes seconds, nor need to reach its server, a store has one
-writer, and what could not be uploaded is complete on disk. A folder whose ``tracked.json`` fits its
-``result.json`` has been uploaded; every other one is still to be.
+A job writes its files and is done. The process that a user started logs them at its end, a single
+run's or a sweep's; ``python -m experiments.runner.sync`` does so at any time. So workers neither
+import MLflow, which takes seconds, nor need to reach its server, a store has one writer, and what
+could not be logged is complete on disk. A folder whose ``tracked.json`` fits its ``result.json``
+has been logged; every other one is still to be.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from experiments.runner.comparison import inputs, metrics, parameters
+from experiments.runner.folder import is_done
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.provenance import write_json
 
@@ -35,15 +36,14 @@ __all__ = [
     "NO_SWEEP",
     "RECEIPT",
     "REMEDY",
-    "SWEEP_UPLOADS",
     "Store",
     "TrackingError",
     "first_line",
+    "is_complete",
     "is_tracked",
     "open_store",
     "read_json",
     "require_no_password",
-    "telling",
     "track_job",
     "upload",
 ]
@@ -53,9 +53,6 @@ RECEIPT = "tracked.json"
 
 NO_SWEEP = "none"
 """Sweep of a run that was started by itself."""
-
-SWEEP_UPLOADS = "MVEST_SWEEP_UPLOADS"
-"""Environment variable that tells the jobs of a sweep that their parent uploads their results."""
 
 REMEDY = "every result is on disk, and `make sync` uploads what is missing"
 
@@ -185,18 +182,23 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
 
 
 def track_job(folder: Path, config: Mapping[str, Any]) -> None:
-    """Upload the result of a run by itself; a sweep's jobs are left to the process that started it.
+    """Log the result of a run by itself, if it has one that is not logged yet.
 
-    A store that fails costs a line of warning: the result is on disk, to be uploaded later.
+    A store that fails costs a line of warning: the result is on disk, to be logged later.
     """
-    if not config["tracking"]["enabled"] or SWEEP_UPLOADS in os.environ:
+    if not config["tracking"]["enabled"] or not (folder / "result.json").is_file():
         return
     try:
-        outputs = Path(config["paths"]["outputs"])
-        store = open_store(config["tracking"]["uri"], outputs, str(config["name"]))
-        upload(store, folder, NO_SWEEP)
+        if is_complete(folder) and not is_tracked(folder):
+            outputs = Path(config["paths"]["outputs"])
+            upload(open_store(config["tracking"]["uri"], outputs, str(config["name"])), folder)
     except MvestError as error:
         print(f"warning: {error}; {REMEDY}", file=sys.stderr)
+
+
+def is_complete(job: Path) -> bool:
+    """Whether a job has ended: it has failed, or its marker says that everything is on disk."""
+    return is_done(job) or read_json(job / "result.json").get("status") != "converged"
 
 
 def is_tracked(folder: Path) -> bool:
@@ -207,11 +209,13 @@ def is_tracked(folder: Path) -> bool:
     return bool(read_json(receipt).get("result_hash") == _digest(folder / "result.json"))
 
 
-def upload(store: Store, folder: Path, sweep_id: str | None) -> bool:
+def upload(
+    store: Store, folder: Path, sweep_id: str | None = None, name: str | None = None
+) -> bool:
     """Bring the store to the state of a job's folder; returns whether a run was added.
 
-    A run of the same configuration and result is left as it is, save for its sweep. One with
-    another result, or one that was never finished, is replaced.
+    A run of the same configuration and result is left as it is, save for its sweep and its name.
+    One with another result, or one that was never finished, is replaced.
 
     Parameters
     ----------
@@ -220,6 +224,8 @@ def upload(store: Store, folder: Path, sweep_id: str | None) -> bool:
         With ``config.json`` and ``result.json``.
     sweep_id : str or None
         None keeps the sweep that the folder or the store knows.
+    name : str, optional
+        What sets the run apart from the others of its sweep; its row in a table if not given.
 
     Raises
     ------
@@ -246,12 +252,15 @@ def upload(store: Store, folder: Path, sweep_id: str | None) -> bool:
     sweep_id = sweep_id or str(receipt.get("sweep_id", NO_SWEEP))
     if present is None:
         store.changed.add(config_hash)
-        run_id = _log(store, folder, record, config, sweep_id, result_hash)
+        name = name or str(record["row"])
+        run_id = _log(store, folder, record, config, name, sweep_id, result_hash)
     else:
         run_id = present.info.run_id
-        if present.data.tags.get("sweep_id") != sweep_id:
-            with telling(store.place):
+        with telling(store.place):
+            if present.data.tags.get("sweep_id") != sweep_id:
                 store.client.set_tag(run_id, "sweep_id", sweep_id)
+            if name and present.info.run_name != name:
+                store.client.update_run(run_id, name=name)
     written = {"run_id": run_id, "sweep_id": sweep_id, "result_hash": result_hash}
     if written != receipt:
         write_json(folder / RECEIPT, written)
@@ -297,6 +306,7 @@ def _log(
     folder: Path,
     record: Mapping[str, Any],
     config: Mapping[str, Any],
+    name: str,
     sweep_id: str,
     result_hash: str,
 ) -> str:
@@ -335,7 +345,7 @@ def _log(
             store.client.create_run(
                 store.experiment,
                 start_time=begin,
-                run_name=str(record["row"]),
+                run_name=name,
                 tags={k: str(v)[:LONGEST_TEXT] for k, v in tags.items() if v is not None},
             ).info.run_id
         )

@@ -12,13 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common import progress
-from experiments.common.progress import SweepBar
 from experiments.run import main
-from experiments.runner import guard, sweep
+from experiments.runner import guard, progress, sweep
 from experiments.runner.folder import mark_done, write_failure
 from experiments.runner.job import STUDIES
 from experiments.runner.plan import Plan, PlannedJob
+from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request
 from mvest.provenance import write_json
 from tests.places import ROOT
@@ -138,9 +137,8 @@ def test_a_dry_run_lists_what_would_run_and_touches_nothing(run):
     assert len(runs()) == 4
 
 
-@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_sweep", "_tell"])
+@pytest.mark.parametrize("broken", ["make_plan", "require_admissible", "run_plan", "_tell"])
 def test_nothing_is_launched_after_a_mistake_of_ours(run, monkeypatch, broken):
-    # Hydra only warns of what a callback raises, and would then launch every job in its own way.
     def fail(*_):
         raise ZeroDivisionError("a mistake")
 
@@ -223,7 +221,7 @@ def test_a_wrong_sweep_is_one_clear_line_and_launches_nothing(run, overrides, wo
     assert len(err.splitlines()) == 1, err
     assert words in err
     assert runs() == []
-    assert [path.name for path in Path().rglob("*") if path.is_file()] == ["file"]
+    assert [path.name for path in Path().rglob("*")] == ["file"], "not even an empty folder"
 
 
 def test_a_wrong_job_is_named(run):
@@ -248,7 +246,7 @@ def test_a_full_disk_is_a_clear_error_and_leaves_no_half_file(run, monkeypatch):
     assert (status, out) == (2, "")
     assert "plan.json: No space left on device" in err
     assert len(err.splitlines()) == 1
-    assert not [path for path in Path().rglob("*") if path.is_file()]
+    assert not list(Path().iterdir())
 
 
 def test_a_disk_that_fills_up_within_a_job_costs_its_row(run):
@@ -284,9 +282,11 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
 
     run("sweep=debug", "filter.initial=[5,3]")
     monkeypatch.setattr(BasicLauncher, "launch", interrupt)
-    status, _, err = run("sweep=debug")
+    status, out, err = run("sweep=debug")
     assert status == 130
     assert err.startswith("interrupted")
+    assert "the same command goes on from there" in err
+    assert "2 of 4 jobs done (2 before), 0 without an estimate, 2 not finished" in out
     states = [job["status"] for job in collected()["jobs"]]
     assert states == ["converged", "converged", "failed", "failed"]
 

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from experiments.common.build import build_filter, build_twin
 from experiments.common.config import hash_of, register
+from experiments.runner.plan import expand, grids
+from experiments.runner.plugins import register_plugins
 from experiments.studies.twin.study import run_twin
 from mvest.errors import MvestError
 from tests.places import CONF
@@ -40,20 +40,10 @@ def no_hydra_left_over():
     GlobalHydra.instance().clear()
 
 
-def grids(name: str, size: str) -> list[dict]:
+def jobs(name: str, size: str) -> list[list[str]]:
     config = compose("config", [f"sweep={name}", f"sweep.size={size}"], return_hydra_config=True)
     assert config.hydra.mode.name == "MULTIRUN"
-    found = OmegaConf.to_container(config.hydra.sweeper.params, resolve=True)
-    return found if isinstance(found, list) else [found]
-
-
-def jobs(name: str, size: str) -> list[list[str]]:
-    parser = OverridesParser.create()
-    found = []
-    for grid in grids(name, size):
-        lines = [f"{key}={value}" for key, value in grid.items()]
-        found += BasicSweeper.split_arguments(parser.parse_overrides(lines), None)[0]
-    return found
+    return expand(grids(config), [], GlobalHydra.instance().config_loader())
 
 
 def composed(*overrides: str) -> tuple[str, dict]:
@@ -65,6 +55,7 @@ def composed(*overrides: str) -> tuple[str, dict]:
 @pytest.fixture
 def configuration():
     register()
+    register_plugins()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         yield
 

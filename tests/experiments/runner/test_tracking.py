@@ -9,13 +9,15 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
-from experiments import sync
-from experiments.dashboard import save_comparison, view_state
-from experiments.runner import comparison, tracking
+from experiments.runner import comparison, sync, tracking
+from experiments.runner.dashboard import last_comparison
+from experiments.runner.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
 from mvest.errors import ConfigurationError, InputError
 
@@ -145,18 +147,6 @@ def test_a_failed_run_has_no_errors() -> None:
     found = {name: value for name, value, _ in comparison.metrics(record)}
     assert found["failed"] == 1
     assert not [name for name in found if name.startswith(("error", "estimate", "distance"))]
-
-
-def test_axes_are_what_varies_in_the_order_of_a_study() -> None:
-    settings = {"noise": "0.5", "filter": "paper", "P0": "0.1", "initial.a": "5", "rows": "3"}
-    numbers = ["error.mean", "error.a", "seconds"]
-    settings |= {"cells": "3"}
-    changed = {"rows": "4", "cells": "4", "filter": "iterated"}
-    runs = [(settings, numbers), ({**settings, **changed}, numbers)]
-    assert comparison.axes(runs) == (
-        ["P0", "initial.a", "noise", "rows"],
-        ["error.a", "error.mean"],
-    )
 
 
 # --- upload -------------------------------------------------------------------------------------
@@ -302,67 +292,102 @@ def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read
 # --- a sweep ------------------------------------------------------------------------------------
 
 
-def test_a_sweep_is_uploaded_while_it_runs(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(sync, "INTERVAL", 0.05)
+def asked(outputs: Path, uri: str | None = None) -> DictConfig:
+    """What a sweep's own configuration says of its store."""
+    return OmegaConf.create({"tracking": {"uri": uri}, "paths": {"outputs": str(outputs)}})
+
+
+def make_plan(outputs: Path, **factors: dict) -> Plan:
+    """A sweep whose jobs are in folders of these names."""
+    jobs = [
+        PlannedJob(
+            (name * 64)[:64],
+            outputs / "debug" / name,
+            (f"seed={number}",),
+            {"factors": varied, "row": "white noise", "force": False},
+            None,
+            False,
+        )
+        for number, (name, varied) in enumerate(factors.items())
+    ]
+    plan = Plan("debug", outputs / "debug", {}, tuple(jobs), 1)
+    plan.write()
+    return plan
+
+
+def test_a_sweep_is_logged_at_its_end(tmp_path) -> None:
     upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, "before"), "an-earlier-sweep")
     untracked = make_config(tmp_path)
     untracked["tracking"]["enabled"] = False
-    make_job(tmp_path, "kept-quiet", untracked)
-    plan = {"jobs": [{"folder": name} for name in ("before", "kept-quiet", "a", "b")]}
-    (tmp_path / "debug" / "plan.json").write_text(json.dumps(plan))
-    uploader = sync.SweepUploader(None, tmp_path, "debug")
-    uploader.start()
-    job = make_job(tmp_path, "a")
-    until = time.monotonic() + 30.0
-    while not (job / RECEIPT).exists() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert (job / RECEIPT).exists()
-    make_job(tmp_path, "b")
-    make_job(tmp_path, "of-another-sweep")
-    uploader.finish()
-    found = {run.data.tags["folder"]: run.data.tags["sweep_id"] for run in stored(tmp_path)}
-    sweep = json.loads((tmp_path / "debug" / sync.LAST_SWEEP).read_text())
+    make_job(tmp_path, "quiet", untracked)
+    make_job(tmp_path, "a")
+    (make_job(tmp_path, "cut") / "done").unlink()
+    make_job(tmp_path, "other")
+    varied = {name: {"P0": number, "Q": 1} for number, name in enumerate(("before", "quiet", "a"))}
+    plan = make_plan(tmp_path, **varied, cut={"P0": 7, "Q": 1}, missing={"P0": 8, "Q": 1})
+    store = sync.open_early(asked(tmp_path), plan)
+    assert store is not None
+    sync.log_sweep(asked(tmp_path), plan, store)
     # Whoever sweeps with tracking wants to see the whole sweep, whatever its jobs were told before.
-    assert sweep["jobs"] == ["a", "b", "before", "kept-quiet"]
-    assert {name for name, one in found.items() if one == sweep["sweep_id"]} == set(sweep["jobs"])
-    assert found["of-another-sweep"] == "none"
+    sweep_id = json.loads((tmp_path / "debug" / PLAN).read_text())["sweep_id"]
+    found = {run.data.tags["folder"]: run for run in stored(tmp_path)}
+    assert set(found) == {"before", "quiet", "a"}
+    assert {run.data.tags["sweep_id"] for run in found.values()} == {sweep_id}
+    # Named by what differs between them.
+    assert {name: run.info.run_name for name, run in found.items()} == {
+        "before": "P0=0", "quiet": "P0=1", "a": "P0=2",
+    }  # fmt: skip
 
-    store, compared = save_comparison(tmp_path)
-    assert len(compared.runs) == 4
-    assert compared.parameters[:2] == ("P0", "initial.anterior")
-    assert compared.metrics == ("error.anterior", "error.posterior", "error.mean")
-    tags = store.client.get_experiment(store.experiment).tags
-    saved = json.loads(tags["mlflow.sharedViewState.last_sweep"])
-    assert json.loads(saved["state"]) == view_state(compared)
+    assert sync.main([str(tmp_path)]) == 0
+    (other,) = [run for run in stored(tmp_path) if run.data.tags["folder"] == "other"]
+    assert (other.data.tags["sweep_id"], other.info.run_name) == ("none", "white noise")
 
-    again = sync.SweepUploader(None, tmp_path, "debug")
-    again.start()
-    again.finish()
-    resumed = json.loads((tmp_path / "debug" / sync.LAST_SWEEP).read_text())
-    assert resumed["sweep_id"] == sweep["sweep_id"], "a resumed sweep is the same sweep"
+    compared = last_comparison(tmp_path)
+    assert set(compared.runs) == {run.info.run_id for run in found.values()}
+    page = compared.page("http://here")
+    assert page.startswith("http://here/#/compare-runs?runs=%5B%22")
+    assert all(run in page for run in compared.runs)
+    many = replace(compared, runs=("r",) * 200).page("http://here")
+    assert many.endswith(f"/runs?searchFilter=tags.sweep_id%20%3D%20%22{sweep_id}%22")
 
 
-def test_a_sweep_without_its_store_warns_once(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sync, "INTERVAL", 0.05)
-    uploader = sync.SweepUploader("nonsense://place", tmp_path, "debug")
-    uploader.start()
-    job = make_job(tmp_path, "a")
-    uploader.finish()
+def test_a_sweep_that_goes_on_is_the_same_one(tmp_path) -> None:
+    def sweep_id(*names: str) -> str:
+        make_plan(tmp_path, **{name: {"P0": name} for name in names})
+        return json.loads((tmp_path / "debug" / PLAN).read_text())["sweep_id"]
+
+    first = sweep_id("a", "b")
+    assert sweep_id("a", "b") == first
+    assert sweep_id("a", "b", "c") == first
+    assert sweep_id("a", "d") != first
+
+
+def test_runs_of_the_same_factors_are_named_by_what_else_differs(tmp_path) -> None:
+    plan = make_plan(tmp_path, a={"kind": "x"}, b={"kind": "x"}, c={"kind": "y"})
+    assert plan.names() == ["kind=x, seed=0", "kind=x, seed=1", "kind=y"]
+    assert make_plan(tmp_path, a={"kind": "x"}).names() == ["white noise"]
+
+
+def test_a_sweep_without_its_store_warns_and_loses_nothing(tmp_path, capsys) -> None:
+    config = asked(tmp_path, "nonsense://place")
+    job, plan = make_job(tmp_path, "a"), make_plan(tmp_path, a={})
+    assert sync.open_early(config, plan) is None
+    assert "warning: tracking store nonsense://place" in capsys.readouterr().err
+    sync.log_sweep(config, plan, None)
     said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 2
-    assert "tracking store nonsense://place" in said[0]
-    assert said[1] == "warning: 1 of 1 runs are not in MLflow"
+    assert len(said) == 1
+    assert said[0].startswith("warning: 1 of 1 runs are not in MLflow: tracking store nonsense://")
+    assert said[0].endswith("`make sync` uploads what is missing")
     assert (job / "result.json").exists()
 
 
 def test_no_sweep_is_said_so(tmp_path) -> None:
     with pytest.raises(InputError, match="no finished sweep"):
-        save_comparison(tmp_path)
+        last_comparison(tmp_path)
 
 
 @pytest.mark.slow
 def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(sync, "INTERVAL", 0.05)
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
 
     def serve() -> subprocess.Popen:
@@ -392,19 +417,21 @@ def test_a_server_killed_in_the_middle_loses_nothing(tmp_path, capsys, monkeypat
     config = make_config(tmp_path, tracking={"enabled": True, "uri": uri})
     server = serve()
     try:
-        uploader = sync.SweepUploader(uri, tmp_path, "debug")
-        uploader.start()
-        first = make_job(tmp_path, "a", config)
-        until = time.monotonic() + 60.0
-        while not (first / RECEIPT).exists() and time.monotonic() < until:
-            time.sleep(0.05)
-        assert (first / RECEIPT).exists()
-        kill(server)
-        second = make_job(tmp_path, "b", config)
-        uploader.finish()
+        first, second = (make_job(tmp_path, name, config) for name in "ab")
+        plan = make_plan(tmp_path, a={}, b={})
+        store = sync.open_early(asked(tmp_path, uri), plan)
+        true = store.client.log_batch
+
+        def die(run_id: str, **values) -> None:
+            true(run_id, **values)
+            if (first / RECEIPT).exists():
+                kill(server)
+
+        monkeypatch.setattr(store.client, "log_batch", die)
+        sync.log_sweep(asked(tmp_path, uri), plan, store)
         said = capsys.readouterr().err.strip().splitlines()
-        assert len(said) == 2
-        assert said[1] == "warning: 1 of 2 runs are not in MLflow"
+        assert len(said) == 1
+        assert said[0].startswith("warning: 1 of 2 runs are not in MLflow")
         assert not (second / RECEIPT).exists()
         server = serve()
         assert sync.main([str(tmp_path)]) == 0
