@@ -11,6 +11,7 @@ import difflib
 import os
 import sys
 from itertools import takewhile
+from pathlib import Path
 
 import hydra
 from hydra.errors import HydraException, OverrideParseException
