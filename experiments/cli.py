@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.add_argument("folder", nargs="?", default="results", metavar="FOLDER")
             return tables([parser.parse_args(rest).folder])
         case "dashboard":
-            from experiments.dashboard import main as dashboard
+            from experiments.runner.dashboard import main as dashboard
 
             return dashboard(rest)
         case _:
