@@ -344,10 +344,10 @@ def test_a_sweep_is_logged_at_its_end(tmp_path) -> None:
 
     compared = last_comparison(tmp_path)
     assert set(compared.runs) == {run.info.run_id for run in found.values()}
-    page = compared.page("http://here")
-    assert page.startswith("http://here/#/compare-runs?runs=%5B%22")
+    page = compared.page("http://127.0.0.1")
+    assert page.startswith("http://127.0.0.1/#/compare-runs?runs=%5B%22")
     assert all(run in page for run in compared.runs)
-    many = replace(compared, runs=("r",) * 200).page("http://here")
+    many = replace(compared, runs=("r",) * 200).page("http://127.0.0.1")
     assert many.endswith(f"/runs?searchFilter=tags.sweep_id%20%3D%20%22{sweep_id}%22")
 
 
