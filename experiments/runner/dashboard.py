@@ -68,7 +68,10 @@ class Comparison:
             return f"{server}/#/experiments/{self.experiment}/runs?searchFilter={chosen}"
         runs = json.dumps(self.runs, separators=(",", ":"))
         experiments = json.dumps([self.experiment])
-        return f"{server}/#/compare-runs?runs={quote(runs)}&experiments={quote(experiments)}"
+        return (
+            f"{server}/#/compare-runs?runs={quote(runs)}&experiments={quote(experiments)}"
+            "&workflowType=machine_learning"
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -161,7 +164,7 @@ def serving(
             with suppress(ProcessLookupError):
                 os.killpg(server.pid, end)
             with suppress(subprocess.TimeoutExpired):
-                server.wait(10.0)
+                server.wait(5.0)
         for name, handler in before.items():
             signal.signal(name, handler)
 

@@ -13,6 +13,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image
+
 from experiments.runner.dashboard import last_comparison, serving
 from mvest.errors import InputError, MvestError
 
@@ -21,10 +23,12 @@ __all__ = ["look_at", "main"]
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--disable-dev-shm-usage", "--hide-scrollbars", "--window-size=1600,970",
-    "--virtual-time-budget=30000",
+    "--disable-dev-shm-usage", "--hide-scrollbars", "--virtual-time-budget=30000",
 )  # fmt: skip
 """Chromium as a program that speaks to nobody but the page, which it gives 30 s to draw itself."""
+
+PICTURE, PANEL = (1600, 970), 410
+"""Pixels of the picture, and of the panel at its right with which a new user is greeted."""
 
 PATIENCE = 120.0
 """Seconds of the clock that a page may take."""
@@ -40,6 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         comparison = last_comparison(given.outputs)
         with serving(comparison.place, given.outputs, 0, quiet=True) as (address, _):
             look_at(comparison.page(address), f"--screenshot={given.to.resolve()}")
+        with Image.open(given.to) as picture:
+            cropped = picture.crop((0, 0, *PICTURE))
+        cropped.save(given.to)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -59,18 +66,11 @@ def look_at(address: str, what: str) -> str:
     if program is None:
         raise InputError("Chromium is not installed (Debian: apt install chromium)")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        command = [program, *FLAGS, f"--user-data-dir={profile}"]
+        window = f"--window-size={PICTURE[0] + PANEL},{PICTURE[1]}"
+        command = [program, *FLAGS, window, f"--user-data-dir={profile}", what, address]
         try:
-            # A new profile is greeted by a panel that covers a third of the first page it sees.
-            subprocess.run(
-                [*command, "--dump-dom", address], check=True, capture_output=True, timeout=PATIENCE
-            )
             seen = subprocess.run(
-                [*command, what, address],
-                check=True,
-                capture_output=True,
-                text=True,
-                timeout=PATIENCE,
+                command, check=True, capture_output=True, text=True, timeout=PATIENCE
             )
         except (subprocess.SubprocessError, OSError) as error:
             raise InputError(f"Chromium shows no page: {error}") from error

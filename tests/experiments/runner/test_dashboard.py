@@ -1,102 +1,109 @@
-"""What a reader sees: MLflow's pages on a real sweep, in a real browser."""
+"""What a reader sees: MLflow's pages on a real sweep, in a real browser; and how they end."""
 
 import json
 import os
+import re
+import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from experiments import screenshot
+from experiments.runner import dashboard, screenshot
 from mvest.errors import InputError
 from tests.places import ROOT
 
 pytestmark = pytest.mark.slow
+
+PATHS = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
 
 
 @pytest.fixture(scope="module")
 def outputs(tmp_path_factory) -> Path:
     """A real sweep of four jobs."""
     place = tmp_path_factory.mktemp("sweep")
-    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     subprocess.run(
         [sys.executable, "-m", "experiments.run", "-m", "sweep=debug"],
-        cwd=place, env=os.environ | {"PYTHONPATH": paths}, check=True, timeout=600,
+        cwd=place, env=os.environ | {"PYTHONPATH": PATHS}, check=True, timeout=600,
     )  # fmt: skip
     return place / "outputs"
 
 
 @pytest.fixture(scope="module")
-def shown(outputs):
-    """The server's address, what is compared, and the browser."""
+def shown(outputs) -> str:
+    """The comparison's page as it is drawn."""
+    compared = dashboard.last_comparison(outputs)
     try:
-        with screenshot.browser() as page, screenshot.served(outputs) as (address, compared):
-            page.get(address)
-            page.execute_script(screenshot.NO_ASSISTANT)
-            yield page, address, compared
+        with dashboard.serving(compared.place, outputs, 0, quiet=True) as (address, _):
+            return screenshot.look_at(compared.page(address), "--dump-dom")
     except InputError as error:
         if "not installed" in str(error):
             pytest.skip(str(error))
         raise
 
 
-def run_links(page) -> set[str]:
-    return set(
-        page.execute_script(
-            "return [...document.querySelectorAll('a[href*=\"/runs/\"]')]"
-            ".map(e => e.getAttribute('href').split('/runs/')[1].split(/[/?]/)[0])"
-        )
-    )
+def test_the_page_compares_every_run_and_calls_it_by_what_differs(shown, outputs) -> None:
+    jobs = json.loads((outputs / "sweep_debug" / "plan.json").read_text())["jobs"]
+    assert f"Comparing {len(jobs)} Runs" in shown
+    runs = set(dashboard.last_comparison(outputs).runs)
+    assert set(re.findall(r"/runs/([0-9a-f]{32})", shown)) == runs
+    assert len(runs) == len(jobs) == 4
+    for job in jobs:
+        assert job["name"] in shown
+        assert job["hash"] not in job["name"]
 
 
-def jobs(outputs) -> int:
-    return len(json.loads((outputs / "sweep_debug" / "plan.json").read_text())["jobs"])
-
-
-def test_the_saved_view_shows_every_run_and_its_axes(shown, outputs) -> None:
-    page, address, compared = shown
-    page.get(compared.chart_page(address))
-    names = [*compared.parameters, *compared.metrics]
-    assert {"P0", "initial.anterior", "noise", "error.anterior", "seed"} <= set(names)
-    screenshot.await_axes(page, names)
-    assert run_links(page) == set(compared.runs)
-    assert len(compared.runs) == jobs(outputs)
-    assert page.execute_script(
-        "return document.body.innerText.includes('Last sweep')"
-        f" && document.body.innerText.includes('{len(compared.runs)} matching runs')"
-    )
+def test_its_axes_are_settings_that_differ_and_the_error(shown) -> None:
+    axes = re.findall(r'class="axis-title"[^>]*>([^<]*)<', shown)
+    # P0 and the noise are the same in all of them: they have no axis.
+    assert axes == ["initial.anterior", "initial.posterior", "seed", "error.mean"]
     # Numbers along the axes, not names: a setting that MLflow takes for text has no scale.
-    ticks = page.execute_script(
-        "return [...document.querySelectorAll('g.dimension')].map(axis =>"
-        " [...axis.querySelectorAll('.tick text')].map(e => e.textContent))"
-    )
-    assert len(ticks) == len(names)
-    for labels in ticks:
-        assert labels
-        assert all(float(label.replace("−", "-")) is not None for label in labels)
-
-
-def test_the_page_that_compares_run_by_run_has_all_of_them(shown) -> None:
-    page, address, compared = shown
-    # Away from the other page, whose axes could be taken for this one's.
-    page.get("about:blank")
-    page.get(compared.compare_page(address))
-    screenshot.await_axes(page, ["error.mean"])
-    assert run_links(page) >= set(compared.runs)
-    said = page.execute_script("return document.body.innerText")
-    assert f"Comparing {len(compared.runs)} Runs" in said
-    assert len(screenshot.axis_labels(page)) >= 3
-
-
-def test_axes_that_are_not_there_are_missed(shown, monkeypatch) -> None:
-    page, address, compared = shown
-    monkeypatch.setattr(screenshot, "PATIENCE", 1.0)
-    page.get(compared.chart_page(address))
-    with pytest.raises(InputError, match="no axes nonsense"):
-        screenshot.await_axes(page, ["nonsense"])
+    ticks = [text.replace("−", "-") for text in re.findall(r"<text[^>]*>([\d.−-]+)</text>", shown)]
+    assert {5.0, 4.0, 3.0, 2.0, 1.0} <= {float(tick) for tick in ticks}
 
 
 def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
     assert screenshot.main([str(outputs), "--to", str(tmp_path / "page.png")]) == 0
     assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+
+
+def listening(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_stopped_dashboard_leaves_no_server_behind(outputs, tmp_path, end) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = ("-m", "experiments.runner.dashboard", str(outputs), "--port", str(port))
+    with (tmp_path / "said").open("w") as said:
+        shown = subprocess.Popen(
+            [sys.executable, *command],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": PATHS, "BROWSER": "true"},
+            stdout=said,
+            stderr=said,
+        )
+    try:
+        while not listening(port):
+            assert shown.poll() is None, (tmp_path / "said").read_text()
+            time.sleep(0.1)
+        shown.send_signal(end)
+        assert shown.wait(timeout=60) == 0
+    finally:
+        shown.kill()
+        shown.wait()
+    assert not listening(port)
+
+
+def test_a_server_that_ends_is_not_waited_for(outputs) -> None:
+    with (
+        pytest.raises(InputError, match="did not start"),
+        dashboard.serving("nonsense://place", outputs, 0, quiet=True),
+    ):
+        pytest.fail("it cannot serve this")
