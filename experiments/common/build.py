@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.mirror import build
+from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import REFERENCE, GateCase

@@ -13,7 +13,6 @@ from experiments.common.build import Twin, build_filter, build_twin
 from experiments.common.cases.own_case import read_configured, settings_of
 from experiments.common.progress import SolveBar
 from experiments.common.whole_cycle import cycle_model, stored_cycle
-from experiments.studies.patient.study import make_patient
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
 from mvest.personalise.chain import foresee_case
@@ -23,7 +22,7 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import foresight_text
 from mvest.typing import FloatArray
 
-__all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "foresee_patient", "told"]
+__all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "told"]
 
 Values = Mapping[str, Any]
 
@@ -106,17 +105,6 @@ def foresee_own(config: Values, _folder: Path | None = None) -> str:
     length = doubt.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"
     return told(case.name, found, f"{doubt.typical_mm:.3g} mm of noise stated, {errors}")
-
-
-def foresee_patient(config: Values, folder: Path | None = None) -> str:
-    """The answer for the case of a virtual patient, which is simulated first unless it is there.
-
-    Raises
-    ------
-    MvestError
-        If the configuration is inadmissible or the patient's valve does not close.
-    """
-    return foresee_own({**config, "case": str(make_patient(config).case)}, folder)
 
 
 def foresee_cycle(config: Values, _folder: Path | None = None) -> str:

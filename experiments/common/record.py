@@ -1,239 +1,334 @@
-"""What a run writes down: ``result.json`` and the fields of its figures."""
+"""The record of a run: what ``result.json`` and the kept records in ``results/`` hold.
+
+A study computes its findings; everything else that a record says is stamped once, by the runner.
+"""
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
-from functools import partial
+from collections.abc import Hashable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from types import GenericAlias
+from typing import Any, Generic, Literal, TypeVar, cast
 
-import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from mvest.errors import MvestError
-from mvest.files import write_atomically
-from mvest.observation.vertices import Observation
-from mvest.problem.estimate import StudyResult
-from mvest.provenance import provenance
-from mvest.reporting.expectation import confounded_record
-from mvest.typing import FloatArray
-from mvest.valve.anatomy.valve import LeafletSurface, Valve
-from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.measurements import measure_closure
+from mvest.errors import InputError
+from mvest.provenance import provenance, write_json
 
-__all__ = ["make_record", "measure_frames", "repeat_entry", "write_fields"]
+__all__ = [
+    "SCHEMA",
+    "GitState",
+    "Mesh",
+    "Model",
+    "Outcome",
+    "Provenance",
+    "Record",
+    "Status",
+    "model_of_values",
+    "read_data",
+    "read_record",
+    "record_from",
+    "stamp",
+    "write_record",
+]
 
-SCHEMA = 1
-"""Version of the layout of ``result.json``."""
+SCHEMA = 2
+"""Version of the layout of a record."""
 
-Values = Mapping[str, Any]
+HASH_DIGITS = 12
+"""Digits of a hash that a line of text shows."""
+
+Status = Literal["converged", "failed"]
+F = TypeVar("F")
 
 
-def make_record(
-    result: StudyResult,
-    config: Values,
-    *,
-    config_hash: str,
-    meshes: Mapping[str, Any],
-    closure: Mapping[str, Any] | None,
-    truth_values: FloatArray | None,
-    started: float,
-) -> dict[str, Any]:
-    """Plain data of a finished run, failed or not.
+@dataclass(frozen=True, slots=True)
+class GitState:
+    """The commit that computed a record; None outside a checkout.
 
-    Values that do not exist are None. Lists of parameters are in the order of ``parameters``;
-    relative errors are signed parts of the truth.
+    Attributes
+    ----------
+    sha : str or None
+    dirty : bool or None
+        Whether tracked files differed from it.
     """
-    filtered = result.filtered
-    return {
-        "schema": SCHEMA,
-        "experiment": config["name"],
-        "title": config["title"],
-        "row": config["row"],
-        "table": config["table"],
-        "paper": config["paper"],
-        "status": "converged" if result.converged else "failed",
-        "reason": result.reason,
-        "detail": result.detail,
-        "parameters": list(result.parameters),
-        "truth": _list(truth_values),
-        "initial": list(config["filter"]["initial"]),
-        "estimate": _list(result.estimate),
-        "std": _list(result.std),
-        "relative_error": _list(result.relative_error),
-        "moduli": [
-            {
-                "region": m.region,
-                "name": m.name,
-                "truth": m.truth,
-                "estimate": m.estimate,
-                "std": m.std,
-                "relative_error": m.relative_error,
-            }
-            for m in result.moduli
-        ],
-        "moduli_error_percent": _moduli_error(result),
-        "distance_mm": _spread(result.distance),
-        "distance_to_truth_mm": _spread(result.distance_to_truth),
-        "closure": None if closure is None else dict(closure),
-        "iterations": 0 if filtered is None else filtered.iterations,
-        "forward_solves": 0 if filtered is None else filtered.forward_solves,
-        "seconds": result.seconds,
-        "seconds_total": time.time() - started,
-        "iterates": None if filtered is None else _list(filtered.iterates),
-        "iterate_std": None if filtered is None else _list(filtered.iterate_std),
-        "innovation": _innovation(result),
-        "identifiability": _identifiability(result),
-        "mesh": dict(meshes),
-        "model": {
-            "element": config["mechanics"]["element"],
-            "cells": [config["mesh"][key] for key in ("columns", "rows", "layers")],
-            "source": config["mesh"]["source"],
-            "filter": config["filter"]["mode"],
-            "noise_mm": config["observation"]["noise_mm"],
-        },
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": meshes["sha256"],
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
+
+    sha: str | None
+    dirty: bool | None
 
 
-def repeat_entry(seed: int, result: StudyResult) -> dict[str, Any]:
-    """Plain data of the estimate from one seed; lists are in the order of the parameters."""
-    filtered = result.filtered
-    innovation, bound = _innovation(result), _identifiability(result)
-    return {
-        "seed": seed,
-        "status": "converged" if result.converged else "failed",
-        "reason": result.reason,
-        "detail": result.detail,
-        "estimate": _list(result.estimate),
-        "std": _list(result.std),
-        "relative_error": _list(result.relative_error),
-        "bound": None if bound is None else bound["cramer_rao_std"],
-        "distance_mm": _spread(result.distance),
-        "distance_to_truth_mm": _spread(result.distance_to_truth),
-        "nis": None if innovation is None else innovation["nis"],
-        "nis_band": None if innovation is None else innovation["nis_band"],
-        "iterations": None if filtered is None else filtered.iterations,
-        "forward_solves": None if filtered is None else filtered.forward_solves,
-        "iterates": [] if filtered is None else _list(filtered.iterates),
-        "iterate_std": [] if filtered is None else _list(filtered.iterate_std),
-        "seconds": result.seconds,
-    }
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a record came from.
+
+    Attributes
+    ----------
+    git : GitState
+    versions : mapping
+        Package -> version.
+    threads : mapping
+        Environment variable that caps threads -> its value.
+    python, platform, machine : str
+    cpu_count : int or None
+    config_hash, mesh_hash : str
+        SHA-256; the mesh's is "none" where there is no mesh.
+    seed : int
+    finished : str
+        UTC, ISO 8601.
+    """
+
+    git: GitState
+    versions: Mapping[str, str | None]
+    threads: Mapping[str, str | None]
+    python: str
+    platform: str
+    machine: str
+    cpu_count: int | None
+    config_hash: str
+    mesh_hash: str
+    seed: int
+    finished: str
 
 
-def measure_frames(valve: Valve, result: StudyResult, contact_distance: float) -> dict[str, Any]:
-    """Orifice, passing ball, coaptation and intersections of each fitted frame.
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """The estimator's mesh, and the truth's where there is another.
+
+    Attributes
+    ----------
+    sha256 : str
+    nodes : int
+    elements : int or None
+    truth_sha256 : str or None
+    """
+
+    sha256: str
+    nodes: int
+    elements: int | None = None
+    truth_sha256: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What the estimator computed with, as far as its cost depends on it.
+
+    Attributes
+    ----------
+    element : str
+    cells : tuple of int
+        Around the valve, from annulus to free edge, through the thickness.
+    source : str
+        Of the mesh.
+    filter : str
+    noise_mm : float
+        SD of the errors of an observed coordinate.
+    """
+
+    element: str
+    cells: tuple[int, ...]
+    source: str | None = None
+    filter: str | None = None
+    noise_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome(Generic[F]):
+    """What a study gives back.
+
+    Attributes
+    ----------
+    findings : F
+        Everything that its tables and figures need, as plain data in dataclasses.
+    status : {"converged", "failed"}
+    reason, detail : str
+        Why it ended.
+    mesh : Mesh or None
+    forward_solves : int
+    """
+
+    findings: F
+    status: Status = "converged"
+    reason: str = "completed"
+    detail: str = ""
+    mesh: Mesh | None = None
+    forward_solves: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record(Generic[F]):
+    """A finished run.
+
+    Attributes
+    ----------
+    schema : int
+        Version of this layout.
+    study, experiment, title, row, table : str
+        Its room, its configuration, and what tables call it.
+    status, reason, detail : str
+        As in `Outcome`.
+    parameters : tuple of str
+    factors : mapping
+        What is varied in this job of a sweep, by name.
+    seconds_total : float
+        From the start of the job to its record.
+    forward_solves : int
+    model : Model or None
+    mesh : Mesh or None
+    provenance : Provenance
+    findings : F
+        None where the job died before it had any.
+    """
+
+    schema: int
+    study: str
+    experiment: str
+    title: str
+    row: str
+    table: str
+    status: Status
+    reason: str
+    detail: str
+    parameters: tuple[str, ...]
+    factors: Mapping[str, Any]
+    seconds_total: float
+    forward_solves: int
+    model: Model | None
+    mesh: Mesh | None
+    provenance: Provenance
+    findings: F
+
+    @property
+    def converged(self) -> bool:
+        """Whether the run ended as it should."""
+        return self.status == "converged"
+
+    @property
+    def line(self) -> str:
+        """Commit, configuration, mesh and seed in one line, for tables and figures."""
+        source = self.provenance
+        sha = (source.git.sha or "unknown")[:HASH_DIGITS] + ("+changes" if source.git.dirty else "")
+        return (
+            f"{self.experiment}: mvest {source.versions['mvest']}, commit {sha}, "
+            f"configuration {source.config_hash[:HASH_DIGITS]}, "
+            f"mesh {source.mesh_hash[:HASH_DIGITS]}, seed {source.seed}"
+        )
+
+
+def model_of_values(values: Mapping[str, Any]) -> Model:
+    """What a configuration says of the estimator's model."""
+    return Model(
+        values["mechanics"]["element"],
+        tuple(values["mesh"][key] for key in ("columns", "rows", "layers")),
+        values["mesh"]["source"],
+        values["filter"]["mode"],
+        values["observation"]["noise_mm"],
+    )
+
+
+def stamp(
+    values: Mapping[str, Any], config_hash: str, outcome: Outcome[F], started: float
+) -> Record[F]:
+    """The record of an outcome.
 
     Parameters
     ----------
-    valve : Valve
-        The observed surface; its first two regions face each other.
-    result : StudyResult
-        With fitted frames.
-    contact_distance : float
-        mm between midsurfaces, up to which they count as touching.
-
-    Returns
-    -------
-    dict
-        Frame -> measurements in mm and mm², or the reason why they could not be taken.
+    values : mapping
+        The resolved configuration.
+    config_hash : str
+    outcome : Outcome
+        Its findings are None where a job died.
+    started : float
+        Seconds since the epoch.
     """
-    assert result.observation is not None
-    assert result.fitted is not None
-    surface = valve.surface
-    first = np.unique(surface.triangles[surface.region == 0])
-    measured: dict[str, Any] = {}
-    for frame, points in zip(result.observation.frames, result.fitted, strict=True):
-        annulus = points[valve.annulus]
-        anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
-        try:
-            plane = annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior)
-            found = measure_closure(
-                points,
-                surface.triangles,
-                surface.region,
-                surface.thickness,
-                annulus,
-                plane,
-                contact_distance,
-            )
-        except MvestError as error:
-            # An estimate is not lost because the valve's shape defies a measurement.
-            measured[frame] = {"reason": str(error)}
-        else:
-            measured[frame] = asdict(found)
-    return measured
+    source = provenance()
+    return Record(
+        schema=SCHEMA,
+        study=values["study"],
+        experiment=values["name"],
+        title=values["title"],
+        row=values["row"],
+        table=values["table"],
+        status=outcome.status,
+        reason=outcome.reason,
+        detail=outcome.detail,
+        parameters=tuple(values["parameters"]),
+        factors=dict(values["factors"]),
+        seconds_total=time.time() - started,
+        forward_solves=outcome.forward_solves,
+        model=model_of_values(values),
+        mesh=outcome.mesh,
+        provenance=Provenance(
+            **{**source, "git": GitState(**source["git"])},
+            config_hash=config_hash,
+            mesh_hash="none" if outcome.mesh is None else outcome.mesh.sha256,
+            seed=values["seed"],
+            finished=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        ),
+        findings=outcome.findings,
+    )
 
 
-def write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> None:
-    """Write the observed and the fitted frames as compressed arrays, whole or not at all.
+def write_record(path: Path, record: Record[Any]) -> None:
+    """Write a record as JSON, whole or not at all.
 
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If it holds something without a JSON form, or cannot be written.
     """
-    assert isinstance(result.observation, Observation)
-    assert result.fitted is not None
-    arrays: dict[str, Any] = {
-        "triangles": surface.triangles.astype(np.int32),
-        "region": surface.region.astype(np.int8),
-        "rest": surface.vertices.astype(np.float32),
-        "observed": result.observation.positions.astype(np.float32),
-        "fitted": result.fitted.astype(np.float32),
-        "distance": np.asarray(result.distance, dtype=np.float64),
-    }
-    write_atomically(path, partial(np.savez_compressed, **arrays))
+    write_json(path, asdict(record))
 
 
-def _list(values: FloatArray | None) -> list[Any] | None:
-    return None if values is None else np.asarray(values).tolist()
+@cache
+def _adapter(findings: Hashable) -> TypeAdapter[Record[Any]]:
+    return TypeAdapter(cast(type[Record[Any]], GenericAlias(Record, (findings,))))
 
 
-def _spread(values: FloatArray | None) -> dict[str, float] | None:
-    if values is None:
-        return None
-    # A vertex that is not seen has no distance.
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return None
-    return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
+def record_from(data: Any, findings: type[F], where: str) -> Record[F]:
+    """A record from plain data; ``where`` names it in an error.
+
+    Raises
+    ------
+    InputError
+        If the data are no record with findings of this type; the message names the first field.
+    """
+    try:
+        return _adapter(cast(Hashable, findings)).validate_python(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or "it"
+        raise InputError(f"{where} is no record of a run: {field}: {first['msg']}") from error
 
 
-def _moduli_error(result: StudyResult) -> dict[str, float] | None:
-    errors = [m.relative_error for m in result.moduli if m.relative_error is not None]
-    return _spread(100.0 * np.abs(np.array(errors))) if errors else None
+def read_record(path: Path, findings: type[F]) -> Record[F]:
+    """The record in a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or is no such record.
+    """
+    return record_from(read_data(path), findings, str(path))
 
 
-def _innovation(result: StudyResult) -> dict[str, Any] | None:
-    summary = None if result.filtered is None else result.filtered.innovation
-    if summary is None:
-        return None
-    return {
-        "size": summary.size,
-        "rms": summary.rms,
-        "max_abs": summary.max_abs,
-        "nis": summary.nis,
-        "nis_band": list(summary.nis_band),
-    }
+def read_data(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file.
 
-
-def _identifiability(result: StudyResult) -> dict[str, Any] | None:
-    found = result.identifiability
-    if found is None:
-        return None
-    bound = [float(v) if np.isfinite(v) else None for v in found.std]
-    condition = found.condition_number
-    return {
-        "cramer_rao_std": bound,
-        "condition_number": condition if np.isfinite(condition) else None,
-        "flat": list(found.flat()),
-        "confounded": confounded_record(found),
-    }
+    Raises
+    ------
+    InputError
+        If it cannot be read or holds something else.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path} holds a {type(data).__name__}, expected a mapping")
+    return data

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import closure_model
-from experiments.common.mirror import build
+from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation

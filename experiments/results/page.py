@@ -16,6 +16,7 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 import mvest
+from experiments.common.study import Section, load_study, study_names
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.report import COST, pictures_of, read_sweeps
 from experiments.sweeps.rows import (
@@ -46,79 +47,10 @@ NOT_SETTINGS = ("paths", "hydra", "sweep", "title", "paper", "parameters", "name
 """Parts of a configuration that say where and how it runs or what it is called."""
 
 OTHERS = (
-    ("table1", "Table 1", ("table1", "table1_valve")),
-    ("mesh_independence", "Independence of the mesh", ()),
-    ("strip", "Clamped strips", ()),
-    ("gate", "One closed state", ()),
-    ("closure", "A closing valve", ("closure",)),
-    ("law", "Two material laws on the same valve (simulated)", ("law", "law_biaxial")),
-    (
-        "identifiability",
-        "What data can tell, before any are taken",
-        ("identifiability_designs", "identifiability_profiles", "identifiability_valley"),
-    ),
-    ("filters", "Filters and the posterior itself (simulated)", ("filters",)),
-    ("table2", "Table 2: moduli of five virtual patients (simulated)", ()),
-    ("table3", "Table 3: distances of their closed valves (simulated)", ("figure3",)),
-    ("population", "Virtual patients drawn at random (simulated)", ("population",)),
-    (
-        "imaging",
-        "Leaflets found in simulated echo volumes",
-        ("imaging_distance", "imaging_training", "imaging_confidence", "imaging_std"),
-    ),
-    ("joint", "Chordal length and moduli from a whole cycle (simulated)", ("joint",)),
-    (
-        "joint_open",
-        "The same of a valve that opens fully (simulated)",
-        ("joint_open",),
-    ),
-    ("cycle", "What the frames of a cycle tell (simulated)", ("cycle",)),
-    ("prediction", "What an estimated valve would do (simulated)", ("prediction",)),
-    ("chord", "Chordae by family", ("chord",)),
-    ("patch", "A stiff patch of a leaflet", ("patch",)),
-    ("donor", "A recorded donor valve", ("donor",)),
-    ("models", "Other biomechanical models (simulated)", ("models",)),
-    ("benchmark", "How fast", ("benchmark",)),
+    Section("strip", title="Clamped strips", validation=True),
+    Section("benchmark", {"benchmark": "Where the time goes."}, "How fast", validation=True),
 )
-"""Other results: Markdown file, title where it has none, and the pictures beside it."""
-CAPTIONS = {
-    "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
-    "table1_valve": "The fitted valve, open and closed. Simulated.",
-    "closure": "A valve closing. Simulated.",
-    "law": "Stress of each leaflet under equibiaxial stretch: true, as estimated with the "
-    "exponential law, and with the linear law from the same data. Simulated.",
-    "law_biaxial": "The exponential law with the coefficients of excised leaflets.",
-    "identifiability_designs": "Expected standard deviation of a modulus with each design: which "
-    "vertices are seen, with which errors, in which frames, and what is known of the nuisances. "
-    "Simulated.",
-    "identifiability_profiles": "Profile likelihoods: the least misfit with one parameter held, "
-    "and how the others then make up for it. Simulated.",
-    "identifiability_valley": "95 % regions of a modulus with a nuisance, for different frames; "
-    "the floor of the valley that the profile followed. Simulated.",
-    "filters": "Posterior of each unknown by Monte Carlo, and what each filter takes it for. "
-    "Simulated.",
-    "figure3": "Figure 3: closed valves coloured by their distance from what was observed, with "
-    "generic and with personalised stiffness, on one scale. Drawn are midsurfaces: leaflets that "
-    "touch lie a thickness apart, so that a white slit is not yet a leak. Simulated.",
-    "population": "Estimates with their 95 % intervals against the hidden truth. Simulated.",
-    "imaging_distance": "Distance of found leaflets from true ones, volume by volume. Simulated.",
-    "imaging_training": "Errors of each stage against the number of training volumes. Simulated.",
-    "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
-    "imaging_std": "Standard deviation that the image step tells of each point. Simulated.",
-    "joint": "Estimates as frames come in, errors over seeds, and what two frames and a whole "
-    "cycle could tell. Simulated.",
-    "joint_open": "As the figure before, of a valve that opens fully. Simulated.",
-    "cycle": "The cycle and its frames, what they tell of each parameter, and a modulus that "
-    "drifts over beats, filtered and smoothed. Simulated.",
-    "prediction": "A leaking valve closed as observed and under changed conditions, seen from the "
-    "atrium, and measures of it with their 95 % intervals. Simulated.",
-    "chord": "What is known of chordae and leaflets before and after the data. Simulated.",
-    "patch": "True and found modulus of the unrolled anterior leaflet, and how sure. Simulated.",
-    "donor": "A recorded donor valve and closures of its model.",
-    "models": "A pressed sheet in two finite-element codes: deformed, its moduli iterate by "
-    "iterate under each model, and how the codes differ on finer meshes. Simulated.",
-    "benchmark": "Where the time goes.",
-}
+"""What no study made."""
 
 
 def write_report(results: Path) -> Path:
@@ -142,9 +74,9 @@ def write_report(results: Path) -> Path:
     page = environment.get_template("page.html.jinja").render(
         sweeps=[_sweep_section(results, sweep) for sweep in sweeps],
         others=[
-            _other_section(results, name, title, pictures)
-            for name, title, pictures in OTHERS
-            if (results / f"{name}.md").is_file()
+            _other_section(results, section)
+            for section in _sections()
+            if (results / f"{section.name}.md").is_file()
         ],
     )
     return write_atomically(results / REPORT, page)
@@ -228,8 +160,15 @@ def _cache(sweep: Sweep) -> str:
     return f"Of {hits + misses} requests for a simulated truth, {hits} were served from the store."
 
 
-def _other_section(results: Path, name: str, title: str, pictures: Sequence[str]) -> dict[str, Any]:
-    body = (results / f"{name}.md").read_text(encoding="utf-8")
+def _sections() -> list[Section]:
+    """Sections of all studies, those that validate the model first."""
+    found = [section for name in study_names() for section in load_study(name).sections]
+    return sorted([*found, *OTHERS], key=lambda section: not section.validation)
+
+
+def _other_section(results: Path, section: Section) -> dict[str, Any]:
+    title = section.title
+    body = (results / f"{section.name}.md").read_text(encoding="utf-8")
     heading, _, rest = body.partition("\n")
     if heading.startswith("# "):
         title, body = heading.removeprefix("# "), rest
@@ -240,9 +179,9 @@ def _other_section(results: Path, name: str, title: str, pictures: Sequence[str]
     html = MarkdownIt("commonmark", {"html": False}).enable("table").render(body)
     html = html.replace("<table>", '<div class="scroll tall"><table>')
     html = html.replace("</table>", "</table></div>")
-    found = [(results / f"{picture}.png", CAPTIONS[picture]) for picture in pictures]
+    found = [(results / f"{picture}.png", caption) for picture, caption in section.pictures.items()]
     return {
-        "anchor": name,
+        "anchor": section.name,
         "title": title,
         "body": Markup(html),
         "pictures": [embedded(path, caption) for path, caption in found if path.is_file()],

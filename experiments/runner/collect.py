@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
+from experiments.common.plain import flat
+from experiments.common.record import model_of_values
 from experiments.runner.folder import last_record
 from experiments.runner.plan import Plan, PlannedJob
-from experiments.runner.request import model_settings
 from mvest.provenance import config_hash, provenance
 
 __all__ = ["NOT_RUN", "collect", "overheads"]
@@ -60,7 +62,7 @@ def collect(
     """
     found = [_entry(job, returned.get(job.config_hash[:16])) for job in plan.jobs]
     records = [record for _, record in found if record is not None]
-    stored = [record.get("truth_store") for record in records]
+    stored = [flat(record).get("truth_store") for record in records]
     first = plan.jobs[0].values
     run_again = {job.config_hash[:16] for job in plan.to_run}
     kept = {key: value for key, value in earlier.items() if key not in run_again}
@@ -106,8 +108,9 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
     for job in plan.to_run:
         record = last_record(job.folder, job.config_hash)
         if record is not None and record["status"] == "converged":
+            whole = flat(record)
             computing[job.config_hash[:16]] = float(
-                record.get("seconds_computing", record["seconds"])
+                whole.get("seconds_computing") or whole.get("seconds") or 0.0
             )
     processes: dict[str, list[Mapping[str, Any]]] = {}
     for end in returned.values():
@@ -136,7 +139,7 @@ def _entry(
         "repeats": values["repeats"],
         "status": "failed" if record is None else record["status"],
         "reason": record["reason"] if record else (end["reason"] if end else NOT_RUN),
-        "model": record["model"] if record and "model" in record else model_settings(values),
+        "model": asdict(model_of_values(values)),
         "initial": settings["initial"],
         "truth": values["truth"]["values"],
         "P0": settings["P0"],
@@ -150,8 +153,9 @@ def _entry(
 
 def _runs(record: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """What each seed of a job found; nothing where the job as a whole was lost."""
-    if record is None:
+    if record is None or record["findings"] is None:
         return []
+    record = flat(record)
     if "repeats" in record:
         return [{key: run.get(key) for key in RUN} for run in record["repeats"]]
     innovation = record.get("innovation") or {}

@@ -7,7 +7,6 @@ is made last, after everything else is on disk.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,10 +14,11 @@ from typing import Any
 
 from filelock import FileLock
 
-from experiments.runner.request import Request, model_settings
+from experiments.common.record import Outcome, read_data, stamp, write_record
+from experiments.runner.request import Request
 from mvest.errors import InputError
 from mvest.files import remove_parts
-from mvest.provenance import provenance, write_json
+from mvest.provenance import write_json
 
 __all__ = [
     "CONFIG",
@@ -40,22 +40,6 @@ __all__ = [
 
 DONE, RESULT, CONFIG, LOG, LOCK = "done", "result.json", "config.json", "log.txt", ".lock"
 """Files of a job: its marker, its record, its configuration, what it said, who is at work."""
-
-ABSENT = (
-    "estimate",
-    "std",
-    "relative_error",
-    "moduli_error_percent",
-    "distance_mm",
-    "distance_to_truth_mm",
-    "closure",
-    "iterates",
-    "iterate_std",
-    "innovation",
-    "identifiability",
-    "confirmed_mm",
-)
-"""What the record of a lost job has no value for."""
 
 
 class FailedRunError(Exception):
@@ -187,33 +171,12 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
     InputError
         If it cannot be written.
     """
-    values = request.values
-    record: dict[str, Any] = {
-        **{key: values[key] for key in ("title", "row", "table", "paper", "parameters", "factors")},
-        "schema": 1,
-        "experiment": values["name"],
-        "status": "failed",
-        "reason": reason,
-        "detail": "",
-        "truth": values["truth"].get("values"),
-        "initial": values["filter"].get("initial"),
-        **dict.fromkeys(ABSENT),
-        "moduli": [],
-        "iterations": 0,
-        "forward_solves": 0,
-        "seconds": 0.0,
-        "seconds_total": time.time() - started,
-        "repeats": [],
-        "mesh": {},
-        "model": model_settings(values),
-        "provenance": {
-            **provenance(),
-            "config_hash": request.config_hash,
-            "mesh_hash": "none",
-            "seed": values["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
-    write_json(request.folder / CONFIG, values)
-    write_json(request.folder / RESULT, record)
-    return record
+    record = stamp(
+        request.values,
+        request.config_hash,
+        Outcome(findings=None, status="failed", reason=reason),
+        started,
+    )
+    write_json(request.folder / CONFIG, request.values)
+    write_record(request.folder / RESULT, record)
+    return read_data(request.folder / RESULT)

@@ -12,7 +12,7 @@ import os
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from statistics import fmean
@@ -25,8 +25,10 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.config import hash_of, plain
+from experiments.common.plain import flat
+from experiments.common.record import model_of_values
 from experiments.runner.folder import RESULT, last_record
-from experiments.runner.request import Request, model_settings
+from experiments.runner.request import Request
 from mvest.errors import ConfigurationError
 from mvest.provenance import git_state, write_json
 
@@ -174,7 +176,7 @@ class Plan:
         times = [
             fmean(spent[kind]) * job.values.get("repeats", 1)
             for job in left
-            if (kind := json.dumps(model_settings(job.values))) in spent
+            if (kind := json.dumps(asdict(model_of_values(job.values)))) in spent
         ]
         if not times:
             return "time unknown: no job of this kind has finished yet"
@@ -326,7 +328,7 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
     )
     for place in places[:MAX_READ]:
         try:
-            record = json.loads(place.read_text(encoding="utf-8"))
+            record = flat(json.loads(place.read_text(encoding="utf-8")))
             kind, seconds = json.dumps(record["model"]), float(record["seconds_total"])
             seeds = len(record.get("repeats") or [None])
             converged = record["status"] == "converged"

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from experiments.common.config import NOT_THE_RESULT, hash_of, plain
 
-__all__ = ["Request", "as_published", "model_settings"]
+__all__ = ["Request", "as_published"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,17 +65,6 @@ class Request:
             "folder": str(self.folder),
             "publish_as": self.publish_as,
         }
-
-
-def model_settings(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a record says of the estimator's model."""
-    return {
-        "element": values["mechanics"]["element"],
-        "cells": [values["mesh"][key] for key in ("columns", "rows", "layers")],
-        "source": values["mesh"]["source"],
-        "filter": values["filter"]["mode"],
-        "noise_mm": values["observation"]["noise_mm"],
-    }
 
 
 def as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:

@@ -17,12 +17,13 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from experiments.common.progress import announce_compilation
+from experiments.common.study import load_study
 from experiments.results.page import write_report
 from experiments.runner.check import require_admissible
 from experiments.runner.collect import NOT_RUN, collect
 from experiments.runner.folder import is_done, nothing_empty, require_writable, write_failure
 from experiments.runner.guard import run_guarded
-from experiments.runner.job import FailedRunError, require_study, run_job
+from experiments.runner.job import FailedRunError, run_job
 from experiments.runner.plan import Plan, PlannedJob, make_plan
 from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request, as_published
@@ -215,7 +216,7 @@ def _tell(plan: Plan) -> None:
 
 def _foresee(plan: Plan) -> None:
     """Say what the data of each job will tell."""
-    checks = require_study(plan.jobs[0].values).checks()
+    checks = load_study(plan.jobs[0].values["study"]).checks()
     for job in plan.jobs:
         if not checks or job.values["study"] != plan.jobs[0].values["study"]:
             raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")

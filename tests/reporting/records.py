@@ -83,3 +83,22 @@ def failed_record(**changes: Any) -> dict[str, Any]:
         reason="not converged: the model gives no prediction where the filter needs one",
         **changes,
     )
+
+
+def stored(record: dict[str, Any], study: str = "twin") -> dict[str, Any]:
+    """The same as ``result.json`` holds it: what is stamped, and the findings apart."""
+    stamped = {
+        "schema", "experiment", "title", "row", "table", "status", "reason", "detail", "parameters",
+        "factors", "seconds_total", "forward_solves", "model", "mesh", "provenance",
+    }  # fmt: skip
+    source = {
+        "threads": {}, "python": "3.12", "platform": "Linux", "machine": "x86_64", "cpu_count": 2,
+        "finished": "2024-01-01T00:00:00Z", **record["provenance"],
+    }  # fmt: skip
+    return {
+        "factors": {},
+        **{key: value for key, value in record.items() if key in stamped},
+        "study": study,
+        "provenance": source,
+        "findings": {key: value for key, value in record.items() if key not in stamped},
+    }

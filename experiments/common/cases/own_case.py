@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from experiments.common.build import mechanics_of
 from experiments.common.cases.record import case_record, fields_of
-from experiments.common.mirror import build
 from experiments.common.progress import SolveBar
+from experiments.common.schema import build
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from experiments.common.record import make_record
+from experiments.common.estimate_record import make_record
 from mvest.cases.case import Role
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.result import Personalised

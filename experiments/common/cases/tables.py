@@ -6,7 +6,6 @@ after its estimation.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,9 +30,9 @@ __all__ = [
     "POPULATION",
     "Record",
     "distance_words",
+    "in_order",
     "interval_words",
     "provenance_of",
-    "read_kept",
     "table2",
     "table3",
     "write_patient_tables",
@@ -59,25 +58,14 @@ NOTE = (
 )
 
 
-def read_kept(results: Path, table: str) -> dict[str, Record]:
-    """Name -> record of what is kept of a table, in its order.
+def in_order(records: Mapping[str, Record]) -> dict[str, Record]:
+    """Name -> record, in the order of the tables."""
 
-    Raises
-    ------
-    InputError
-        If a record cannot be read.
-    """
-    found = {}
-    for path in sorted((results / table).glob("*.json")):
-        try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-            rank = record["case"]["name"]
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror}") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is no record of a patient: {error}") from error
-        found[path.stem] = (ORDER.index(rank) if rank in ORDER else len(ORDER), rank, record)
-    return {name: record for name, (_, _, record) in sorted(found.items(), key=lambda i: i[1][:2])}
+    def place(item: tuple[str, Record]) -> tuple[int, str]:
+        name = item[1]["case"]["name"]
+        return (ORDER.index(name) if name in ORDER else len(ORDER)), name
+
+    return dict(sorted(records.items(), key=place))
 
 
 # -- Tables 2 and 3 -------------------------------------------------------------------------------
@@ -141,18 +129,17 @@ def table3(records: Sequence[Record]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def write_patient_tables(results: Path) -> list[Path]:
-    """``table2.*``, ``table3.*`` and ``figure3.*`` from the kept patients; none if there are none.
+def write_patient_tables(
+    results: Path, kept: Mapping[str, Record], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """``table2.*``, ``table3.*`` and ``figure3.*`` from kept patients and their arrays.
 
     Raises
     ------
     InputError
-        If a record is damaged or a file cannot be written.
+        If a file cannot be written.
     """
-    kept = read_kept(results, PATIENTS)
     records = list(kept.values())
-    if not records:
-        return []
     line = provenance_of(records)
     second, third = table2(records), table3(records)
     written = write_table(
@@ -163,9 +150,9 @@ def write_patient_tables(results: Path) -> list[Path]:
             results / "table3", third, _readable3(third), line, [NOTE, *distance_words(third)]
         )
     fields = {
-        records[k]["case"]["name"]: read_case_fields(results / PATIENTS / f"{name}.npz")
-        for k, name in enumerate(kept)
-        if (results / PATIENTS / f"{name}.npz").is_file()
+        record["case"]["name"]: read_case_fields(arrays[name])
+        for name, record in kept.items()
+        if name in arrays
     }
     if fields:
         written += save_figure(results / "figure3", figure3(fields), records[0])

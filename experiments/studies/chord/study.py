@@ -11,8 +11,13 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
+from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import bound_entry, closed_frame, cycle_model
+from experiments.studies.chord.report import chord_text, write_chord
+from experiments.studies.chord.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
@@ -22,7 +27,7 @@ from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 
-__all__ = ["run_chord_study"]
+__all__ = ["STUDY", "run_chord_study"]
 
 Values = Mapping[str, Any]
 
@@ -123,3 +128,23 @@ def _entry(label: str, seed: int, found: Estimate, truth: FloatArray) -> dict[st
         "nees": nees(offset, covariance),
         "runs": found.forward_solves,
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_chord_study),
+    words=lambda record: chord_text(flat(record)),
+    write=each(write_chord),
+    keeps_failures=True,
+    checks=lambda: (foresee_cycle,),
+    sections=(
+        Section(
+            "chord",
+            {
+                "chord": "What is known of chordae and leaflets before and after the data. "
+                "Simulated."
+            },
+        ),
+    ),
+)

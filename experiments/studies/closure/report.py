@@ -11,12 +11,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from experiments.common.plain import Plain, flat
+from experiments.common.record import Record as Run
 from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import keep_record, provenance_line
+from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["closure_figure", "closure_text", "publish_closure", "write_closure_tables"]
+__all__ = ["closure_figure", "closure_text", "write_closure"]
 
 Record = Mapping[str, Any]
 
@@ -128,8 +130,14 @@ def write_closure_tables(folder: Path, record: Record) -> list[Path]:
     ]
 
 
-def publish_closure(results: Path, record: Record, folder: Path) -> list[Path]:
-    """Keep the record, its tables and its figure."""
-    keep_record(results, record)
-    figure = closure_figure(record, folder / "fields.npz")
-    return write_closure_tables(results, record) + save_figure(results / "closure", figure, record)
+def write_closure(
+    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table and words of each closure, and its figure where its frames are still there."""
+    written = []
+    for name, run in records.items():
+        record = flat(run)
+        written += write_closure_tables(folder, record)
+        if name in arrays:
+            written += save_figure(folder / "closure", closure_figure(record, arrays[name]), record)
+    return written

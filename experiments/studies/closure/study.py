@@ -11,12 +11,16 @@ import numpy as np
 
 from experiments.common.build import closure_model, template_of
 from experiments.common.forward import forward_record, without_nan
+from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.study import Section, Study
+from experiments.studies.closure.report import closure_text, write_closure
+from experiments.studies.closure.settings import Settings
 from mvest.closure.measures import measure_steps
 from mvest.typing import FloatArray
 from mvest.valve.geometry.surfaces import thicken
 from mvest.valve.mesh.embedding import embed
 
-__all__ = ["run_closure_study"]
+__all__ = ["STUDY", "run_closure_study"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -24,9 +28,6 @@ Outcome = tuple[dict[str, Any], list[Path]]
 
 def run_closure_study(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
     """Close the valve once and measure every stored step."""
-    from experiments.studies.closure.report import closure_figure
-    from mvest.reporting.figures import save_figure
-
     values = np.array(config["truth"]["values"], dtype=float)
     model = closure_model(config)
     result = model.close(values, sensitivities=False, every_frame=True)
@@ -54,9 +55,19 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
         triangles=surface.triangles.astype(np.int32),
         region=surface.region.astype(np.int8),
     )
-    return record, save_figure(folder / "closure", closure_figure(record, fields), record)
+    return record, []
 
 
 def _normals(config: Values, columns: int, rows: int) -> FloatArray:
     j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
     return template_of(config).normal(360.0 * i / columns, j / (rows - 1))
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_closure_study),
+    words=lambda record: closure_text(flat(record)),
+    write=write_closure,
+    sections=(Section("closure", {"closure": "A valve closing. Simulated."}, validation=True),),
+)

@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
+from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import (
     bound_entry,
     closed_frame,
@@ -20,6 +23,8 @@ from experiments.common.whole_cycle import (
     stored_cycle,
     stored_frames,
 )
+from experiments.studies.cycle.report import cycle_text, write_cycle
+from experiments.studies.cycle.settings import Settings
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import Beats, CycleObservation
 from mvest.errors import ConfigurationError, InputError
@@ -29,7 +34,7 @@ from mvest.estimation.trajectory import Trajectory
 from mvest.estimation.transform import Log
 from mvest.typing import FloatArray
 
-__all__ = ["frame_sets", "run_cycle_study"]
+__all__ = ["STUDY", "frame_sets", "run_cycle_study"]
 
 Values = Mapping[str, Any]
 
@@ -226,3 +231,24 @@ def _band(trajectory: Trajectory, path: FloatArray) -> dict[str, Any]:
         "mean_std": trajectory.std.mean(axis=0).tolist(),
         "coverage": np.mean(np.abs(error) <= 1.96 * trajectory.std, axis=0).tolist(),
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_cycle_study),
+    words=lambda record: cycle_text(flat(record)),
+    write=each(write_cycle),
+    keeps_failures=True,
+    checks=lambda: (foresee_cycle,),
+    sections=(
+        Section(
+            "cycle",
+            {
+                "cycle": "The cycle and its frames, what they tell of each parameter, and a "
+                "modulus "
+                "that drifts over beats, filtered and smoothed. Simulated."
+            },
+        ),
+    ),
+)

@@ -13,13 +13,15 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from experiments.common.plain import Plain, flat
+from experiments.common.record import Record as Run
 from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
-from mvest.reporting.files import keep_record, provenance_line
+from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["donor_figure", "donor_text", "publish_donor", "write_donor_tables"]
+__all__ = ["donor_figure", "donor_text", "write_donor"]
 
 Record = Mapping[str, Any]
 
@@ -214,10 +216,14 @@ def write_donor_tables(folder: Path, record: Record) -> list[Path]:
     ]
 
 
-def publish_donor(results: Path, record: Record, fields: Path) -> list[Path]:
-    """Keep the record, and write its table and its picture into the results."""
-    keep_record(results, record)
-    return [
-        *write_donor_tables(results, record),
-        *save_figure(results / "donor", donor_figure(fields), record),
-    ]
+def write_donor(
+    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table of each run, and its picture where its surfaces are still there."""
+    written = []
+    for name, run in records.items():
+        record = flat(run)
+        written += write_donor_tables(folder, record)
+        if name in arrays:
+            written += save_figure(folder / "donor", donor_figure(arrays[name]), record)
+    return written

@@ -19,9 +19,12 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of
+from experiments.common.estimate_record import make_record
+from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import SolveBar
-from experiments.common.record import make_record
-from experiments.studies.donor.report import donor_figure
+from experiments.common.study import Section, Study
+from experiments.studies.donor.report import donor_figure, donor_text, write_donor
+from experiments.studies.donor.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -42,7 +45,7 @@ from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["DonorStudy", "build_donor", "run_donor"]
+__all__ = ["STUDY", "DonorStudy", "build_donor", "run_donor"]
 
 Values = Mapping[str, Any]
 
@@ -370,3 +373,15 @@ def _summary(
         "fitted_surface_mm": None if fitted is None else fitted["surface"],
         "closer_than_generic": None if None in means else bool(means[1] < means[0]),  # type: ignore[operator]
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_donor),
+    words=lambda record: donor_text(flat(record)),
+    write=write_donor,
+    sections=(
+        Section("donor", {"donor": "A recorded donor tricuspid valve and closures of its model."}),
+    ),
+)

@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Study
+from experiments.studies.external.report import external_text, write_external_tables
+from experiments.studies.external.settings import Settings
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Estimate, Filter
 from mvest.estimation.gaussian import Gaussian
@@ -23,7 +27,7 @@ from mvest.external.process import Command
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
-__all__ = ["check_external", "model_of", "run_external"]
+__all__ = ["STUDY", "check_external", "model_of", "run_external"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -244,3 +248,14 @@ def _record(
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_external),
+    words=lambda record: external_text(flat(record)),
+    write=each(write_external_tables),
+    checks=lambda: (check_external,),
+    sections=(),
+)

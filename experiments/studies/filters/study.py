@@ -15,8 +15,10 @@ import numpy as np
 from scipy.stats import skew
 
 from experiments.common.build import MADE_BY, filter_of
-from experiments.common.mirror import build
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.schema import build
 from experiments.common.store import Store
+from experiments.common.study import Section, Study
 from experiments.studies.filters.problem import (
     TRANSFORM,
     FilterProblem,
@@ -24,7 +26,13 @@ from experiments.studies.filters.problem import (
     build_problem,
     fit_to_prior,
 )
-from experiments.studies.filters.report import REFERENCE, filters_figure
+from experiments.studies.filters.report import (
+    REFERENCE,
+    filters_figure,
+    filters_text,
+    write_filter_study,
+)
+from experiments.studies.filters.settings import Settings
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate, Filter
 from mvest.estimation.filters.ensemble import EnsembleFilter
@@ -36,7 +44,7 @@ from mvest.provenance import provenance, write_json
 from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
 
-__all__ = ["run_filter_study"]
+__all__ = ["STUDY", "run_filter_study"]
 
 Values = Mapping[str, Any]
 
@@ -309,3 +317,22 @@ def _record(
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_filter_study),
+    words=lambda record: filters_text(flat(record)),
+    write=each(write_filter_study),
+    sections=(
+        Section(
+            "filters",
+            {
+                "filters": "Posterior of each unknown by Monte Carlo, and what each filter "
+                "takes it for."
+                " Simulated."
+            },
+        ),
+    ),
+)

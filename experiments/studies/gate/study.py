@@ -12,9 +12,13 @@ import numpy as np
 
 from experiments.common.build import closure_model
 from experiments.common.forward import forward_record, without_nan
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
+from experiments.studies.gate.report import gate_text, write_gate_tables
+from experiments.studies.gate.settings import Settings
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateRow, run_gate
 
-__all__ = ["run_gate_study"]
+__all__ = ["STUDY", "run_gate_study"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -45,3 +49,13 @@ def run_gate_study(config: Values, config_hash: str, folder: Path, started: floa
     if not rows[0]["passed"]:
         record |= {"status": "failed", "reason": rows[0]["reason"]}
     return record, []
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_gate_study),
+    words=lambda record: gate_text(flat(record)),
+    write=each(write_gate_tables),
+    sections=(Section("gate", validation=True),),
+)

@@ -14,8 +14,15 @@ import numpy as np
 
 from experiments.common.build import closure_model
 from experiments.common.forward import forward_record
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
 from experiments.studies.identifiability.figures import write_identifiability_figures
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
+from experiments.studies.identifiability.report import (
+    identifiability_text,
+    write_identifiability_study,
+)
+from experiments.studies.identifiability.settings import Settings
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.closure.model import ClosureModel
@@ -28,7 +35,7 @@ from mvest.observation.errors import SpatialCorrelation
 from mvest.reporting.expectation import confounded_record
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["run_identifiability"]
+__all__ = ["STUDY", "run_identifiability"]
 
 Values = Mapping[str, Any]
 
@@ -330,3 +337,29 @@ def _plain(found: Profile, chosen: Values) -> dict[str, Any]:
 def _finite(value: float) -> float | None:
     """Infinity, which JSON lacks, as None."""
     return float(value) if np.isfinite(value) else None
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_identifiability),
+    words=lambda record: identifiability_text(flat(record)),
+    write=each(write_identifiability_study),
+    sections=(
+        Section(
+            "identifiability",
+            {
+                "identifiability_designs": "Expected standard deviation of a modulus with "
+                "each design: which vertices "
+                "are seen, with which errors, in which frames, and what is known of the "
+                "nuisances. Simulated.",
+                "identifiability_profiles": "Profile likelihoods: the least misfit with one "
+                "parameter held, and how the "
+                "others then make up for it. Simulated.",
+                "identifiability_valley": "95 % regions of a modulus with a nuisance, for "
+                "different frames; the floor "
+                "of the valley that the profile followed. Simulated.",
+            },
+        ),
+    ),
+)

@@ -1,52 +1,28 @@
-"""Records of moduli from simulated volumes in the results, and the table of all of them."""
+"""What the results keep of moduli from simulated volumes, and the table of all of them."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from filelock import FileLock
-
+from experiments.common.plain import Plain, flat
+from experiments.common.record import Record
 from experiments.studies.imaging.tables import write_volume_tables
-from mvest.errors import cannot_write
-from mvest.provenance import write_json
 
-__all__ = ["publish_volume"]
+__all__ = ["kept_of_volume", "write_volumes"]
 
-FOLDER = "volume"
-"""Of the records in the results; the table beside it has the same name."""
-
-KEPT = ("status", "reason", "rows", "unknowns", "known_geometry", "image_errors", "provenance")
+KEPT = ("rows", "unknowns", "known_geometry", "image_errors")
 
 
-def publish_volume(results: Path, name: str, record: Mapping[str, Any]) -> list[Path]:
-    """Keep the record of a patient, and renew the table of all.
+def kept_of_volume(record: Record[Plain]) -> Record[Plain]:
+    """What the table needs of a record, and what else was estimated."""
+    return replace(record, findings={key: record.findings.get(key) for key in KEPT})
 
-    Parameters
-    ----------
-    results : Path
-    name : str
-        Of the record.
-    record : mapping
-        With ``rows`` as for `experiments.studies.imaging.tables.volume_table`.
-    """
-    folder = results / FOLDER
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # Jobs of one experiment end in several processes at once.
-        with FileLock(results / f".{FOLDER}.lock"):
-            write_json(folder / f"{name}.json", {key: record.get(key) for key in KEPT})
-            kept = [json.loads(file.read_text("utf-8")) for file in sorted(folder.glob("*.json"))]
-            whole = {**record, "rows": [row for one in kept for row in one["rows"]]}
-            write_json(
-                results / f"{FOLDER}.json",
-                {
-                    key: whole.get(key)
-                    for key in ("schema", "experiment", "title", "rows", "provenance")
-                },
-            )
-            return write_volume_tables(results, whole)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
+
+def write_volumes(
+    folder: Path, records: Mapping[str, Record[Plain]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """The table of all volumes."""
+    rows = [row for record in records.values() for row in record.findings["rows"]]
+    return write_volume_tables(folder, {**flat(list(records.values())[-1]), "rows": rows})

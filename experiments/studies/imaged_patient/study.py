@@ -12,8 +12,13 @@ import numpy as np
 
 from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.mirror import build
+from experiments.common.cases.report import case_text, write_case_tables
+from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.schema import build
 from experiments.common.store import Store
+from experiments.common.study import Section, Study
+from experiments.studies.imaged_patient.report import kept_of_volume, write_volumes
+from experiments.studies.imaged_patient.settings import Settings
 from mvest.cases.case import ValveCase
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
@@ -34,7 +39,7 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
-__all__ = ["ImagedPlace", "make_imaged_patient", "run_imaged_patient", "volume_rows"]
+__all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient", "volume_rows"]
 
 Values = Mapping[str, Any]
 
@@ -265,3 +270,16 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: Values) ->
         patient["name"], f"{patient['description']}, its true positions", "simulated", "MIT", True
     )
     return case_of_sequence(told, frames, texts)
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_imaged_patient),
+    words=lambda record: case_text(flat(record)),
+    write=write_volumes,
+    write_run=lambda folder, record: write_case_tables(folder, flat(record)),
+    keep=kept_of_volume,
+    keeps_failures=True,
+    sections=(Section("volume", title="Moduli from simulated volumes"),),
+)

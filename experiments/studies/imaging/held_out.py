@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.mirror import build
 from experiments.common.progress import PartBar
+from experiments.common.schema import build
 from experiments.studies.imaging.parallel import in_processes
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.trials import (

@@ -72,7 +72,7 @@ def imaging_record(
         "seconds_total": time.time() - started,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "mesh": {},
-        "model": {"detectors": store.model_key(store.training.volumes)},
+        "detectors": store.model_key(store.training.volumes),
         "layout": {"columns": motion.columns, "rows": motion.rows},
         "valves": {
             which: {"count": config["imaging"][which]["count"], "refused": dict(found.refused)}

@@ -20,8 +20,8 @@ from joblib.externals.loky import get_reusable_executor
 from numpy.typing import NDArray
 
 from experiments.common.build import mechanics_of
-from experiments.common.mirror import build
 from experiments.common.progress import PartBar
+from experiments.common.schema import build
 from experiments.common.store import Store, key_of
 from experiments.studies.imaging.parallel import in_processes
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model

@@ -6,15 +6,19 @@ import hashlib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.mirror import build
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.schema import build
+from experiments.common.study import Section, Study
 from experiments.studies.imaging.held_out import HeldOut, hold_out
 from experiments.studies.imaging.record import imaging_record
+from experiments.studies.imaging.report import NOT_KEPT, imaging_text, write_imaging_study
+from experiments.studies.imaging.settings import Settings
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.tables import imaging_table, imaging_words
 from mvest.errors import ConfigurationError, InputError, cannot_write
@@ -35,7 +39,7 @@ from mvest.imaging.moving_valve import MovingValve
 from mvest.provenance import provenance
 from mvest.reporting.images.figures import SETTINGS
 
-__all__ = ["MODEL", "publish_model", "require_imaging", "run_imaging"]
+__all__ = ["MODEL", "STUDY", "publish_model", "require_imaging", "run_imaging"]
 
 Values = Mapping[str, Any]
 
@@ -241,3 +245,32 @@ def _require_targets(targets: Values) -> None:
 def _versions() -> dict[str, Any]:
     found = provenance()["versions"]
     return {name: found[name] for name in ("mvest", "numpy", "lightgbm")}
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_imaging),
+    words=lambda record: imaging_text(flat(record)),
+    write=each(write_imaging_study),
+    keep=lambda record: replace(
+        record,
+        findings={key: value for key, value in record.findings.items() if key not in NOT_KEPT},
+    ),
+    finish=lambda job, record: publish_model(job.values, flat(record), job.folder),
+    require=require_imaging,
+    sections=(
+        Section(
+            "imaging",
+            {
+                "imaging_distance": "Distance of estimated leaflets from true ones, volume by"
+                " volume. Simulated.",
+                "imaging_training": "Errors of each stage against the number of training "
+                "volumes. Simulated.",
+                "imaging_confidence": "Confidence in volumes with and without a valve. Simulated.",
+                "imaging_std": "Standard deviation that the image step states of each point. "
+                "Simulated.",
+            },
+        ),
+    ),
+)

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
+from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import (
     bound_entry,
     closed_frame,
@@ -20,6 +23,8 @@ from experiments.common.whole_cycle import (
     shift_by_check_mesh,
     stored_cycle,
 )
+from experiments.studies.joint.report import joint_text, write_joint
+from experiments.studies.joint.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
@@ -32,7 +37,7 @@ from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import Transform
 from mvest.typing import FloatArray
 
-__all__ = ["run_joint_study"]
+__all__ = ["STUDY", "run_joint_study"]
 
 Values = Mapping[str, Any]
 
@@ -234,3 +239,27 @@ def _rng(config: Values, k: int) -> np.random.Generator:
 def _tell(label: str, found: Estimate, truth: FloatArray) -> None:
     errors = ", ".join(f"{100 * e:+.2f} %" for e in found.mean / truth - 1)
     print(f"{label}: {errors} ({found.forward_solves} runs)", file=sys.stderr, flush=True)
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_joint_study),
+    words=lambda record: joint_text(flat(record)),
+    write=each(write_joint),
+    checks=lambda: (foresee_cycle,),
+    sections=(
+        Section(
+            "joint",
+            {
+                "joint": "Estimates as frames come in, errors over seeds, and what two frames"
+                " and a "
+                "whole cycle could tell. Simulated."
+            },
+        ),
+        Section(
+            "joint_open",
+            {"joint_open": "As the figure before, of a valve that opens fully. Simulated."},
+        ),
+    ),
+)

@@ -12,6 +12,10 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_twin
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
+from experiments.studies.law.report import law_text, write_law_tables
+from experiments.studies.law.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.information.consistency import chi_square_band
@@ -28,7 +32,7 @@ from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
-__all__ = ["run_law_study"]
+__all__ = ["STUDY", "run_law_study"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -283,3 +287,22 @@ def _record(config: Values, config_hash: str, twin: Twin, started: float) -> dic
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
     }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_law_study),
+    words=lambda record: law_text(flat(record)),
+    write=each(write_law_tables),
+    sections=(
+        Section(
+            "law",
+            {
+                "law": "Stress of each leaflet under equibiaxial stretch: true, as estimated with "
+                "the exponential law, and with the linear law from the same data. Simulated.",
+                "law_biaxial": "The exponential law with the coefficients of excised leaflets.",
+            },
+        ),
+    ),
+)

@@ -14,7 +14,11 @@ import numpy as np
 
 import mvest
 from experiments.common.build import build_filter
-from experiments.common.mirror import build
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.schema import build
+from experiments.common.study import Section, Study
+from experiments.studies.models.report import models_text, write_models_tables
+from experiments.studies.models.settings import Settings
 from experiments.studies.models.sheet.own import OwnSheet
 from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
@@ -30,7 +34,7 @@ from mvest.provenance import config_hash as hash_of_data
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
-__all__ = ["run_models", "sheet_program"]
+__all__ = ["STUDY", "run_models", "sheet_program"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -235,3 +239,23 @@ def _record(
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
     }  # fmt: skip
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_models),
+    words=lambda record: models_text(flat(record)),
+    write=each(write_models_tables),
+    sections=(
+        Section(
+            "models",
+            {
+                "models": "A pressed sheet in two finite-element codes: deformed, its moduli "
+                "iterate by"
+                " iterate under each model, and how the codes differ on finer meshes. "
+                "Simulated."
+            },
+        ),
+    ),
+)

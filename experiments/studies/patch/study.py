@@ -17,8 +17,13 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of, template_of
+from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
+from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import cycle_model, shift_by_check_mesh, stored_cycle
+from experiments.studies.patch.report import patch_text, write_patch
+from experiments.studies.patch.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
@@ -28,7 +33,7 @@ from mvest.estimation.transform import to_filter
 from mvest.mechanics.law.field import FieldBasis, StiffPatch
 from mvest.typing import FloatArray
 
-__all__ = ["run_patch_study"]
+__all__ = ["STUDY", "run_patch_study"]
 
 Values = Mapping[str, Any]
 
@@ -217,3 +222,23 @@ class _Leaflet:
             "rms_log_error": float(np.sqrt(np.sum(weight * error**2))),
             "within_two_std": float(np.sum(weight[np.abs(error) <= 2 * std])),
         }
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_patch_study),
+    words=lambda record: patch_text(flat(record)),
+    write=each(write_patch),
+    checks=lambda: (foresee_cycle,),
+    sections=(
+        Section(
+            "patch",
+            {
+                "patch": "True and estimated modulus of the unrolled anterior leaflet, and "
+                "how sure. "
+                "Simulated."
+            },
+        ),
+    ),
+)

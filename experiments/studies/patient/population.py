@@ -11,11 +11,9 @@ from matplotlib.figure import Figure
 from scipy.stats import beta
 
 from experiments.common.cases.tables import (
-    POPULATION,
     Record,
     distance_words,
     provenance_of,
-    read_kept,
     table3,
     write_table,
 )
@@ -52,11 +50,8 @@ def population_frame(records: Sequence[Record]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def write_population_tables(results: Path) -> list[Path]:
-    """``population.*`` from the kept patients drawn at random; none if there are none."""
-    records = list(read_kept(results, POPULATION).values())
-    if not records:
-        return []
+def write_population_tables(results: Path, records: Sequence[Record]) -> list[Path]:
+    """``population.*`` from kept patients drawn at random."""
     table = population_frame(records)
     readable = []
     for (estimation, name), group in table.groupby(["estimation", "name"], sort=False):

@@ -14,8 +14,14 @@ import numpy as np
 from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.record import of_all_unknowns
-from experiments.common.mirror import build
+from experiments.common.cases.report import case_text, write_case_tables
+from experiments.common.expectation import foresee_own
+from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.schema import build
 from experiments.common.store import Store
+from experiments.common.study import Section, Study
+from experiments.studies.patient.report import arrays_of_patient, kept_of_patient, write_patients
+from experiments.studies.patient.settings import Settings
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
@@ -31,7 +37,7 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
 
-__all__ = ["PatientPlace", "make_patient", "reveal", "run_patient"]
+__all__ = ["STUDY", "PatientPlace", "make_patient", "reveal", "run_patient"]
 
 Values = Mapping[str, Any]
 
@@ -225,3 +231,50 @@ def _reveal_positions(
 
 def _spread(values: FloatArray) -> dict[str, float]:
     return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
+
+
+def foresee_patient(config: Values, folder: Path | None = None) -> str:
+    """The answer for the case of a virtual patient, which is simulated first unless it is there.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or the patient's valve does not close.
+    """
+    return foresee_own({**config, "case": str(make_patient(config).case)}, folder)
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_patient),
+    words=lambda record: case_text(flat(record)),
+    write=write_patients,
+    write_run=lambda folder, record: write_case_tables(folder, flat(record)),
+    keep=kept_of_patient,
+    keep_arrays=arrays_of_patient,
+    keeps_failures=True,
+    checks=lambda: (foresee_patient,),
+    sections=(
+        Section("table2", title="Table 2: moduli of five virtual patients (simulated)"),
+        Section(
+            "table3",
+            {
+                "figure3": "Figure 3: closed valves coloured by their distance from what was "
+                "observed, "
+                "with generic and with personalised stiffness, on one scale. Drawn are "
+                "midsurfaces: leaflets that touch lie a thickness apart, so that a white slit"
+                " is not yet a leak. Simulated."
+            },
+            "Table 3: distances of their closed valves (simulated)",
+        ),
+        Section(
+            "population",
+            {
+                "population": "Estimates with their 95 % intervals against the hidden truth. "
+                "Simulated."
+            },
+            "Virtual patients drawn at random (simulated)",
+        ),
+    ),
+)

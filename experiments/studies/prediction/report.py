@@ -8,16 +8,18 @@ from typing import Any
 
 import pandas as pd
 
+from experiments.common.plain import Plain, flat
+from experiments.common.record import Record as Run
 from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
-from mvest.reporting.files import keep_record, provenance_line
+from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, markdown_rows, number
 
 __all__ = [
     "SHOWN",
     "coverage",
     "prediction_text",
-    "publish_prediction",
+    "write_prediction",
     "write_prediction_tables",
 ]
 
@@ -298,12 +300,17 @@ def write_prediction_tables(folder: Path, record: Record) -> list[Path]:
     ]
 
 
-def publish_prediction(results: Path, record: Record, fields: Path) -> list[Path]:
-    """Keep the record, and write its tables and its figure into the results."""
+def write_prediction(
+    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Tables of each run, and its figure where its valves are still there."""
     from experiments.studies.prediction.figure import prediction_figure
 
-    keep_record(results, record)
-    return [
-        *write_prediction_tables(results, record),
-        *save_figure(results / "prediction", prediction_figure(record, fields), record),
-    ]
+    written = []
+    for name, run in records.items():
+        record = flat(run)
+        written += write_prediction_tables(folder, record)
+        if name in arrays:
+            figure = prediction_figure(record, arrays[name])
+            written += save_figure(folder / "prediction", figure, record)
+    return written

@@ -17,8 +17,12 @@ import numpy as np
 
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
 from experiments.common.forward import forward_record
-from experiments.common.mirror import build
+from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import PartBar
+from experiments.common.schema import build
+from experiments.common.study import Section, Study
+from experiments.studies.prediction.report import prediction_text, write_prediction
+from experiments.studies.prediction.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
@@ -32,7 +36,7 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["run_prediction"]
+__all__ = ["STUDY", "run_prediction"]
 
 Values = Mapping[str, Any]
 Outcome = tuple[dict[str, Any], list[Path]]
@@ -327,3 +331,22 @@ def _write_fields(
         free_edge=valve.free_edge.astype(np.int32),
         tips=valve.papillary_tips.astype(np.float32),
     )
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_prediction),
+    words=lambda record: prediction_text(flat(record)),
+    write=write_prediction,
+    sections=(
+        Section(
+            "prediction",
+            {
+                "prediction": "A leaking valve closed as observed and under changed "
+                "conditions, seen from "
+                "the atrium, and measures of it with their 95 % intervals. Simulated."
+            },
+        ),
+    ),
+)

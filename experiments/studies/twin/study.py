@@ -12,8 +12,18 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_twin
+from experiments.common.estimate_record import (
+    make_record,
+    measure_frames,
+    repeat_entry,
+    write_fields,
+)
+from experiments.common.expectation import TwinForesight
+from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import SolveBar
-from experiments.common.record import make_record, measure_frames, repeat_entry, write_fields
+from experiments.common.study import Section, Study
+from experiments.studies.twin.publish import require_twin, text_table_of, write_twin, write_twin_run
+from experiments.studies.twin.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.estimation.wrappers import SharedStart
 from mvest.observation.vertices import observed_frames
@@ -21,7 +31,7 @@ from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 
-__all__ = ["run_twin"]
+__all__ = ["STUDY", "run_twin"]
 
 TYPICAL_SOLVES = 6
 """Forward solves that a filter usually needs; only the progress bar's first guess."""
@@ -131,3 +141,28 @@ def _confirm(twin: Twin, result: StudyResult) -> float | None:
 
 def _steps(model: ClosureModel) -> Sequence[object]:
     return model.settings.protocol.steps()
+
+
+STUDY = Study(
+    settings=Settings,
+    findings=Plain,
+    run=plain_run(run_twin),
+    words=lambda record: text_table_of(flat(record)),
+    write=write_twin,
+    write_run=write_twin_run,
+    checks=lambda: (TwinForesight(),),
+    require=require_twin,
+    sections=(
+        Section(
+            "table1",
+            {
+                "table1": "Estimates after each iteration, ± 2 standard deviations, and the truth. "
+                "Simulated.",
+                "table1_valve": "The fitted valve, open and closed. Simulated.",
+            },
+            "Table 1",
+            validation=True,
+        ),
+        Section("mesh_independence", title="Independence of the mesh", validation=True),
+    ),
+)

@@ -18,7 +18,7 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     run,
     sweep,
 )
-from tests.reporting.records import record
+from tests.reporting.records import record, stored
 
 HOSTILE = "<script>alert('x')</script><img src=http://example.org/x>"
 
@@ -166,8 +166,9 @@ def test_tables_are_made_again_from_published_sweeps_alone(tmp_path, capsys) -> 
     assert main([str(tmp_path)]) == 0
     assert before == {path.name: path.read_bytes() for path in tmp_path.glob("sweep_*")}
     assert "report.html" in capsys.readouterr().out
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records" / "table1.json").write_text(json.dumps(record()), encoding="utf-8")
+    place = tmp_path / "records" / "table1"
+    place.mkdir(parents=True)
+    (place / "table1.json").write_text(json.dumps(stored(record())), encoding="utf-8")
     assert main([str(tmp_path)]) == 0
     assert "Moduli of a synthetic valve" in (tmp_path / "report.html").read_text(encoding="utf-8")
     (tmp_path / "sweeps" / "filter.json").write_text("{", encoding="utf-8")

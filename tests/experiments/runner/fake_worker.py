@@ -8,13 +8,15 @@ import os
 import signal
 from pathlib import Path
 
-from experiments.runner import job, worker
-from experiments.runner.folder import write_failure
-from experiments.runner.request import Request
+from experiments.common.record import Outcome
+from experiments.common.study import Study
+from experiments.runner import worker
+from experiments.studies.twin import study
+from experiments.studies.twin.settings import Settings
 
 
-def run(values, config_hash, folder, started):
-    seed = values["seed"]
+def run(job):
+    seed = job.values["seed"]
     with Path("runs").open("a") as runs:
         runs.write(f"{seed}\n")
     for name in ("kill", "raise", "full"):
@@ -28,22 +30,27 @@ def run(values, config_hash, folder, started):
             case "raise":
                 raise RuntimeError("it broke")
             case "full":
-                raise OSError(28, "No space left on device", str(folder / "result.json"))
-    record = write_failure(Request(values, config_hash, folder), "converged", started)
+                raise OSError(28, "No space left on device", str(job.folder / "result.json"))
     print(f"seed {seed}")
-    found = {
-        "status": "converged",
-        "estimate": [6.0 + seed / 10, 2.0],
-        "std": [0.1, 0.1],
-        "relative_error": [0.01, 0.01],
-        "truth_store": "hit",
-        "seconds_computing": 0.0,
-    }
-    record |= found
-    return {key: value for key, value in record.items() if key != "repeats"}, []
+    return Outcome(
+        findings={
+            "status": "converged",
+            "estimate": [6.0 + seed / 10, 2.0],
+            "std": [0.1, 0.1],
+            "relative_error": [0.01, 0.01],
+            "truth_store": "hit",
+            "seconds_computing": 0.0,
+        }
+    )
 
 
-job.STUDIES["twin"] = job.Study(run, lambda record: "", lambda *_: [], lambda *_: [])
+study.STUDY = Study(
+    settings=Settings,
+    findings=dict,
+    run=run,
+    words=lambda record: "",
+    write=lambda folder, records, arrays: [],
+)
 
 if __name__ == "__main__":
     worker.main()

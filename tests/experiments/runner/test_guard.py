@@ -44,7 +44,15 @@ def worker():
 
 def request(folder: Path, **order) -> Request:
     values = {
-        **{"name": "a", "title": "b", "row": "c", "table": "d", "paper": None, "seed": 1},
+        **{
+            "study": "twin",
+            "name": "a",
+            "title": "b",
+            "row": "c",
+            "table": "d",
+            "paper": None,
+            "seed": 1,
+        },
         **{"parameters": ["x"], "factors": {"k": 1}, "truth": {"values": [1.0]}},
         **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
         **{"mechanics": {"element": "hex18"}, "tracking": {"enabled": False}, "force": False},
@@ -78,7 +86,7 @@ def test_whatever_ends_a_job_costs_its_own_row(worker, tmp_path, order, reason):
     assert record["status"] == "failed"
     assert reason in record["reason"]
     assert record["factors"] == {"k": 1}
-    assert record["repeats"] == []
+    assert record["findings"] is None
     assert last_record(asked.folder, asked.config_hash) == record
     assert not is_done(asked.folder)
     # The next job finds a process at its service.
@@ -165,12 +173,13 @@ def test_a_second_process_waits_for_the_folder(tmp_path):
 LONG = """
 import os, sys
 from pathlib import Path
-from experiments.runner import job
+from dataclasses import replace
 from experiments.runner import worker
-def run(values, config_hash, folder, started):
+from experiments.studies.twin import study
+def run(job):
     Path("pid").write_text(str(os.getpid()))
     while True: sum(range(1000))
-job.STUDIES["twin"] = job.Study(run, None, None, None)
+study.STUDY = replace(study.STUDY, run=run)
 worker.main()
 """
 """The real worker, in the middle of a computation that never ends."""

@@ -15,10 +15,10 @@ import pytest
 from experiments.run import main
 from experiments.runner import guard, progress, sweep
 from experiments.runner.folder import mark_done, write_failure
-from experiments.runner.job import STUDIES
 from experiments.runner.plan import Plan, PlannedJob
 from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request
+from experiments.studies.twin import study
 from mvest.provenance import write_json
 from tests.places import ROOT
 
@@ -292,8 +292,8 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
-    told = replace(STUDIES["twin"], text=lambda record: f"told: {record['status']}")
-    monkeypatch.setitem(STUDIES, "twin", told)
+    told = replace(study.STUDY, words=lambda record: f"told: {record.status}")
+    monkeypatch.setattr(study, "STUDY", told)
     alone = ("experiment=debug", "time_limit_s=600", "seed=2")
     Path("raise-2").touch()
     status, _, err = run(*alone)

@@ -1,0 +1,77 @@
+"""What studies that personalise a case add to the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from mvest.personalise.settings import CaseMesh, PaperSettings
+from mvest.simulation.virtual_patient import Deviations, PatientSimulation
+
+__all__ = ["ImagedSettings", "PatientSettings", "PersonalSettings", "UnknownSettings"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnknownSettings:
+    """One quantity that is not known of a case: its prior, and what becomes of it."""
+
+    mean: float
+    std: float
+    treatment: str = "estimated"  # or considered, or fixed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PersonalSettings:
+    """How a case is personalised (see mvest.personalise.PersonaliseSettings)."""
+
+    unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    tolerance: float = 2e-3
+    max_iterations: int = 15
+    largest_change: float = 0.2  # of a parameter's logarithm from one equilibrium to the next
+    paper: PaperSettings | None = None
+    moduli_only: bool = False  # estimate also with all nuisances fixed
+    confirm: bool = False  # close the fitted valve anew from the open one
+    correspondence: bool = True  # use corresponding vertices as such, where there are any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImagedSettings:
+    """From a volume over time to a case: what the file does not say."""
+
+    model: str | None = None  # file of the detection model; null: the one for ultrasound
+    package_model: str | None = None  # SHA-256 of that one, where a result is kept as its own
+    modality: str | None = None  # ultrasound, ct or mr, where the file does not say
+    frame_interval_s: float | None = None  # where the file states no times
+    time_unit: str | None = None  # s or ms, where the file states times without a unit
+    # [frame, .mrk.json] with landmarks placed by hand, where the automatic ones fail.
+    landmarks: tuple[Any, ...] = ()
+    open_frame: int | None = None  # null: the one with the largest orifice
+    closed_frame: int | None = None  # null: the one whose leaflets touch most
+    pressure_mmHg: float | None = None  # transmitral, in the closed frame
+    pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
+    held_out: tuple[Any, ...] = ()  # [frame, mmHg]: closed frames not shown
+    thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
+    valve_confidence: float = 0.6  # of the best frame; below it there is no valve (0: show it)
+    least_confidence: float = 0.6  # of the frames that are chosen
+    error_samples: int = 20  # at most, with which the valve is closed anew
+    name: str | None = None  # null: the name of the file
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False  # does the volume come from a simulation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PatientSettings:
+    """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
+
+    name: str
+    description: str
+    moduli: dict[str, float] = field(default_factory=dict)  # MPa
+    moduli_spread: float = 0.0  # SD of the logarithm by which they are drawn about these
+    variation: float = 0.0  # size of the random variation of the anatomy; 0: as configured
+    simulation: PatientSimulation = field(default_factory=PatientSimulation)
+    deviations: Deviations = field(default_factory=Deviations)
+    paper_moduli: tuple[float, ...] = ()  # MPa, of the paper's patient
+    paper_distance_mm: tuple[float, ...] = ()  # generic, personalised

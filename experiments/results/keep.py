@@ -1,0 +1,102 @@
+"""``results/records``: kept records, and the tables and figures that follow from them.
+
+``results/records/TABLE/NAME.json`` is the record ``NAME`` of the table ``TABLE``, beside it what
+figures need of the run's arrays, if anything.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+
+from experiments.common.record import Record, read_data, record_from, write_record
+from experiments.common.study import Study, load_study
+from mvest.errors import InputError, cannot_write
+from mvest.files import write_atomically
+
+__all__ = ["FIELDS", "RECORDS", "arrays_of", "publish", "regenerate"]
+
+RECORDS = "records"
+"""Folder of the kept records within the results."""
+
+FIELDS = "fields.npz"
+"""What a run leaves of arrays in its folder."""
+
+
+def arrays_of(folder: Path, name: str) -> dict[str, Path]:
+    """Name -> arrays of the run in a folder, if it left any."""
+    path = folder / FIELDS
+    return {name: path} if path.is_file() else {}
+
+
+def publish(
+    study: Study[Any, Any], results: Path, name: str, record: Record[Any], folder: Path
+) -> list[Path]:
+    """Keep a record, and renew the table it belongs to.
+
+    Parameters
+    ----------
+    study : Study
+    results : Path
+        The folder of all results; made if need be.
+    name : str
+        Of the record.
+    record : Record
+    folder : Path
+        Output folder of the run.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    place = results / RECORDS / record.table
+    arrays = arrays_of(folder, name)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        # Jobs of one experiment end in several processes at once.
+        with FileLock(results / f".{record.table}.lock"):
+            write_record(place / f"{name}.json", study.keep(record))
+            kept = study.keep_arrays(record, arrays[name]) if arrays else {}
+            if kept:
+                write_atomically(place / f"{name}.npz", partial(np.savez_compressed, **kept))
+            records = _read(place, study.findings)
+            return study.write(results, records, _arrays(place) | arrays)
+    except OSError as error:
+        raise cannot_write(place, error) from error
+
+
+def regenerate(results: Path) -> list[Path]:
+    """Write every table and figure again that follows from kept records.
+
+    Raises
+    ------
+    InputError
+        If there is no record, or one is damaged.
+    """
+    places = sorted({path.parent for path in (results / RECORDS).glob("*/*.json")})
+    if not places:
+        raise InputError(
+            f"{results / RECORDS} holds no record; run an experiment first, for example "
+            "python -m experiments.run experiment=table1"
+        )
+    written: list[Path] = []
+    for place in places:
+        first = next(iter(sorted(place.glob("*.json"))))
+        study = load_study(str(read_data(first).get("study")))
+        written += study.write(results, _read(place, study.findings), _arrays(place))
+    return written
+
+
+def _read(place: Path, findings: type) -> dict[str, Record[Any]]:
+    """The records of a table by name; the one that has the table's name comes first."""
+    paths = sorted(place.glob("*.json"), key=lambda path: (path.stem != place.name, path.stem))
+    return {path.stem: record_from(read_data(path), findings, str(path)) for path in paths}
+
+
+def _arrays(place: Path) -> dict[str, Path]:
+    return {path.stem: path for path in sorted(place.glob("*.npz"))}

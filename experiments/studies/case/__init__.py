@@ -1,0 +1,1 @@
+"""One's own valve: a folder of data to moduli with intervals."""

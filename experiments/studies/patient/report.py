@@ -1,0 +1,52 @@
+"""What the results keep of virtual patients, and the tables that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.cases.tables import PATIENTS, POPULATION, in_order, write_patient_tables
+from experiments.common.plain import Plain, flat
+from experiments.common.record import Record
+from experiments.studies.patient.population import write_population_tables
+
+__all__ = ["arrays_of_patient", "kept_of_patient", "write_patients"]
+
+KEPT_ARRAYS = (
+    "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
+    "chord_insertion", "generic", "fitted", "distance_generic", "distance_fitted",
+)  # fmt: skip
+"""Arrays that Figure 3 needs."""
+
+
+def write_patients(
+    folder: Path, records: Mapping[str, Record[Plain]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Tables 2 and 3 and Figure 3, or the table of the population."""
+    kept = in_order({name: flat(record) for name, record in records.items()})
+    if next(iter(records.values())).table == POPULATION:
+        return write_population_tables(folder, list(kept.values()))
+    return write_patient_tables(folder, kept, arrays)
+
+
+def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
+    """What tables need of a record; the settings are in ``conf``."""
+    dropped = ("settings", "measurements") if record.table == POPULATION else ()
+    findings = {key: value for key, value in record.findings.items() if key not in dropped}
+    return replace(record, findings=findings)
+
+
+def arrays_of_patient(record: Record[Plain], path: Path) -> dict[str, Any]:
+    """Arrays that Figure 3 needs, in single precision."""
+    if record.table != PATIENTS:
+        return {}
+    with np.load(path, allow_pickle=False) as stored:
+        return {key: _small(stored[key]) for key in KEPT_ARRAYS if key in stored}
+
+
+def _small(array: Any) -> Any:
+    return array.astype(np.float32) if array.dtype == np.float64 else array

@@ -1,0 +1,17 @@
+"""Settings of the study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from experiments.common.cases.settings import PatientSettings, PersonalSettings
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    patient: PatientSettings
+    personal: PersonalSettings

@@ -1,0 +1,1 @@
+"""A volume over time to moduli with intervals."""

@@ -1,0 +1,72 @@
+import dataclasses
+from dataclasses import dataclass
+
+import pytest
+from omegaconf import OmegaConf
+from omegaconf.errors import ConfigKeyError, ValidationError
+
+from experiments.common.config import MechanicsConfig, TemplateConfig
+from experiments.common.schema import build, schema
+from mvest.errors import ConfigurationError, InputError
+from mvest.imaging.detection.tracking import TrackingSettings
+from mvest.imaging.learning.training import TrainingSettings
+from mvest.mechanics.settings import MechanicsSettings, TissueSettings
+from mvest.simulation.motion import PopulationSettings
+from mvest.valve.anatomy.template import TemplateParameters
+
+
+@dataclass(frozen=True)
+class Inner:
+    x: float = 1.5
+
+
+@dataclass(frozen=True)
+class Outer:
+    needed: float
+    inner: Inner = Inner()
+    numbers: tuple[float, ...] = (1.0, 2.0)
+    pairs: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+    table: dict[str, Inner] = dataclasses.field(default_factory=dict)
+    maybe: int | None = None
+
+
+def test_there_and_back() -> None:
+    config = OmegaConf.structured(schema(Outer))
+    config.merge_with(
+        {"needed": 2, "inner": {"x": 3}, "pairs": [[3, 4], [5, 6]], "table": {"a": {}}}
+    )
+    assert build(Outer, OmegaConf.to_container(config)) == Outer(
+        2.0, Inner(3.0), pairs=((3, 4), (5, 6)), table={"a": Inner()}
+    )
+
+
+def test_a_missing_value_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="Outer needs a value for needed"):
+        build(Outer, OmegaConf.to_container(OmegaConf.structured(schema(Outer))))
+
+
+def test_typos_and_wrong_types_are_refused() -> None:
+    config = OmegaConf.structured(schema(Outer))
+    with pytest.raises(ConfigKeyError):
+        config.merge_with({"inner": {"y": 3}})
+    with pytest.raises(ValidationError):
+        config.merge_with({"inner": {"x": "three"}})
+
+
+def test_the_librarys_defaults_are_the_configurations() -> None:
+    template = OmegaConf.to_container(OmegaConf.structured(TemplateConfig))
+    assert build(TemplateParameters, template) == TemplateParameters()
+    # Dataclasses within dataclasses, and mappings.
+    for cls in (PopulationSettings, TrainingSettings, TrackingSettings):
+        made = OmegaConf.to_container(OmegaConf.structured(schema(cls)))
+        assert build(cls, made) == cls()
+    mechanics = OmegaConf.structured(MechanicsConfig)
+    mechanics.merge_with({"tissue": {"anterior": {"ratio": 2.0}}})
+    tissue = {"anterior": TissueSettings(2.0)}
+    assert build(MechanicsSettings, OmegaConf.to_container(mechanics)) == MechanicsSettings(tissue)
+
+
+def test_the_librarys_own_checks_apply() -> None:
+    values = OmegaConf.to_container(OmegaConf.structured(TemplateConfig))
+    with pytest.raises(InputError, match="taper"):
+        build(TemplateParameters, {**values, "taper": 0.0})
