@@ -5,7 +5,8 @@ from dataclasses import fields
 
 import pytest
 
-from experiments.common.cases.settings import ImagedSettings, ImagingConfig
+from experiments.common.cases.settings import ImagedSettings
+from experiments.studies.imaging.settings import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
@@ -17,7 +18,7 @@ OWN, MAIN = (ROOT / "mvest" / "imaging" / "README.md", ROOT / "README.md")
 @pytest.mark.parametrize("path", [OWN, MAIN], ids=["imaging", "main"])
 def test_settings_that_are_named_exist(path):
     text = path.read_text(encoding="utf-8")
-    for part, config in (("imaged", ImagedSettings), ("imaging", ImagingConfig)):
+    for part, config in (("imaged", ImagedSettings), ("imaging", ImagingSettings)):
         named = set(re.findall(rf"(?<![\w./]){part}\.(\w+)\b", text)) - {"md"}
         assert named, part
         assert named <= {f.name for f in fields(config)}
