@@ -17,6 +17,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume
 from mvest.imaging.writing import write_sequence_nrrd
+from mvest.valve.anatomy.dimensions import AnnulusDimensions
 from mvest.valve.anatomy.template import Template, TemplateParameters
 from tests.made_up_closure import made_up_case, use
 from tests.places import ROOT
@@ -28,7 +29,9 @@ TISSUE = {"anterior": mvest.TissueSettings(ratio=2.65), "posterior": mvest.Tissu
 
 def small_model() -> mvest.ClosureModel:
     """A coarse valve that a low pressure moves in two steps without closing it."""
-    template = mvest.Template(mvest.TemplateParameters(half_ap=13.8))
+    template = mvest.Template(
+        mvest.TemplateParameters().changed({"annulus.anteroposterior_half_axis": 13.8})
+    )
     protocol = mvest.ClosureProtocol(5.0, ramp=0.1, dt=0.05, end=0.1, equilibrium=False)
     return mvest.ClosureModel(
         template.valve(24, 7),
@@ -76,7 +79,7 @@ def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def simulated_volume(folder: Path) -> Path:
     """A file as a user has one: a valve of its own, closing a little, in simulated echo."""
     layout = ValveLayout(64, 15)
-    template = Template(TemplateParameters(half_commissural=17.2, half_ap=13.4))
+    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
     valve = template.valve(layout.columns, layout.rows)
     phi, s, _, tip = template.chord_places()
     vertices = valve.surface.vertices

@@ -13,6 +13,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.evaluation import surface_distances
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume, true_sequence
+from mvest.valve.anatomy.dimensions import AnnulusDimensions
 from mvest.valve.anatomy.template import Template, TemplateParameters
 
 LAYOUT = ValveLayout(64, 15)
@@ -26,7 +27,7 @@ def model():
 @pytest.fixture(scope="module")
 def seen():
     """Two open frames of a valve with an anatomy of its own, and where it truly is."""
-    template = Template(TemplateParameters(half_commissural=17.2, half_ap=13.4))
+    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
     valve = template.valve(LAYOUT.columns, LAYOUT.rows)
     phi, s, _, tip = template.chord_places()
     vertices = valve.surface.vertices

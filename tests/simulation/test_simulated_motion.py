@@ -249,7 +249,10 @@ def test_limits_are_checked(change):
 
 # --- populations --------------------------------------------------------------------------------
 
-BASES = {"one": TemplateParameters(), "other": TemplateParameters(half_ap=15.0)}
+BASES = {
+    "one": TemplateParameters(),
+    "other": TemplateParameters().changed({"annulus.anteroposterior_half_axis": 15.0}),
+}
 
 
 @pytest.fixture

@@ -13,170 +13,19 @@ papillary tips lie at negative z. All lengths are mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
 __all__ = ["ChordLayout", "Template", "TemplateParameters"]
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
-
-
-@dataclass(frozen=True, slots=True)
-class ChordLayout:
-    """Where the chordae insert, in material coordinates of one half; the other half is mirrored.
-
-    Attributes
-    ----------
-    marginal_phi : tuple of float
-        Degrees from the commissure, positive on the anterior leaflet, at ``s = marginal_s``.
-    basal : tuple of (float, float)
-        (phi, s) of the basal chordae.
-    marginal_s : float
-    marginal_stiffness, basal_stiffness : float
-        Axial stiffness EA, N.
-    marginal_slack, basal_slack : float
-        Rest length over the distance to the intended closed position.
-    open_slack : float
-        Rest length over the open length, at least.
-    toe_strain : float
-    elongated : tuple of (float, float, float)
-        (from, to, factor): chordae that insert at these ``phi`` of the whole valve, in degrees, are
-        longer by the factor; where ranges overlap, by all of theirs. Nothing is mirrored.
-    absent : tuple of (float, float)
-        (from, to): chordae that insert at these ``phi`` of the whole valve are missing.
-
-    Raises
-    ------
-    InputError
-        If there is no chord, a place is incomplete, a range is empty or a factor not positive.
-    """
-
-    marginal_phi: tuple[float, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
-    basal: tuple[tuple[float, float], ...] = ((-60.0, 0.5), (50.0, 0.55), (75.0, 0.55))
-    marginal_s: float = 0.97
-    marginal_stiffness: float = 20.0
-    basal_stiffness: float = 16.0
-    marginal_slack: float = 0.985
-    basal_slack: float = 1.03
-    open_slack: float = 1.035
-    toe_strain: float = 0.015
-    elongated: tuple[tuple[float, float, float], ...] = ()
-    absent: tuple[tuple[float, float], ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.marginal_phi and not self.basal:
-            raise InputError("a chord layout needs at least one chord")
-        for k, place in enumerate(self.basal):
-            if len(place) != 2:
-                raise InputError(f"basal chord {k} is {place}, expected (phi, s)")
-        for elongation in self.elongated:
-            if len(elongation) != 3 or not (elongation[0] < elongation[1] and elongation[2] > 0):
-                raise InputError(
-                    f"elongated chordae {elongation}, expected (from, to, factor) with from < to "
-                    "and factor > 0"
-                )
-        for gap in self.absent:
-            if len(gap) != 2 or not gap[0] < gap[1]:
-                raise InputError(f"absent chordae {gap}, expected (from, to) with from < to")
-
-
-@dataclass(frozen=True, slots=True)
-class TemplateParameters:
-    """Shape of the valve; lengths in mm, angles in degrees.
-
-    Attributes
-    ----------
-    half_commissural, half_ap : float
-        Half axes of the annulus.
-    saddle : float
-        Height of the annulus.
-    flattening : float
-        Share by which the anterior half axis is shorter.
-    commissure_angle : float
-        Parametric angle of the commissures above the x axis.
-    length_anterior, length_posterior, length_commissure : float
-        Leaflet lengths from annulus to free edge in the middle and at the commissures.
-    exponent_anterior, exponent_posterior : float
-        Power of the sine with which the length falls off towards the commissures.
-    bulge : float
-        Depth of the leaflets' belly over their length.
-    edge_half_width : float
-        Half width of the open free edge between the commissures.
-    edge_exponent : float
-        Shape of the open free edge: 1 gives half ellipses, 2 parabolas that meet at an angle.
-    edge_y : float
-        y of the free edge at the commissures.
-    edge_anterior, edge_posterior : float
-        y of the open free edge's middles relative to ``edge_y`` (anterior up, posterior down).
-    tips : tuple
-        (x, y, z) of the papillary tip at positive x; the other is its mirror image.
-    tips_displacement : tuple
-        (x, y, z) by which this tip has moved since the chordae got their lengths, outward for
-        positive x; the other moves as its mirror image. The chordae do not follow, so they tether
-        the leaflets; they are only never taut in the open valve.
-    thickness_anterior, thickness_posterior : float
-    taper : float
-        Thickness at the free edge over that of the annular half.
-    ap_contraction, commissural_contraction : float
-        Shares by which the annulus shrinks until the valve is closed.
-    closed_sag, closed_half_width, closed_z, closed_drop : float
-        Intended coaptation line, from which the rest lengths of the chordae follow:
-        ``y = edge_y - sag (1 - u^2)``, ``z = closed_z - drop u^2`` with ``u = x / half_width``.
-    fibre_turn : float
-        Share of the anterior leaflet's angle at each commissure over which its fibres turn from
-        parallel to perpendicular to the annulus.
-    """
-
-    half_commissural: float = 18.0
-    half_ap: float = 14.0
-    saddle: float = 6.5
-    flattening: float = 0.08
-    commissure_angle: float = 19.6
-    length_anterior: float = 24.0
-    length_posterior: float = 18.8
-    length_commissure: float = 11.0
-    exponent_anterior: float = 1.2
-    exponent_posterior: float = 1.2
-    bulge: float = 0.04
-    edge_half_width: float = 15.5
-    edge_exponent: float = 2.0
-    edge_y: float = 1.83
-    edge_anterior: float = 6.5
-    edge_posterior: float = 10.5
-    tips: tuple[float, float, float] = (16.0, -0.24, -25.0)
-    tips_displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    thickness_anterior: float = 1.32
-    thickness_posterior: float = 1.26
-    taper: float = 0.75
-    ap_contraction: float = 0.064
-    commissural_contraction: float = 0.008
-    closed_sag: float = 7.19
-    closed_half_width: float = 13.0
-    closed_z: float = -10.9
-    closed_drop: float = 3.4
-    fibre_turn: float = 0.23
-    chordae: ChordLayout = ChordLayout()
-
-    def __post_init__(self) -> None:
-        for name in ("tips", "tips_displacement"):
-            if len(getattr(self, name)) != 3:
-                raise InputError(f"template {name} = {getattr(self, name)}, expected (x, y, z)")
-        if not 0 < self.fibre_turn <= 0.5:
-            raise InputError(f"template fibre_turn = {self.fibre_turn}, expected in (0, 0.5]")
-        for name in (
-            "half_commissural", "half_ap", "length_anterior", "length_posterior",
-            "length_commissure", "edge_half_width", "thickness_anterior", "thickness_posterior",
-            "taper", "closed_half_width",
-        ):  # fmt: skip
-            if not getattr(self, name) > 0:
-                raise InputError(f"template {name} = {getattr(self, name)}, expected > 0")
 
 
 def _smoothstep(x: FloatArray) -> FloatArray:
@@ -216,14 +65,15 @@ class Template:
     # -- surface ----------------------------------------------------------------------------------
     def annulus(self, phi: FloatArray) -> FloatArray:
         """Annulus points ``(k, 3)`` in the reference frame."""
-        p = self.parameters
+        p = self.parameters.annulus
         theta = self._annulus_angle(phi)
-        half_ap = np.where(np.sin(theta) > 0, p.half_ap * (1 - p.flattening), p.half_ap)
+        half = p.anteroposterior_half_axis
+        half_y = np.where(np.sin(theta) > 0, half * (1 - p.anterior_flattening), half)
         return np.stack(
             [
-                p.half_commissural * np.cos(theta),
-                half_ap * np.sin(theta),
-                -0.5 * p.saddle * np.cos(2 * theta),
+                p.commissural_half_axis * np.cos(theta),
+                half_y * np.sin(theta),
+                -0.5 * p.saddle_height * np.cos(2 * theta),
             ],
             axis=-1,
         )
@@ -231,56 +81,54 @@ class Template:
     def _annulus_angle(self, phi: FloatArray) -> FloatArray:
         """Parametric angle of the annulus (radians) at material angle ``phi`` (degrees)."""
         phi = np.mod(phi, 360.0)
-        c = np.deg2rad(self.parameters.commissure_angle)
+        c = np.deg2rad(self.parameters.annulus.commissure_angle)
         anterior = c + (np.pi - 2 * c) * phi / 180.0
         posterior = np.pi - c + (np.pi + 2 * c) * (phi - 180.0) / 180.0
         return np.where(phi <= 180.0, anterior, posterior)
 
     def length(self, phi: FloatArray) -> FloatArray:
         """Leaflet length ``(k,)``."""
-        p = self.parameters
-        sine = np.sin(np.deg2rad(phi))
-        rise_a = (p.length_anterior - p.length_commissure) * np.maximum(
-            sine, 0
-        ) ** p.exponent_anterior
-        rise_p = (p.length_posterior - p.length_commissure) * np.maximum(
-            -sine, 0
-        ) ** p.exponent_posterior
-        return p.length_commissure + rise_a + rise_p
+        p = self.parameters.leaflets
+        sine, edge = np.sin(np.deg2rad(phi)), p.commissural_length
+        a, b = p.anterior, p.posterior
+        rise_a = (a.length - edge) * np.maximum(sine, 0) ** a.length_exponent
+        rise_b = (b.length - edge) * np.maximum(-sine, 0) ** b.length_exponent
+        return edge + rise_a + rise_b
 
     def thickness(self, phi: FloatArray, s: FloatArray) -> FloatArray:
         """Thickness ``(k,)``; blends between the leaflets over 20 degrees at each commissure."""
-        p = self.parameters
+        p = self.parameters.leaflets
+        thick, other = p.anterior.thickness, p.posterior.thickness
         blend = _smoothstep(0.5 + np.sin(np.deg2rad(phi)) / (2 * np.sin(np.deg2rad(20.0))))
-        base = p.thickness_posterior + (p.thickness_anterior - p.thickness_posterior) * blend
-        return base * (1 - (1 - p.taper) * _smoothstep((s - 0.5) / 0.5))
+        base = other + (thick - other) * blend
+        return base * (1 - (1 - p.edge_thinning) * _smoothstep((s - 0.5) / 0.5))
 
     @cached_property
     def _edge_table(self) -> tuple[FloatArray, FloatArray]:
         """Edge angle over phi such that points are spread evenly along each leaflet's free edge."""
-        p = self.parameters
+        p = self.parameters.free_edge
         angle = np.linspace(0, 2 * np.pi, 2881)
         phi = np.empty_like(angle)
         for low, high, depth in (
-            (0.0, np.pi, p.edge_anterior),
-            (np.pi, 2 * np.pi, p.edge_posterior),
+            (0.0, np.pi, p.anterior_depth),
+            (np.pi, 2 * np.pi, p.posterior_depth),
         ):
             part = (angle >= low - 1e-12) & (angle <= high + 1e-12)
             a = angle[part]
-            sine, q = np.abs(np.sin(a)), p.edge_exponent
-            speed = np.hypot(p.edge_half_width * sine, depth * q * sine ** (q - 1) * np.cos(a))
+            sine, q = np.abs(np.sin(a)), p.exponent
+            speed = np.hypot(p.half_width * sine, depth * q * sine ** (q - 1) * np.cos(a))
             arc = np.concatenate([[0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(a))])
             phi[part] = np.rad2deg(low) + 180.0 * arc / arc[-1]
         return phi, angle
 
     def _edge_xy(self, phi: FloatArray) -> FloatArray:
         """Open free edge ``(k, 2)``: two arcs ``(a cos, b sin^q)`` that share their ends."""
-        p = self.parameters
+        p = self.parameters.free_edge
         angle = np.interp(np.mod(phi, 360.0), *self._edge_table)
         sine = np.sin(angle)
-        depth = np.where(sine > 0, p.edge_anterior, -p.edge_posterior)
-        y = p.edge_y + depth * np.abs(sine) ** p.edge_exponent
-        return np.stack([p.edge_half_width * np.cos(angle), y], axis=-1)
+        depth = np.where(sine > 0, p.anterior_depth, -p.posterior_depth)
+        y = p.commissural_y + depth * np.abs(sine) ** p.exponent
+        return np.stack([p.half_width * np.cos(angle), y], axis=-1)
 
     def position(
         self, phi: FloatArray, s: FloatArray, zeta: FloatArray | float = 0.0
@@ -314,7 +162,7 @@ class Template:
         belly = np.concatenate(
             [inward * (drop / length)[..., None], (reach / length)[..., None]], axis=-1
         )
-        depth = self.parameters.bulge * length * 4 * s * (1 - s)
+        depth = self.parameters.leaflets.belly_depth * length * 4 * s * (1 - s)
         return a + s[..., None] * span + depth[..., None] * belly
 
     def tangents(self, phi: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -344,7 +192,7 @@ class Template:
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(k, 3)`` seen from the leaflet ``region``."""
         t, r = self.tangents(phi, s)
-        turn = self.parameters.fibre_turn * 180.0
+        turn = self.parameters.leaflets.fibre_turn * 180.0
         from_commissure = np.minimum(np.mod(phi, 360.0), np.abs(180.0 - np.mod(phi, 360.0)))
         angle = 0.5 * np.pi * (1 - _smoothstep(from_commissure / turn))
         angle = np.where(region == ANTERIOR, angle, 0.0)
@@ -357,12 +205,12 @@ class Template:
     @property
     def papillary_tips(self) -> FloatArray:
         """Where the tips are ``(2, 3)`` mm, displacement included."""
-        return self._intended_tips + _mirrored(self.parameters.tips_displacement)
+        return self._intended_tips + _mirrored(self.parameters.papillary.displacement)
 
     @property
     def _intended_tips(self) -> FloatArray:
         """``(2, 3)`` mm: the tips for which the chordae have their lengths."""
-        return _mirrored(self.parameters.tips)
+        return _mirrored(self.parameters.papillary.tip)
 
     def chord_places(self) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
         """Where the chordae of both halves insert, in their order and without the absent ones.
@@ -421,18 +269,18 @@ class Template:
 
     def _closed_position(self, phi: FloatArray, s: FloatArray, rest: FloatArray) -> FloatArray:
         """Intended closed positions: the coaptation line at the free edge, the annulus at s = 0."""
-        p = self.parameters
-        u = np.clip(rest[:, 0] / p.edge_half_width, -1.0, 1.0)
-        y = p.edge_y - p.closed_sag * (1 - u**2)
-        z = p.closed_z - p.closed_drop * u**2
-        edge = np.stack([u * p.closed_half_width, y, z], axis=-1)
+        opened, closed = self.parameters.free_edge, self.parameters.closed_edge
+        u = np.clip(rest[:, 0] / opened.half_width, -1.0, 1.0)
+        y = opened.commissural_y - closed.sag * (1 - u**2)
+        z = closed.middle_z - closed.drop * u**2
+        edge = np.stack([u * closed.half_width, y, z], axis=-1)
         return (1 - s)[:, None] * self.annulus(phi) + s[:, None] * edge
 
     def motion(self, phi: FloatArray) -> Motion:
         """Annulus at ``phi`` and papillary tips from open (phase 0) to closed (phase 1)."""
-        p = self.parameters
+        p = self.parameters.annulus
         start = self.annulus(phi)
-        end = start * np.array([1 - p.commissural_contraction, 1 - p.ap_contraction, 1.0])
+        end = start * [1 - p.commissural_contraction, 1 - p.anteroposterior_contraction, 1.0]
         tips = self.papillary_tips
         return Motion(np.array([0.0, 1.0]), np.stack([start, end]), np.stack([tips, tips]))
 

@@ -18,7 +18,8 @@ scale of 1; tips lie 13 to 19 mm aside. The other spreads are choices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -109,27 +110,27 @@ def _changed(p: TemplateParameters, z: FloatArray) -> TemplateParameters:
     along_y, along_x = np.exp(size + ap), np.exp(size + commissural)
     half = 0.5 * (size + ap)
     thickness = np.exp(THICKNESS * z[8])
-    tips = np.exp(size) * np.array(p.tips) + TIP * z[10:13]
+    tip = np.exp(size) * np.array(p.papillary.tip) + TIP * z[10:13]
     factors = {
-        "half_commissural": along_x,
-        "half_ap": along_y,
-        "saddle": np.exp(size + SADDLE * z[7]),
-        "length_anterior": np.exp(half + LEAFLET * z[3]),
-        "length_posterior": np.exp(half + LEAFLET * z[4]),
-        "length_commissure": np.exp(half),
-        "edge_half_width": along_x,
-        "edge_y": along_y,
-        "edge_anterior": along_y * np.exp(EDGE * z[5]),
-        "edge_posterior": along_y * np.exp(EDGE * z[6]),
-        "thickness_anterior": thickness,
-        "thickness_posterior": thickness,
-        "ap_contraction": np.exp(CONTRACTION * z[9]),
-        "closed_sag": along_y,
-        "closed_half_width": along_x,
-        "closed_z": np.exp(size),
-        "closed_drop": np.exp(size),
+        "annulus.commissural_half_axis": along_x,
+        "annulus.anteroposterior_half_axis": along_y,
+        "annulus.saddle_height": np.exp(size + SADDLE * z[7]),
+        "annulus.anteroposterior_contraction": np.exp(CONTRACTION * z[9]),
+        "leaflets.anterior.length": np.exp(half + LEAFLET * z[3]),
+        "leaflets.posterior.length": np.exp(half + LEAFLET * z[4]),
+        "leaflets.commissural_length": np.exp(half),
+        "leaflets.anterior.thickness": thickness,
+        "leaflets.posterior.thickness": thickness,
+        "free_edge.half_width": along_x,
+        "free_edge.commissural_y": along_y,
+        "free_edge.anterior_depth": along_y * np.exp(EDGE * z[5]),
+        "free_edge.posterior_depth": along_y * np.exp(EDGE * z[6]),
+        "closed_edge.half_width": along_x,
+        "closed_edge.sag": along_y,
+        "closed_edge.middle_z": np.exp(size),
+        "closed_edge.drop": np.exp(size),
     }
     values: dict[str, Any] = {
-        name: float(getattr(p, name) * factor) for name, factor in factors.items()
+        name: float(attrgetter(name)(p) * factor) for name, factor in factors.items()
     }
-    return replace(p, tips=tuple(tips.tolist()), **values)
+    return p.changed({**values, "papillary.tip": tuple(tip.tolist())})

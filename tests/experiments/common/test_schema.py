@@ -68,5 +68,6 @@ def test_the_librarys_defaults_are_the_configurations() -> None:
 
 def test_the_librarys_own_checks_apply() -> None:
     values = OmegaConf.to_container(OmegaConf.structured(TemplateConfig))
-    with pytest.raises(InputError, match="taper"):
-        build(TemplateParameters, {**values, "taper": 0.0})
+    values["leaflets"]["edge_thinning"] = 0.0
+    with pytest.raises(InputError, match=r"leaflets\.edge_thinning"):
+        build(TemplateParameters, values)

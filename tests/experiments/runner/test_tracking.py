@@ -46,7 +46,7 @@ def make_config(outputs: Path, **changes) -> dict:
         "seed": 1,
         "repeats": 1,
         "factors": {"noise": 0.5, "kind": "white"},
-        "valve": {"taper": 0.75},
+        "valve": {"leaflets": {"edge_thinning": 0.75}},
         "mesh": {"source": "structured", "columns": 24, "rows": 3, "layers": 1},
         "mechanics": {"element": "hex18"},
         "filter": {"mode": "paper", "initial": [5.0, 3.0], "P0": 0.01, "Q": 0.01, "R": 1e-4},

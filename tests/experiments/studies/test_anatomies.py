@@ -51,8 +51,8 @@ def test_normal_valves_have_normal_annuli_and_anterior_leaflets(name: str) -> No
     ap, commissural = diameters(template)
     assert 24 - 3 <= ap <= 30.8 + 4.4
     assert 35 - 5 <= commissural <= 35.1 + 4.9
-    assert 20 <= template.parameters.length_anterior <= 25
-    assert 13 <= template.parameters.tips[0] <= 19
+    assert 20 <= template.parameters.leaflets.anterior.length <= 25
+    assert 13 <= template.parameters.papillary.tip[0] <= 19
 
 
 def test_the_two_normal_valves_differ() -> None:
@@ -67,17 +67,17 @@ def test_functional_regurgitation_is_a_wide_annulus_and_displaced_tips() -> None
     ap, commissural = diameters(template)
     assert 33 <= ap <= 41  # 33 +- 6 to 36 +- 5
     assert 41 <= commissural <= 48  # 41 +- 5 to 43 +- 5
-    outward, _, up = template.parameters.tips_displacement
+    outward, _, up = template.parameters.papillary.displacement
     assert outward > 0
     assert up < 0
-    assert 5 <= np.linalg.norm(template.parameters.tips_displacement) <= 10
+    assert 5 <= np.linalg.norm(template.parameters.papillary.displacement) <= 10
 
 
 def test_prolapse_is_a_long_posterior_leaflet_on_long_chordae() -> None:
     p, normal = anatomy("prolapse").parameters, anatomy("template").parameters
-    width = p.half_ap / normal.half_ap
-    assert p.length_posterior > 1.1 * width * normal.length_posterior
-    assert p.length_anterior < 1.1 * width * normal.length_anterior
+    width = p.annulus.anteroposterior_half_axis / normal.annulus.anteroposterior_half_axis
+    assert p.leaflets.posterior.length > 1.1 * width * normal.leaflets.posterior.length
+    assert p.leaflets.anterior.length < 1.1 * width * normal.leaflets.anterior.length
     plain_chordae = Template(normal).chordae()
     assert len(anatomy("prolapse").chordae()) == len(plain_chordae)
     middle = np.prod([f for low, high, f in p.chordae.elongated if low <= 270 <= high])

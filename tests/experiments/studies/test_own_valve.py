@@ -6,7 +6,6 @@ anywhere, as in a scanner's coordinates, and meshed anew where frames do not cor
 
 import json
 import sys
-from dataclasses import replace
 
 import meshio
 import numpy as np
@@ -43,7 +42,7 @@ COARSE = (
 def seen():
     """The open valve, and the vertices of it as it closes."""
     # The same thickness everywhere, as where a user gives none.
-    template = Template(replace(TemplateParameters(), taper=1.0))
+    template = Template(TemplateParameters().changed({"leaflets.edge_thinning": 1.0}))
     valve = template.valve(COLUMNS, ROWS)
     tissue = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
     model = ClosureModel(

@@ -26,7 +26,10 @@ LAYOUT = ValveLayout(16, 7)
 FIT = FitSettings((10, 12, 12), (6.0, 4.0, 3.0))
 """No more modes than the small shape model has."""
 
-TIPS = np.array([Template().parameters.tips, Template().parameters.tips]) * [[1, 1, 1], [-1, 1, 1]]
+TIPS = np.array([Template().parameters.papillary.tip, Template().parameters.papillary.tip]) * [
+    [1, 1, 1],
+    [-1, 1, 1],
+]
 
 
 def moving_valve(number, frames=4, layout=LAYOUT):

@@ -17,26 +17,34 @@ from mvest.valve.anatomy.template import (
 TEMPLATE = Template()
 DEFAULT = TEMPLATE.parameters
 OTHER = Template(
-    replace(DEFAULT, half_commissural=20.0, half_ap=15.5, length_anterior=27.0, saddle=4.0)
+    DEFAULT.changed(
+        {
+            "annulus.commissural_half_axis": 20.0,
+            "annulus.anteroposterior_half_axis": 15.5,
+            "annulus.saddle_height": 4.0,
+            "leaflets.anterior.length": 27.0,
+        }
+    )
 )
 ALL_AROUND = np.arange(0.0, 360.0, 0.05)
 
 
 @pytest.mark.parametrize("template", [TEMPLATE, OTHER])
 def test_the_annulus_has_the_diameters_and_the_height_of_the_parameters(template):
-    # Half ellipses: y from -half_ap to half_ap (1 - flattening), 14 + 12.88 = 26.88 mm by default.
-    p = template.parameters
+    # Half ellipses: y from -b to b (1 - flattening), 14 + 12.88 = 26.88 mm by default.
+    p = template.parameters.annulus
+    a, b = p.commissural_half_axis, p.anteroposterior_half_axis
     x, y, z = template.annulus(ALL_AROUND).T
-    assert np.ptp(x) == pytest.approx(2 * p.half_commissural, rel=1e-5)
-    assert np.ptp(y) == pytest.approx(p.half_ap * (2 - p.flattening), rel=1e-5)
-    assert np.ptp(z) == pytest.approx(p.saddle, rel=1e-5)
+    assert np.ptp(x) == pytest.approx(2 * a, rel=1e-5)
+    assert np.ptp(y) == pytest.approx(b * (2 - p.anterior_flattening), rel=1e-5)
+    assert np.ptp(z) == pytest.approx(p.saddle_height, rel=1e-5)
     # A saddle: its horns are the middles of the leaflets, towards the atrium.
     middles = template.annulus(np.array([90.0, 270.0]))
-    np.testing.assert_allclose(middles[:, 2], 0.5 * p.saddle)
+    np.testing.assert_allclose(middles[:, 2], 0.5 * p.saddle_height)
     np.testing.assert_allclose(middles[:, 0], 0, atol=1e-12)
     # The commissures are `commissure_angle` above the x axis, in the parameter of the ellipse.
     x, y, _ = template.annulus(np.array([0.0]))[0]
-    angle = np.arctan2(y / (p.half_ap * (1 - p.flattening)), x / p.half_commissural)
+    angle = np.arctan2(y / (b * (1 - p.anterior_flattening)), x / a)
     assert np.degrees(angle) == pytest.approx(p.commissure_angle)
 
 
@@ -50,11 +58,11 @@ def arc(template, phi):
 def test_leaflets_have_the_length_of_the_parameters(template):
     # A parabola of sagitta d over a chord L is L (1 + 8/3 (d/L)^2 - 32/5 (d/L)^4) long; d = 0.04 L
     # gives 1.00425 L.
-    p = template.parameters
-    factor = 1 + 8 / 3 * p.bulge**2 - 32 / 5 * p.bulge**4
+    p = template.parameters.leaflets
+    factor = 1 + 8 / 3 * p.belly_depth**2 - 32 / 5 * p.belly_depth**4
     assert factor == pytest.approx(1.00425, abs=1e-5)
-    for phi, length in ((90.0, p.length_anterior), (270.0, p.length_posterior),
-                        (0.0, p.length_commissure), (180.0, p.length_commissure)):  # fmt: skip
+    for phi, length in ((90.0, p.anterior.length), (270.0, p.posterior.length),
+                        (0.0, p.commissural_length), (180.0, p.commissural_length)):  # fmt: skip
         assert arc(template, phi) == pytest.approx(factor * length, rel=1e-5)
 
 
@@ -97,7 +105,7 @@ def test_normals_point_to_the_ventricle(template):
     # The open leaflets are a funnel hanging from the annulus; blood flows through it, and the
     # ventricle's blood is around it: outwards. The pressure of the ventricle pushes against them.
     surface = template.valve().surface
-    axis = np.array([0.0, template.parameters.edge_y, 0.0])
+    axis = np.array([0.0, template.parameters.free_edge.commissural_y, 0.0])
     outwards = (surface.vertices - axis) * [1, 1, 0]
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     assert np.einsum("ki,ki->k", surface.normals, outwards).min() > 0.2
@@ -210,7 +218,7 @@ def test_rest_lengths_lead_to_the_intended_closed_line():
     layout = ChordLayout(marginal_phi=(90.0,), basal=(), marginal_s=1.0, open_slack=0.1)
     chordae = Template(replace(DEFAULT, chordae=layout)).chordae()
     target = np.array([0.0, 1.83 - 7.19, -10.9])
-    expected = 0.985 * np.linalg.norm(target - np.array(DEFAULT.tips))
+    expected = 0.985 * np.linalg.norm(target - np.array(DEFAULT.papillary.tip))
     assert chordae.rest_length[0] == pytest.approx(expected, rel=1e-9)
 
 
@@ -270,7 +278,7 @@ def test_ranges_of_chordae_that_mean_nothing_are_refused(wrong):
 def test_displaced_tips_tether_because_the_chordae_do_not_follow():
     shift = (3.0, -1.0, -5.0)
     plain = TEMPLATE.chordae()
-    template = Template(replace(DEFAULT, tips_displacement=shift))
+    template = Template(DEFAULT.changed({"papillary.displacement": shift}))
     chordae = template.chordae()
     # Outward on both sides, and down.
     moved_by = template.papillary_tips - TEMPLATE.papillary_tips
@@ -282,16 +290,16 @@ def test_displaced_tips_tether_because_the_chordae_do_not_follow():
     expected = np.maximum(plain.rest_length, DEFAULT.chordae.open_slack * opened)
     np.testing.assert_allclose(chordae.rest_length, expected, rtol=1e-12)
     # ... and so they are shorter than those made for where the tips are now.
-    moved = tuple(np.add(DEFAULT.tips, shift))
-    adapted = Template(replace(DEFAULT, tips=moved)).chordae()
+    moved = tuple(np.add(DEFAULT.papillary.tip, shift))
+    adapted = Template(DEFAULT.changed({"papillary.tip": moved})).chordae()
     assert np.all(chordae.rest_length <= adapted.rest_length + 1e-12)
     assert (adapted.rest_length - chordae.rest_length).mean() > 1.0
 
 
-@pytest.mark.parametrize("name", ["tips", "tips_displacement"])
+@pytest.mark.parametrize("name", ["papillary.tip", "papillary.displacement"])
 def test_a_place_of_the_tips_needs_three_numbers(name):
     with pytest.raises(InputError, match=rf"template {name} = \(1.0, 2.0\), expected \(x, y, z\)"):
-        TemplateParameters(**{name: (1.0, 2.0)})
+        DEFAULT.changed({name: (1.0, 2.0)})
 
 
 def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
@@ -306,25 +314,48 @@ def test_the_annulus_narrows_by_the_contractions_and_the_tips_stay():
 
 @pytest.mark.parametrize(
     ("name", "place"),
-    [("length_anterior", "90"), ("length_posterior", "270"), ("length_commissure", None)],
+    [
+        ("leaflets.anterior.length", "90"),
+        ("leaflets.posterior.length", "270"),
+        ("leaflets.commissural_length", None),
+    ],
 )
 def test_a_leaflet_that_cannot_reach_its_free_edge_is_refused(name, place):
-    template = Template(replace(DEFAULT, **{name: 1.5}))
+    template = Template(DEFAULT.changed({name: 1.5}))
     where = rf"at phi = {place} degrees is 1\.5" if place else "at phi = "
     with pytest.raises(GeometryError, match=rf"{where}.* mm long and cannot reach its free edge"):
         template.valve(24, 5)
 
 
-POSITIVE = ("half_commissural", "half_ap", "length_anterior", "length_posterior", "taper",
-            "length_commissure", "edge_half_width", "thickness_anterior", "thickness_posterior",
-            "closed_half_width")  # fmt: skip
+POSITIVE = ("annulus.commissural_half_axis", "annulus.anteroposterior_half_axis",
+            "leaflets.anterior.length", "leaflets.posterior.length", "leaflets.edge_thinning",
+            "leaflets.commissural_length", "free_edge.half_width", "leaflets.anterior.thickness",
+            "leaflets.posterior.thickness", "closed_edge.half_width")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", POSITIVE)
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_inadmissible_parameters_are_refused(name, value):
     with pytest.raises(InputError, match=rf"template {name} = {value}, expected > 0"):
-        TemplateParameters(**{name: value})
+        DEFAULT.changed({name: value})
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6, float("nan")])
+def test_fibres_turn_within_half_a_leaflet(turn):
+    with pytest.raises(InputError, match=rf"template leaflets.fibre_turn = {turn}, expected in"):
+        DEFAULT.changed({"leaflets.fibre_turn": turn})
+
+
+def test_values_are_changed_by_their_dotted_names():
+    changed = DEFAULT.changed({"leaflets.anterior.length": 25.0, "annulus.saddle_height": 5.0})
+    assert changed.leaflets.anterior == replace(DEFAULT.leaflets.anterior, length=25.0)
+    assert changed.leaflets.posterior == DEFAULT.leaflets.posterior
+    assert changed.annulus == replace(DEFAULT.annulus, saddle_height=5.0)
+    assert changed.changed({"leaflets.anterior.length": 24.0, "annulus.saddle_height": 6.5}) == (
+        DEFAULT
+    )
+    with pytest.raises(InputError, match="template parameter 'middle.length', expected one of anterior"):
+        DEFAULT.changed({"leaflets.middle.length": 25.0})
 
 
 @pytest.mark.parametrize("size", [(6, 5), (15, 5), (16, 2)])

@@ -1,6 +1,7 @@
 """Random anatomies are valves, of plausible sizes, and the same for the same seed."""
 
-from dataclasses import asdict, replace
+from dataclasses import fields, is_dataclass
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -15,7 +16,17 @@ DRAWN = [vary(DEFAULT, np.random.default_rng(seed)) for seed in range(200)]
 
 
 def drawn(name):
-    return np.array([getattr(p, name) for p in DRAWN])
+    return np.array([attrgetter(name)(p) for p in DRAWN])
+
+
+def numbers(group, prefix=""):
+    """Every number of the parameters by its dotted name, those of the chordae aside."""
+    for field in fields(group):
+        value = getattr(group, field.name)
+        if isinstance(value, float):
+            yield prefix + field.name, value
+        elif is_dataclass(value) and field.name != "chordae":
+            yield from numbers(value, f"{prefix}{field.name}.")
 
 
 def test_every_seed_gives_a_valve_that_can_be_meshed():
@@ -28,8 +39,8 @@ def test_every_seed_gives_a_valve_that_can_be_meshed():
 def test_annuli_are_within_the_range_of_normal_valves():
     # Two standard deviations around the means: 24 - 2 x 3 to 30.8 + 2 x 4.4 mm between anterior
     # and posterior, 35.1 -+ 2 x 4.9 mm between the commissures.
-    ap = drawn("half_ap") * (2 - DEFAULT.flattening)
-    commissural = 2 * drawn("half_commissural")
+    ap = drawn("annulus.anteroposterior_half_axis") * (2 - DEFAULT.annulus.anterior_flattening)
+    commissural = 2 * drawn("annulus.commissural_half_axis")
     assert ap.min() > 18.0
     assert ap.max() < 39.6
     assert commissural.min() > 25.3
@@ -43,26 +54,33 @@ def test_annuli_are_within_the_range_of_normal_valves():
 
 def test_no_leaflet_gets_farther_than_11_percent_and_no_tip_out_of_its_range():
     # Half of (5 + 3.5) % and 1 % of its own, at two standard deviations: 10.5 % in the logarithm.
-    for name in ("length_anterior", "length_posterior"):
-        ratio = drawn(name) / getattr(DEFAULT, name)
+    for name in ("leaflets.anterior.length", "leaflets.posterior.length"):
+        ratio = drawn(name) / attrgetter(name)(DEFAULT)
         assert np.abs(np.log(ratio)).max() < 0.105
         assert np.ptp(np.log(ratio)) > 0.105
-    x, _, z = drawn("tips").T
+    x, _, z = drawn("papillary.tip").T
     assert x.min() > 13.0
     assert x.max() < 19.1
     assert np.all(z < -20.0)
-    assert np.all(drawn("ap_contraction") > 0)
+    assert np.all(drawn("annulus.anteroposterior_contraction") > 0)
 
 
 def test_a_larger_annulus_has_longer_leaflets_and_a_wider_edge():
     for one, other, least in (
-        ("half_ap", "length_anterior", 0.8),
-        ("half_ap", "edge_posterior", 0.7),
-        ("half_commissural", "edge_half_width", 0.999),
-        ("thickness_anterior", "thickness_posterior", 0.999),
+        ("annulus.anteroposterior_half_axis", "leaflets.anterior.length", 0.8),
+        ("annulus.anteroposterior_half_axis", "free_edge.posterior_depth", 0.7),
+        ("annulus.commissural_half_axis", "free_edge.half_width", 0.999),
+        ("leaflets.anterior.thickness", "leaflets.posterior.thickness", 0.999),
     ):
         assert np.corrcoef(drawn(one), drawn(other))[0, 1] > least
-    assert abs(np.corrcoef(drawn("thickness_anterior"), drawn("half_ap"))[0, 1]) < 0.25
+    assert (
+        abs(
+            np.corrcoef(
+                drawn("leaflets.anterior.thickness"), drawn("annulus.anteroposterior_half_axis")
+            )[0, 1]
+        )
+        < 0.25
+    )
 
 
 def test_the_seed_decides_and_the_given_valve_is_the_middle():
@@ -70,15 +88,19 @@ def test_the_seed_decides_and_the_given_valve_is_the_middle():
     assert DRAWN[7] != DRAWN[8]
     assert vary(DEFAULT, np.random.default_rng(7), scale=0.0) == DEFAULT
     # Seven standard errors of 200 draws of a deviation of at most 11 %.
-    for name, value in asdict(DEFAULT).items():
-        if isinstance(value, float):
-            middle = np.median(drawn(name))
-            assert middle == pytest.approx(value, rel=7 * 1.25 * 0.15 / np.sqrt(200))
+    named = dict(numbers(DEFAULT))
+    assert len(named) > 25
+    for name, value in named.items():
+        middle = np.median(drawn(name))
+        assert middle == pytest.approx(value, rel=7 * 1.25 * 0.15 / np.sqrt(200))
 
 
 def test_twice_the_scale_is_twice_the_deviation():
     once, twice = (
-        np.log(vary(DEFAULT, np.random.default_rng(3), scale).half_ap / DEFAULT.half_ap)
+        np.log(
+            vary(DEFAULT, np.random.default_rng(3), scale).annulus.anteroposterior_half_axis
+            / DEFAULT.annulus.anteroposterior_half_axis
+        )
         for scale in (1.0, 2.0)
     )
     assert twice == pytest.approx(2 * once)
@@ -86,16 +108,16 @@ def test_twice_the_scale_is_twice_the_deviation():
 
 def test_what_is_ill_stays_ill():
     layout = ChordLayout(elongated=((225.0, 315.0, 1.1),), absent=((250.0, 256.0),))
-    ill = replace(DEFAULT, chordae=layout, tips_displacement=(3.0, 0.0, -5.0))
+    ill = DEFAULT.changed({"chordae": layout, "papillary.displacement": (3.0, 0.0, -5.0)})
     varied = vary(ill, np.random.default_rng(1))
     assert varied.chordae == layout
-    assert varied.tips_displacement == ill.tips_displacement
+    assert varied.papillary.displacement == ill.papillary.displacement
 
 
 def test_shapes_that_are_no_valve_are_drawn_again_and_counted():
     # The posterior edge is 14 + 1.83 - 10.5 = 5.33 mm from the annulus: a leaflet of 5.5 mm reaches
     # it barely, and about every third one that is drawn does not.
-    p = replace(DEFAULT, length_posterior=5.5)
+    p = DEFAULT.changed({"leaflets.posterior.length": 5.5})
     counts = [draw_variation(p, np.random.default_rng(seed)).refused for seed in range(10)]
     assert any(counts)
     for seed in range(10):
@@ -106,6 +128,6 @@ def test_a_scale_that_leaves_no_valve_or_none_at_all_is_refused():
     for scale in (-1.0, np.nan, np.inf):
         with pytest.raises(InputError, match=f"scale of a variation = {scale}"):
             vary(DEFAULT, np.random.default_rng(0), scale)
-    hopeless = replace(DEFAULT, length_anterior=3.0)
+    hopeless = DEFAULT.changed({"leaflets.anterior.length": 3.0})
     with pytest.raises(InputError, match=f"{MAX_REFUSED} shapes in a row"):
         vary(hopeless, np.random.default_rng(0))

@@ -1,11 +1,10 @@
 """Clinical measurements of the template, whose axes are known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from mvest.errors import GeometryError
+from mvest.valve.anatomy.dimensions import AnnulusDimensions
 from mvest.valve.anatomy.template import Template, TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.measure import clinical
@@ -35,22 +34,20 @@ def quick(monkeypatch):
     ("half_commissural", "half_ap"), [(18.0, 14.0), (22.0, 15.0), (16.0, 16.0)]
 )
 def test_diameters_are_the_axes_of_the_template(quick, half_commissural, half_ap):
-    p = replace(
-        TemplateParameters(), half_commissural=half_commissural, half_ap=half_ap, flattening=0.0
-    )
+    p = TemplateParameters(AnnulusDimensions(half_commissural, half_ap, anterior_flattening=0.0))
     found = measured(p)
     assert found["ap_diameter_mm"] == pytest.approx(2 * half_ap, rel=0.02)
     assert found["commissural_diameter_mm"] == pytest.approx(2 * half_commissural, rel=0.02)
     # An ellipse seen from above; a saddle in space, so longer than it.
     assert found["annulus_area_mm2"] == pytest.approx(np.pi * half_ap * half_commissural, rel=0.02)
-    assert found["annulus_height_mm"] == pytest.approx(p.saddle, rel=0.02)
+    assert found["annulus_height_mm"] == pytest.approx(p.annulus.saddle_height, rel=0.02)
     assert found["annulus_circumference_mm"] > 2 * np.pi * min(half_ap, half_commissural)
 
 
 def test_the_flattened_side_is_the_anterior_one(quick):
     p = TemplateParameters()
     # The anterior half axis is shorter by its flattening: 14 (1 - 0.08) + 14 mm.
-    expected = p.half_ap * (2 - p.flattening)
+    expected = p.annulus.anteroposterior_half_axis * (2 - p.annulus.anterior_flattening)
     assert measured(p)["ap_diameter_mm"] == pytest.approx(expected, rel=0.02)
 
 
@@ -68,8 +65,8 @@ def test_lengths_and_depths_are_those_of_the_template(quick):
     p = TemplateParameters()
     found = measured(p)
     # The longest way from annulus to edge, in the middle of each leaflet.
-    assert found["anterior_length_mm"] == pytest.approx(p.length_anterior, rel=0.05)
-    assert found["posterior_length_mm"] == pytest.approx(p.length_posterior, rel=0.05)
+    assert found["anterior_length_mm"] == pytest.approx(p.leaflets.anterior.length, rel=0.05)
+    assert found["posterior_length_mm"] == pytest.approx(p.leaflets.posterior.length, rel=0.05)
     surface = Template(p).valve(80, 15).surface
     corner = surface.vertices[surface.triangles]
     area = 0.5 * np.linalg.norm(
@@ -78,7 +75,9 @@ def test_lengths_and_depths_are_those_of_the_template(quick):
     for number, name in enumerate(("anterior", "posterior")):
         own = area[surface.region == number].sum()
         assert found[f"{name}_area_mm2"] == pytest.approx(own)
-    assert found["tip_depth_mm"] == pytest.approx(-p.tips[2], abs=0.2 * p.saddle)
+    assert found["tip_depth_mm"] == pytest.approx(
+        -p.papillary.tip[2], abs=0.2 * p.annulus.saddle_height
+    )
 
 
 def test_the_open_valve_has_an_orifice():
@@ -191,10 +190,12 @@ def test_a_saddle_prolapses_over_its_plane_but_does_not_billow(quick):
 
 
 def test_ratios_and_tips(quick):
-    p = replace(TemplateParameters(), flattening=0.0)
+    p = TemplateParameters(AnnulusDimensions(anterior_flattening=0.0))
     found = measured(p)
-    assert found["annulus_sphericity_ratio"] == pytest.approx(p.half_ap / p.half_commissural, 0.02)
-    assert found["tip_separation_mm"] == pytest.approx(2 * p.tips[0])
+    assert found["annulus_sphericity_ratio"] == pytest.approx(
+        p.annulus.anteroposterior_half_axis / p.annulus.commissural_half_axis, 0.02
+    )
+    assert found["tip_separation_mm"] == pytest.approx(2 * p.papillary.tip[0])
     vertices, surface, annulus = dome(-6.0)
     found = clinical_measurements(
         vertices, surface, annulus, TIPS, 1.0, tip_names=("tip_0", "tip_180")

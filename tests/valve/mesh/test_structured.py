@@ -179,8 +179,8 @@ def test_the_papers_mesh_has_3248_nodes():
 def test_the_hash_is_that_of_the_content():
     base = structured_mesh(TEMPLATE, "hex18", 12, 2).sha256
     assert structured_mesh(Template(), "hex18", 12, 2).sha256 == base
-    thicker = Template(type(TEMPLATE.parameters)(thickness_anterior=1.33))
-    turned = Template(type(TEMPLATE.parameters)(fibre_turn=0.24))
+    thicker = Template(TEMPLATE.parameters.changed({"leaflets.anterior.thickness": 1.33}))
+    turned = Template(TEMPLATE.parameters.changed({"leaflets.fibre_turn": 0.24}))
     others = {
         structured_mesh(*arguments).sha256
         for arguments in (
