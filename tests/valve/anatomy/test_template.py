@@ -354,7 +354,7 @@ def test_values_are_changed_by_their_dotted_names():
     assert changed.changed({"leaflets.anterior.length": 24.0, "annulus.saddle_height": 6.5}) == (
         DEFAULT
     )
-    with pytest.raises(InputError, match="template parameter 'middle.length', expected one of anterior"):
+    with pytest.raises(InputError, match=r"parameter 'middle\.length', expected one of anterior"):
         DEFAULT.changed({"leaflets.middle.length": 25.0})
 
 
