@@ -10,3 +10,11 @@ def compiled(monkeypatch):
     That it is given is tested in processes of their own (``test_first_use.py``).
     """
     monkeypatch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def coarse_pictures():
+    """Few dots: what is drawn is the same, and nobody looks at it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mvest.reporting.figures.DPI", 40)
+        yield

@@ -15,14 +15,14 @@ pytest.importorskip("skfem")
 
 SMALL = (
     "experiment=models",
-    "models.sheet.cells=[2,2]",
+    "models.sheet.cells=[2,1]",
     "models.sheet.layers=1",
     "models.sheet.observed=[2,3]",
     "models.sheet.load_steps=1",
     "models.refinements=[[2,2,1]]",
     "observation.noise_mm=0.001",
     "filter.R=1e-6",
-    "filter.initial=[3.5,2.0]",
+    "filter.initial=[3.8,1.6]",
     "tracking.enabled=false",
     "hydra.run.dir=here",
 )
