@@ -20,7 +20,7 @@ from experiments.common.schema import schema
 from experiments.common.study import load_settings, study_names
 from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import MonteCarloFilter
-from mvest.imaging.detection.trained_model import MODEL_FILE
+from mvest.imaging.models import MODEL_FILE
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.anatomy.template import TemplateParameters

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from mvest.errors import InputError
 from mvest.typing import FloatArray
@@ -75,7 +75,7 @@ class PressureCurve:
                 f"time {time:g} s lies outside the pressure curve, which runs from {first:g} to "
                 f"{last:g} s"
             )
-        return float(PchipInterpolator(self.time, self.pressure_mmHg)(time))
+        return float(scipy.interpolate.PchipInterpolator(self.time, self.pressure_mmHg)(time))
 
 
 def generic_curve() -> PressureCurve:
@@ -83,6 +83,7 @@ def generic_curve() -> PressureCurve:
     end = min(VENTRICLE[-1][0], ATRIUM[-1][0])
     time = np.linspace(VENTRICLE[0][0], end, GENERIC_SAMPLES)
     ventricle, atrium = (
-        PchipInterpolator(*np.transpose(part))(time) for part in (VENTRICLE, ATRIUM)
+        scipy.interpolate.PchipInterpolator(*np.transpose(part))(time)
+        for part in (VENTRICLE, ATRIUM)
     )
     return PressureCurve(time, ventricle - atrium)

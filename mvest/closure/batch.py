@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import joblib
 import numpy as np
 
 from mvest.closure.model import ClosureModel
@@ -51,6 +50,8 @@ def predict_many(
     fresh = model.fresh()
     if processes == 1:
         return _predict(fresh, values)
+    import joblib  # and with it asyncio, which one process needs not wait for
+
     # Neighbours in the list tend to cost alike: dealt out in turn, all processes get a like share.
     shares = [values[k::processes] for k in range(min(processes, len(values)))]
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):

@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Protocol, TypeAlias
 
 import numpy as np
-from scipy.special import ndtri
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -211,7 +211,7 @@ class Estimate:
             low, high = np.quantile(self.transformed_samples, tails, axis=0)
             return self.transform.inverse(low), self.transform.inverse(high)
         z = self.transformed
-        half_width = float(ndtri(0.5 + 0.5 * level)) * z.std
+        half_width = float(scipy.special.ndtri(0.5 + 0.5 * level)) * z.std
         return self.transform.inverse(z.mean - half_width), self.transform.inverse(
             z.mean + half_width
         )

@@ -9,19 +9,17 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
-from scipy import sparse
-from scipy.linalg import solve_triangular
-from scipy.sparse.linalg import splu, spsolve_triangular
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import SYMMETRY_TOLERANCE
 from mvest.estimation.prediction import require_finite
 from mvest.typing import FloatArray
 
-SparseMatrix: TypeAlias = "sparse.sparray[Any, Any] | sparse.spmatrix[Any]"
+SparseMatrix: TypeAlias = "scipy.sparse.sparray[Any, Any] | scipy.sparse.spmatrix[Any]"
 """A sparse matrix of SciPy in any of its formats."""
 
-CscMatrix: TypeAlias = "sparse.csc_array[np.float64]"
+CscMatrix: TypeAlias = "scipy.sparse.csc_array[np.float64]"
 """A sparse matrix by columns in double precision."""
 
 
@@ -68,7 +66,7 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
         if R.size != size:
             raise InputError(f"R is of {R.size} observations, expected {size}")
         return R
-    if isinstance(R, sparse.sparray | sparse.spmatrix):
+    if isinstance(R, scipy.sparse.sparray | scipy.sparse.spmatrix):
         return _sparse_noise(csc(R), size)
     variance = np.asarray(R, dtype=np.float64)
     if variance.ndim != 0 and variance.shape != (size,):
@@ -106,7 +104,7 @@ def kronecker_noise(variance: float, root: FloatArray, copies: int) -> Observati
 
     def whiten(values: FloatArray) -> FloatArray:
         by_point = np.reshape(values, (k, -1))
-        solved = solve_triangular(root, by_point, lower=True, check_finite=False)
+        solved = scipy.linalg.solve_triangular(root, by_point, lower=True, check_finite=False)
         return scale * np.reshape(np.asarray(solved, dtype=np.float64), np.shape(values))
 
     log_determinant = copies * (k * np.log(variance) + 2.0 * np.sum(np.log(np.diagonal(root))))
@@ -195,10 +193,12 @@ def low_rank_noise(base: ObservationNoise, columns: FloatArray) -> ObservationNo
 def csc(matrix: SparseMatrix) -> CscMatrix:
     """A sparse matrix of any format and number type as columns in double precision."""
     # SciPy's stubs know no common constructor for all formats.
-    return sparse.csc_array(cast(Any, matrix), dtype=np.float64)
+    return scipy.sparse.csc_array(cast(Any, matrix), dtype=np.float64)
 
 
 def _sparse_noise(R: CscMatrix, size: int) -> ObservationNoise:
+    from scipy.sparse.linalg import splu, spsolve_triangular
+
     if R.shape != (size, size):
         raise InputError(f"R must have shape ({size}, {size}); got {R.shape}")
     require_finite(R.data, "R")
@@ -221,7 +221,7 @@ def _sparse_noise(R: CscMatrix, size: int) -> ObservationNoise:
     if np.any(pivots <= 0.0) or np.any(lu.perm_r != lu.perm_c):
         raise InputError(f"R must be positive definite; its smallest pivot is {pivots.min():g}")
     position = lu.perm_c
-    lower = sparse.csr_array(lu.L)
+    lower = scipy.sparse.csr_array(lu.L)
     weight = 1.0 / np.sqrt(pivots)
 
     def whiten(values: FloatArray) -> FloatArray:

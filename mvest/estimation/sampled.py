@@ -20,8 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
-from scipy.special import ndtri
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -116,6 +115,9 @@ class SampledErrors:
         for k in range(self.count):
             whitened, without = gain(np.delete(D, k, axis=1))
             moved[:, k] = without @ whitened[:, k]
-        widened = (stats.t.ppf(0.5 + 0.5 * LEVEL, self.count) / ndtri(0.5 + 0.5 * LEVEL)) ** 2
+        widened = (
+            scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, self.count)
+            / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
+        ) ** 2
         part = widened / self.count * moved @ moved.T
         return SampledPosterior(rest @ P @ rest.T + part, part)

@@ -5,8 +5,8 @@ from .integrate import simulate as simulate
 from .law.biot import BiotLaw as BiotLaw
 from .law.biot import PoissonReading as PoissonReading
 from .law.biot import TransverselyIsotropic as TransverselyIsotropic
-from .law.field import ModulusField as ModulusField
-from .law.field import StiffPatch as StiffPatch
+from .settings import ModulusField as ModulusField
+from .settings import StiffPatch as StiffPatch
 from .steps import Damping as Damping
 from .steps import NewtonSettings as NewtonSettings
 from .steps import Simulation as Simulation

@@ -3,24 +3,78 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from mvest.errors import InputError
-from mvest.mechanics.forces.contact import ContactSettings
-from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialTissue
-from mvest.mechanics.law.field import ModulusField, StiffPatch
+from mvest.errors import InputError, MaterialError
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
+from mvest.typing import FloatArray
 
-__all__ = ["ClosureProtocol", "MechanicsSettings", "TissueSettings", "smooth_step"]
+__all__ = [
+    "EXPONENTIAL_KINDS",
+    "ClosureProtocol",
+    "ContactSettings",
+    "ExponentialTissue",
+    "MechanicsSettings",
+    "ModulusField",
+    "StiffPatch",
+    "TissueSettings",
+    "smooth_step",
+]
 
 
 def smooth_step(u: float) -> float:
     """Quintic from 0 at ``u <= 0`` to 1 at ``u >= 1`` whose first two derivatives vanish there."""
     u = min(max(u, 0.0), 1.0)
     return u**3 * (10 - 15 * u + 6 * u * u)
+
+
+@dataclass(frozen=True, slots=True)
+class ExponentialTissue:
+    """Coefficients of one region.
+
+    Attributes
+    ----------
+    c0 : float
+        MPa, scale of the exponential.
+    c1, c2 : float
+        Exponents of the isochoric deformation and of the fibres.
+    mu : float
+        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa that
+        excised leaflets have before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
+    kappa : float
+        MPa, bulk modulus.
+    viscous : float
+        MPa, stiffness that the damping acts with.
+
+    Raises
+    ------
+    MaterialError
+        If a coefficient is not positive (c1, c2 and viscous may be zero).
+    """
+
+    c0: float
+    c1: float
+    c2: float
+    mu: float = 0.02
+    kappa: float = 5.0
+    viscous: float = 2.0
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = float(getattr(self, each.name))
+            may_be_zero = each.name in ("c1", "c2", "viscous")
+            if not np.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
+                raise MaterialError(
+                    f"{each.name} = {value} of the exponential law, expected "
+                    f"{'>= 0' if may_be_zero else '> 0'}"
+                )
+
+
+EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
+"""Coefficients that may be parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +149,69 @@ class TissueSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ModulusField:
+    """What is known beforehand of how the modulus of a leaflet varies.
+
+    Attributes
+    ----------
+    correlation_length_mm : float
+        l, over which it is alike.
+    std_log : float
+        Standard deviation of log E_f at a point.
+    modes : int
+        How many modes are kept.
+    """
+
+    correlation_length_mm: float
+    std_log: float
+    modes: int
+
+    def __post_init__(self) -> None:
+        for name in ("correlation_length_mm", "std_log"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"field {name} = {value}, expected > 0")
+        if self.modes < 1:
+            raise InputError(f"field modes = {self.modes}, expected at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class StiffPatch:
+    """Tissue of another stiffness around one point of a leaflet.
+
+    ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` within ``radius`` of the centre,
+    d the distance in the reference frame: smooth, and of bounded extent.
+
+    Attributes
+    ----------
+    region : str
+    centre : tuple of float
+        ``(x, y, z)`` mm in the reference frame.
+    radius_mm : float
+    factor : float
+        On the stiffness at the centre.
+    """
+
+    region: str
+    centre: tuple[float, ...]
+    radius_mm: float
+    factor: float
+
+    def __post_init__(self) -> None:
+        if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
+            raise InputError(f"centre of a patch {self.centre}, expected (x, y, z) mm")
+        for name in ("radius_mm", "factor"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} of a patch = {value}, expected > 0")
+
+    def log_scale(self, points: FloatArray) -> FloatArray:
+        """What is added to log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
+        d2 = np.sum((points - np.asarray(self.centre)) ** 2, axis=-1) / self.radius_mm**2
+        return np.asarray(np.log(self.factor) * np.maximum(1 - d2, 0.0) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
 class ClosureProtocol:
     """How the valve is closed, and when it is looked at.
 
@@ -150,6 +267,34 @@ class ClosureProtocol:
 
 
 @dataclass(frozen=True, slots=True)
+class ContactSettings:
+    """The contact law.
+
+    Attributes
+    ----------
+    reference_pressure : float
+        Contact pressure p0 (MPa) at the reference distance.
+    reference_distance : float
+        c0, the midsurface distance at p0 over the thickness.
+    activation_distance : float
+        c_h, the midsurface distance over the thickness at which contact begins.
+    """
+
+    reference_pressure: float = 0.016
+    reference_distance: float = 1.2
+    activation_distance: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.reference_pressure > 0:
+            raise InputError(f"contact reference_pressure {self.reference_pressure}, expected > 0")
+        if not 0 < self.reference_distance < self.activation_distance:
+            raise InputError(
+                f"contact distances: reference {self.reference_distance}, activation "
+                f"{self.activation_distance}; expected 0 < reference < activation"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class MechanicsSettings:
     """Everything about the mechanics that is not the valve, the mesh or an unknown.
 
@@ -169,10 +314,10 @@ class MechanicsSettings:
         mm over which a chord is spread at its insertion.
     solver : str
     fields : dict
-        Region name -> :class:`mvest.mechanics.law.field.ModulusField`, where the modulus varies
+        Region name -> :class:`ModulusField`, where the modulus varies
         within it; the coefficients ``field.REGION.K`` that are given no value are 0.
     patches : dict
-        Any name -> :class:`mvest.mechanics.law.field.StiffPatch`, for simulations.
+        Any name -> :class:`StiffPatch`, for simulations.
     """
 
     tissue: dict[str, TissueSettings]

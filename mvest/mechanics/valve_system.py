@@ -18,12 +18,12 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialLaw, ExponentialTissue
+from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.moduli import LeafletModuli
 from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray

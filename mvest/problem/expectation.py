@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability, identifiability
@@ -68,7 +68,7 @@ class Foresight:
         if self.informed is None:
             raise ValueError("nothing is known of the parameters with the prior")
         z = self.transform.forward(self.assumed)
-        reach = norm.ppf(0.5 + 0.5 * level) * self.informed.std / self.transform.derivative(z)
+        reach = ndtri(0.5 + 0.5 * level) * self.informed.std / self.transform.derivative(z)
         return self.transform.inverse(z - reach), self.transform.inverse(z + reach)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Confounded, Identifiability
@@ -54,7 +54,7 @@ def foresight_text(
         low = high = None
         if informed is not None:
             reach = np.zeros_like(z)
-            reach[k] = norm.ppf(0.975) * informed.std[k] / transform.derivative(z)[k]
+            reach[k] = ndtri(0.975) * informed.std[k] / transform.derivative(z)[k]
             low, high = (float(transform.inverse(z + s * reach)[k]) for s in (-1.0, 1.0))
         rows.append(
             {

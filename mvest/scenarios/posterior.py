@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import qmc
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate
@@ -63,8 +62,8 @@ def posterior_samples(estimate: Estimate, count: int, seed: int) -> FloatArray:
     if count < 2 or count & (count - 1):
         raise InputError(f"samples = {count}, expected a power of two > 1")
     posterior = estimate.transformed
-    points = qmc.Sobol(posterior.size, scramble=True, seed=seed).random(count)
-    z = posterior.mean + ndtri(points) @ posterior.factor.T
+    points = scipy.stats.qmc.Sobol(posterior.size, scramble=True, seed=seed).random(count)
+    z = posterior.mean + scipy.special.ndtri(points) @ posterior.factor.T
     return np.array([estimate.transform.inverse(row) for row in z])
 
 

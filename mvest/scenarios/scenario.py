@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
@@ -181,7 +181,7 @@ def _share(valve: Valve, plane: AnnulusPlane, ring: Annuloplasty) -> float:
         new = narrowed(annulus, plane, share)
         return measure_annulus(new, plane_of(valve, new)).anteroposterior_diameter - wanted
 
-    return float(brentq(excess, 0.5 * NARROWEST, 1.0, xtol=1e-12))
+    return float(scipy.optimize.brentq(excess, 0.5 * NARROWEST, 1.0, xtol=1e-12))
 
 
 def _with_ring(valve: Valve, plane: AnnulusPlane, share: float) -> Valve:

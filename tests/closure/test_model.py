@@ -13,8 +13,13 @@ import mvest.closure.model
 from mvest.closure.model import REST, ClosedState, ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics import valve_system
-from mvest.mechanics.forces.contact import Contact, ContactSettings
-from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
+from mvest.mechanics.forces.contact import Contact
+from mvest.mechanics.settings import (
+    ClosureProtocol,
+    ContactSettings,
+    MechanicsSettings,
+    TissueSettings,
+)
 from mvest.mechanics.steps import NewtonSettings, StepReason
 from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
 from mvest.valve.anatomy.template import Template

@@ -10,10 +10,10 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS, ExponentialLaw, ExponentialTissue
+from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.settings import TissueSettings
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, TissueSettings
 from mvest.mechanics.valve_system import material_law
 from tests.closure.test_model import (
     CLOSING,

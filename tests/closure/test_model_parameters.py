@@ -10,9 +10,8 @@ import pytest
 
 from mvest.closure.model import ClosedState
 from mvest.errors import InputError
-from mvest.mechanics.law.exponential import EXPONENTIAL_KINDS
-from mvest.mechanics.law.field import ModulusField
 from mvest.mechanics.parameters import KINDS
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ModulusField
 from tests.closure.test_model import (
     AT,
     CLOSING,

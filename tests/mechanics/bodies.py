@@ -5,9 +5,10 @@ import numpy as np
 from mvest.elements import ELEMENTS
 from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
-from mvest.mechanics.forces.contact import Contact, ContactSettings
+from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.settings import ContactSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
 from mvest.valve.mesh.embedding import Embedding, embed

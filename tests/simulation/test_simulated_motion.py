@@ -4,6 +4,7 @@ import pickle
 import time
 from dataclasses import replace
 
+import joblib
 import numpy as np
 import pytest
 
@@ -357,11 +358,9 @@ def test_processes_change_nothing(monkeypatch):
         return replace(still(name), vertices=still().vertices * values["E_f.anterior"])
 
     monkeypatch.setattr(population, "close_in_motion", close)
-    config = population.joblib.parallel_config
+    config = joblib.parallel_config
     # Threads, as what is replaced here is not replaced in other processes.
-    monkeypatch.setattr(
-        population.joblib, "parallel_config", lambda **_: config(backend="threading")
-    )
+    monkeypatch.setattr(joblib, "parallel_config", lambda **_: config(backend="threading"))
     one, two = (
         draw_population(8, 3, BASES, PopulationSettings(), MECHANICS, processes=processes)
         for processes in (1, 2)

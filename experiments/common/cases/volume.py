@@ -26,13 +26,13 @@ from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import (
-    MODEL_FILE,
     DetectionModel,
     default_model,
     load_model,
 )
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.markups import read_markups
+from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence

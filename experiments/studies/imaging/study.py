@@ -26,7 +26,6 @@ from mvest.files import write_atomically
 from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import (
-    MODEL_FILE,
     DetectionAccuracy,
     DetectionModel,
     load_model,
@@ -35,6 +34,7 @@ from mvest.imaging.detection.trained_model import (
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import Correlogram, measure_accuracy
+from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.moving_valve import MovingValve
 from mvest.provenance import provenance
 from mvest.reporting.images.figures import SETTINGS

@@ -22,8 +22,9 @@ from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
 from mvest.mechanics.law.biaxial import biaxial_stress
-from mvest.mechanics.law.exponential import ExponentialLaw, ExponentialTissue
+from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.parameters import kind_of
+from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.solid import Law
 from mvest.mechanics.valve_system import material_law
 from mvest.observation.vertices import Observation

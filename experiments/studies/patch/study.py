@@ -30,7 +30,8 @@ from mvest.estimation.estimate import Estimate
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import to_filter
-from mvest.mechanics.law.field import FieldBasis, StiffPatch
+from mvest.mechanics.law.field import FieldBasis
+from mvest.mechanics.settings import StiffPatch
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_patch_study"]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, OnIterate, Reason
@@ -198,7 +198,7 @@ class _Runs:
 
     def fill(self, region: Region, count: int, rng: np.random.Generator) -> None:
         """Run the model at points that fill a region evenly."""
-        sobol = qmc.Sobol(region.centre.size, rng=rng)
+        sobol = scipy.stats.qmc.Sobol(region.centre.size, rng=rng)
         drawn = sobol.random_base2((count - 1).bit_length())[:count]
         for x in region.points(2.0 * drawn - 1.0):
             if np.linalg.norm(x) <= FURTHEST:

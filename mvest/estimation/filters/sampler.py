@@ -6,9 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import emcee
 import numpy as np
-from emcee.autocorr import integrated_time
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -116,6 +114,8 @@ def draw(
     InputError
         If there are fewer walkers than the moves need, or no start of positive density is found.
     """
+    import emcee  # loads most of SciPy, for this function alone
+
     if settings.walkers < 2 * start.size:
         raise InputError(
             f"{start.size} parameters need at least {2 * start.size} walkers; got "
@@ -131,7 +131,9 @@ def draw(
         accepted.append(float(np.mean(sampler.acceptance_fraction)))
     # (chains, steps, walkers, p)
     drawn = np.array(chains)
-    times = np.array([integrated_time(chain, tol=0, quiet=True) for chain in drawn]).mean(axis=0)
+    times = np.array(
+        [emcee.autocorr.integrated_time(chain, tol=0, quiet=True) for chain in drawn]
+    ).mean(axis=0)
     times = np.maximum(times, 1.0)
     points = drawn.reshape(-1, start.size)
     return Draws(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import helmert
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, OnIterate, Reason
@@ -148,4 +148,4 @@ class UnscentedFilter:
 
 def simplex_points(size: int) -> FloatArray:
     """Corners (p + 1, p) of a regular simplex with mean 0 and covariance I, divided by p + 1."""
-    return np.sqrt(size + 1.0) * np.asarray(helmert(size + 1), dtype=np.float64).T
+    return np.sqrt(size + 1.0) * np.asarray(scipy.linalg.helmert(size + 1), dtype=np.float64).T

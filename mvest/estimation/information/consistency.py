@@ -7,7 +7,7 @@ Navigation (2001), section 5.4. Each takes plain arrays.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv, ndtr
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import checked_covariance
@@ -32,7 +32,8 @@ def chi_square_band(degrees_of_freedom: float, level: float = 0.95) -> tuple[flo
     # A chi-square number with k degrees of freedom is twice a gamma number of shape k/2.
     shape = 0.5 * degrees_of_freedom
     tail = 0.5 * (1.0 - level)
-    return 2.0 * float(gammaincinv(shape, tail)), 2.0 * float(gammaincinv(shape, 1.0 - tail))
+    low, high = scipy.special.gammaincinv(shape, [tail, 1.0 - tail])
+    return 2.0 * float(low), 2.0 * float(high)
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> float:
@@ -124,7 +125,7 @@ class ZTest:
     @property
     def p_value(self) -> float:
         """Two-sided probability of a larger distance, from the normal limit."""
-        return 2.0 * float(ndtr(-abs(self.z)))
+        return 2.0 * float(scipy.special.ndtr(-abs(self.z)))
 
 
 def zero_mean(innovation: FloatArray) -> ZTest:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.information.identifiability import Identifiability, identifiability
@@ -126,7 +126,7 @@ class Design:
             return 0.0
         if excess(high) < 0.0:
             return np.inf
-        return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
+        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-12)))
 
     def needed_repeats(
         self, name: str, target: float, noise: float, knowledge: Mapping[str, float] | None = None
@@ -160,7 +160,7 @@ class Design:
             return 0.0
         if excess(high) < 0.0:
             return np.inf
-        return float(np.exp(brentq(excess, low, high, xtol=1e-12)))
+        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-12)))
 
 
 def together(*designs: Design) -> Design:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
@@ -167,7 +167,7 @@ def profile(
         raise InputError(f"the model has no prediction to start a profile from: {first}")
     everything = np.arange(start.size)
     best = fit.minimise(first, everything)
-    threshold = float(chi2.ppf(level, 1))
+    threshold = float(scipy.stats.chi2.ppf(level, 1))
     below, end_below = _side(fit, best, index, offsets[offsets < 0.0][::-1], threshold)
     above, end_above = _side(fit, best, index, offsets[offsets > 0.0], threshold)
     points = [*below[::-1], best, *above]

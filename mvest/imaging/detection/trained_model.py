@@ -28,19 +28,10 @@ from mvest.imaging.detection.shape_start import MODES, ShapeStart
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
+from mvest.imaging.models import MODEL_FILE
 from mvest.typing import FloatArray
 
-__all__ = [
-    "MODEL_FILE",
-    "DetectionAccuracy",
-    "DetectionModel",
-    "default_model",
-    "load_model",
-    "save_model",
-]
-
-MODEL_FILE = Path(__file__).resolve().parent.parent / "models" / "tee.npz"
-"""The trained model that comes with the package."""
+__all__ = ["DetectionAccuracy", "DetectionModel", "default_model", "load_model", "save_model"]
 
 FORMAT = "mvest detection model"
 VERSION = 1

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
-import joblib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -306,6 +305,8 @@ def train_model(
     InputError
         If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
     """
+    import joblib  # and with it asyncio, which finding a valve needs not wait for
+
     if not valves:
         raise InputError("training: no valves")
     if settings.modes < MODES:

@@ -46,10 +46,11 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.forces.pair_search import search_pairs
+from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = ["Contact", "ContactPairs", "ContactSettings"]
+__all__ = ["Contact", "ContactPairs"]
 
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
@@ -57,34 +58,6 @@ APPROACH = 0.75
 """A pair may lose at most this share of its distance to the barrier in one Newton step."""
 HARMLESS = 0.02
 """mm; a step that moves no point farther cannot take sheets through each other."""
-
-
-@dataclass(frozen=True, slots=True)
-class ContactSettings:
-    """The contact law.
-
-    Attributes
-    ----------
-    reference_pressure : float
-        Contact pressure p0 (MPa) at the reference distance.
-    reference_distance : float
-        c0, the midsurface distance at p0 over the thickness.
-    activation_distance : float
-        c_h, the midsurface distance over the thickness at which contact begins.
-    """
-
-    reference_pressure: float = 0.016
-    reference_distance: float = 1.2
-    activation_distance: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not self.reference_pressure > 0:
-            raise InputError(f"contact reference_pressure {self.reference_pressure}, expected > 0")
-        if not 0 < self.reference_distance < self.activation_distance:
-            raise InputError(
-                f"contact distances: reference {self.reference_distance}, activation "
-                f"{self.activation_distance}; expected 0 < reference < activation"
-            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

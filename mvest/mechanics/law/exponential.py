@@ -37,16 +37,17 @@ Green-Lagrange strain and so leaves rigid rotation alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass
 
 import numba as nb
 import numpy as np
 
-from mvest.errors import InputError, MaterialError
+from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter, known_names
+from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["EXPONENTIAL_KINDS", "ExponentialLaw", "ExponentialTissue"]
+__all__ = ["ExponentialLaw"]
 
 LARGEST_EXPONENT = 12.0
 """Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
@@ -56,52 +57,6 @@ TURNED_OVER = 1e4
 
 VISCOUS = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """Of unit viscous stiffness: stress by strain, component by component."""
-
-
-@dataclass(frozen=True, slots=True)
-class ExponentialTissue:
-    """Coefficients of one region.
-
-    Attributes
-    ----------
-    c0 : float
-        MPa, scale of the exponential.
-    c1, c2 : float
-        Exponents of the isochoric deformation and of the fibres.
-    mu : float
-        MPa, shear modulus at rest. The default is a third of the Young's modulus of 0.06 MPa that
-        excised leaflets have before they stiffen (Krishnamurthy et al. 2009, J. Biomech. 42:1909).
-    kappa : float
-        MPa, bulk modulus.
-    viscous : float
-        MPa, stiffness that the damping acts with.
-
-    Raises
-    ------
-    MaterialError
-        If a coefficient is not positive (c1, c2 and viscous may be zero).
-    """
-
-    c0: float
-    c1: float
-    c2: float
-    mu: float = 0.02
-    kappa: float = 5.0
-    viscous: float = 2.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = float(getattr(self, field.name))
-            may_be_zero = field.name in ("c1", "c2", "viscous")
-            if not np.isfinite(value) or value < 0 or (value == 0 and not may_be_zero):
-                raise MaterialError(
-                    f"{field.name} = {value} of the exponential law, expected "
-                    f"{'>= 0' if may_be_zero else '> 0'}"
-                )
-
-
-EXPONENTIAL_KINDS = ("c0", "c1", "c2", "mu", "kappa")
-"""Coefficients that may be parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,75 +31,13 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.settings import ModulusField
 from mvest.mechanics.solid import Law
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, lumped_areas
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["FieldBasis", "FieldLaw", "ModulusField", "StiffPatch", "at_quadrature"]
-
-
-@dataclass(frozen=True, slots=True)
-class ModulusField:
-    """What is known beforehand of how the modulus of a leaflet varies.
-
-    Attributes
-    ----------
-    correlation_length_mm : float
-        l, over which it is alike.
-    std_log : float
-        Standard deviation of log E_f at a point.
-    modes : int
-        How many modes are kept.
-    """
-
-    correlation_length_mm: float
-    std_log: float
-    modes: int
-
-    def __post_init__(self) -> None:
-        for name in ("correlation_length_mm", "std_log"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"field {name} = {value}, expected > 0")
-        if self.modes < 1:
-            raise InputError(f"field modes = {self.modes}, expected at least 1")
-
-
-@dataclass(frozen=True, slots=True)
-class StiffPatch:
-    """Tissue of another stiffness around one point of a leaflet.
-
-    ``log E_f`` is raised by ``log(factor) (1 - d^2 / radius^2)^2`` within ``radius`` of the centre,
-    d the distance in the reference frame: smooth, and of bounded extent.
-
-    Attributes
-    ----------
-    region : str
-    centre : tuple of float
-        ``(x, y, z)`` mm in the reference frame.
-    radius_mm : float
-    factor : float
-        On the stiffness at the centre.
-    """
-
-    region: str
-    centre: tuple[float, ...]
-    radius_mm: float
-    factor: float
-
-    def __post_init__(self) -> None:
-        if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
-            raise InputError(f"centre of a patch {self.centre}, expected (x, y, z) mm")
-        for name in ("radius_mm", "factor"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} of a patch = {value}, expected > 0")
-
-    def log_scale(self, points: FloatArray) -> FloatArray:
-        """What is added to log E_f ``(...)`` at points ``(..., 3)`` mm of the reference frame."""
-        d2 = np.sum((points - np.asarray(self.centre)) ** 2, axis=-1) / self.radius_mm**2
-        return np.asarray(np.log(self.factor) * np.maximum(1 - d2, 0.0) ** 2)
+__all__ = ["FieldBasis", "FieldLaw", "at_quadrature"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import joblib
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
@@ -145,6 +144,8 @@ def draw_population(
     if processes == 1:
         made = (_draw(*job, settings, mechanics) for job in jobs)
     else:
+        import joblib  # and with it asyncio, which one process needs not wait for
+
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             made = joblib.Parallel(n_jobs=processes, return_as="generator")(
                 joblib.delayed(_draw)(*job, settings, mechanics) for job in jobs

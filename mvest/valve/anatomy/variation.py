@@ -23,7 +23,7 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from scipy.stats import truncnorm
+import scipy
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray
@@ -91,7 +91,7 @@ def draw_variation(
     if not (np.isfinite(scale) and scale >= 0):
         raise InputError(f"scale of a variation = {scale}, expected a number >= 0")
     for refused in range(MAX_REFUSED):
-        z = scale * truncnorm.rvs(-LIMIT, LIMIT, size=13, random_state=rng)
+        z = scale * scipy.stats.truncnorm.rvs(-LIMIT, LIMIT, size=13, random_state=rng)
         try:
             varied = _changed(parameters, z)
             Template(varied).valve(*SAMPLING)

@@ -7,14 +7,9 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.contact import (
-    APPROACH,
-    BARRIER,
-    Contact,
-    ContactPairs,
-    ContactSettings,
-)
+from mvest.mechanics.forces.contact import APPROACH, BARRIER, Contact, ContactPairs
 from mvest.mechanics.forces.pair_search import NEIGHBOUR
+from mvest.mechanics.settings import ContactSettings
 from mvest.valve.mesh.embedding import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses
 

@@ -11,8 +11,9 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
-from mvest.mechanics.law.exponential import LARGEST_EXPONENT, ExponentialLaw, ExponentialTissue
+from mvest.mechanics.law.exponential import LARGEST_EXPONENT, ExponentialLaw
 from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
 from mvest.mechanics.system import Loads, System

@@ -7,9 +7,9 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.field import FieldBasis, FieldLaw, ModulusField, StiffPatch, at_quadrature
+from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.parameters import Parameter
-from mvest.mechanics.settings import MechanicsSettings, TissueSettings
+from mvest.mechanics.settings import MechanicsSettings, ModulusField, StiffPatch, TissueSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.valve_system import material_law, variation_of
 from mvest.valve.anatomy.template import Template
