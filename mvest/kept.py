@@ -8,7 +8,6 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -73,6 +72,11 @@ class Entry(Generic[T]):
         """What is kept, or is made and kept now: see :func:`get_or_make`."""
         return get_or_make([self], lambda _: [make()], write, keep)[0]
 
+    def keep(self, value: Any, write: Callable[[Path, Any], object]) -> T:
+        """Keep a value; what others will read."""
+        write_atomically(self.path, lambda part: write(part, value), sync=True)
+        return self.read(self.path)
+
     @contextmanager
     def alone(self) -> Iterator[None]:
         """Of several processes that need the entry, one is let in and the others wait."""
@@ -135,15 +139,9 @@ def get_or_make(
         for k, value in zip(left, make(left) if left else (), strict=True):
             entry = entries[k]
             if keep(value):
-                write_atomically(entry.path, partial(_write, write, value), sync=True)
-                values[k] = entry.read(entry.path)
-            else:
-                values[k] = value
+                value = entry.keep(value, write)
+            values[k] = value
             entry.counts.misses += 1
     for k in set(range(len(entries))) - set(left):
         entries[k].counts.hits += 1
     return values
-
-
-def _write(write: Callable[[Path, Any], object], value: Any, part: Path) -> None:
-    write(part, value)

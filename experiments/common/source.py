@@ -9,8 +9,8 @@ renamed, with the import lines that name it, and ends with every change of code 
   reporting meet, and of the ``__init__`` of a package, the definitions that are reached count and
   the statements that define nothing.
 * ``from package import name`` leads to the module that defines the name: past an ``__init__`` that
-  merely imports it, in a block for type checkers too, as one that imports on first use has it.
-  Importing a module does not make the packages above it count.
+  merely imports it, in its stub too, as one that imports on first use has it. Importing a module
+  does not make the packages above it count.
 * An imported name counts with the content of the module that it comes from, so that another
   function of the same name is another one. What other libraries are asked for counts by name.
 * A text that is the name of a module, or of a file of Python beside the module, is an import of it.
@@ -21,14 +21,11 @@ What modules read (files of data) or are given (settings) is not code: callers d
 from __future__ import annotations
 
 import ast
-import gc
 import hashlib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeGuard
+from typing import Any, NamedTuple
 
 import experiments
 import mvest
@@ -40,94 +37,56 @@ SLICED = "experiments"
 """Package of whose modules only the definitions count that are reached."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Import:
-    """A name in a module: that of a module, or one that a module binds."""
+class _Import(NamedTuple):
+    """A name in a module: that of a module, or one that a module binds; of a library, no module."""
 
     alias: str
-    module: str
+    module: str | None
     name: str | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Statement:
-    """A statement of a module.
-
-    Attributes
-    ----------
-    binds : frozenset of str
-        Names; of one that may do more than that, none.
-    text : str
-        Its syntax tree.
-    uses : frozenset of str
-        Names, with those of attributes of a name after a dot.
-    imports : tuple of _Import
-        Within it.
-    """
+class _Statement(NamedTuple):
+    """A statement of a module as text, and the names in it; one of other effects binds none."""
 
     binds: frozenset[str]
     text: str
-    uses: frozenset[str]
-    imports: tuple[_Import, ...]
+    uses: set[str]
+    imports: list[_Import]
 
 
 class _Module:
     """What the text of a module says."""
 
     def __init__(self, name: str, path: Path, sources: Sources) -> None:
-        self.name, self.is_package = name, path.name == "__init__.py"
-        self._path, self._sources = path, sources
+        self.name, self.path, self._sources = name, path, sources
+        self.is_package = path.name == "__init__.py"
+        self.is_sliced = self.is_package or name.partition(".")[0] == SLICED
         self.statements: list[_Statement] = []
-        self.imports: dict[str, _Import] = {}
-        self.for_types: dict[str, _Import] = {}
-        self.foreign: dict[str, set[str]] = {}
-        stub = path.with_suffix(".pyi")
-        for node in ast.parse(stub.read_bytes()).body if stub.is_file() else []:
-            self.for_types |= {found.alias: found for found in self._imports(node)}
-        nodes = ast.parse(path.read_bytes()).body
-        for node in nodes:
-            if _is_for_types(node):
-                within = (found for part in node.body for found in self._imports(part))
-                self.for_types |= {found.alias: found for found in within}
-        # What only a type checker reads is no part of what the code does.
-        self.foreign.clear()
-        for node in nodes:
-            if _is_for_types(node):
-                continue
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                self.imports |= {found.alias: found for found in self._imports(node)}
+        self.imports: list[_Import] = []
+        stub, for_types = path.with_suffix(".pyi"), list[_Import]()
+        for node in ast.parse(stub.read_bytes()).body if stub.is_file() else ():
+            for_types += self._imports(node)
+        for node in ast.parse(path.read_bytes()).body:
+            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                for_types += [found for part in node.body for found in self._imports(part)]
+            elif isinstance(node, ast.Import | ast.ImportFrom):
+                self.imports += self._imports(node)
             elif not _is_text(node) and _binds(node) != {"__all__"}:
-                self.statements.append(self._statement(node))
+                uses, imports = set[str](), list[_Import]()
+                text = self._text(node, uses, imports)
+                self.statements.append(_Statement(_binds(node), text, uses, imports))
+        self.offers = {found.alias: found for found in [*for_types, *self.imports]}
 
-    @cached_property
-    def is_sliced(self) -> bool:
-        """Whether only those definitions count that are reached."""
-        return self.is_package or self.name.partition(".")[0] == SLICED
-
-    def hash_of(self, statements: list[_Statement], *more: Any) -> str:
-        """Hash of statements and of what they ask of other libraries."""
-        uses = {name for s in statements for name in s.uses}
-        foreign = sorted((name, sorted(self.foreign[name])) for name in uses & set(self.foreign))
-        return _hash([s.text for s in statements], foreign, *more)
-
-    def reached(self, names: Iterable[str]) -> list[_Statement]:
-        """Statements that define names or what these use in turn, and those that define nothing."""
-        wanted, left, kept = set(names), True, set[int]()
-        while left:
-            new = {
-                k
-                for k, s in enumerate(self.statements)
-                if k not in kept and (not s.binds or s.binds & wanted)
-            }
-            kept |= new
-            wanted |= {name for k in new for name in self.statements[k].uses}
-            left = bool(new)
-        return [self.statements[k] for k in sorted(kept)]
-
-    def _statement(self, node: ast.stmt) -> _Statement:
-        uses, imports = set[str](), list[_Import]()
-        text = self._text(node, uses, imports)
-        return _Statement(_binds(node), text, frozenset(uses), tuple(imports))
+    def counting(self, names: set[str | None]) -> list[_Statement]:
+        """Statements that count where names are wanted, or all of the module (None)."""
+        if None in names or not self.is_sliced:
+            return self.statements
+        kept, wanted, size = list[_Statement](), set[str | None](names), -1
+        while size < len(kept):
+            size = len(kept)
+            kept = [s for s in self.statements if not s.binds or s.binds & wanted]
+            wanted = wanted.union(*(s.uses for s in kept))
+        return kept
 
     def _text(self, node: Any, uses: set[str], imports: list[_Import]) -> str:
         """A syntax tree in one line; what it uses and imports is added to ``uses, imports``."""
@@ -161,18 +120,17 @@ class _Module:
 
     def _named(self, text: str) -> str | None:
         """The module that a text names."""
-        if text.endswith(".py") and self._path.with_name(text.rpartition("/")[2]).is_file():
+        if text.endswith(".py") and self.path.with_name(text.rpartition("/")[2]).is_file():
             package = self.name if self.is_package else self.name.rpartition(".")[0]
             return f"{package}.{text.rpartition('/')[2][:-3]}"
-        return text if "." in text and self._sources.has(text) else None
+        return text if "." in text and self._sources.path(text) else None
 
     def _imports(self, node: ast.stmt) -> Iterator[_Import]:
         if isinstance(node, ast.Import):
             for item in node.names:
-                if self._sources.has(item.name):
-                    yield _Import(item.asname or item.name, item.name, None)
-                else:
-                    self._add_foreign(item, "")
+                is_ours = self._sources.path(item.name) is not None
+                alias = item.asname or item.name
+                yield _Import(alias, *((item.name, None) if is_ours else (None, item.name)))
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
@@ -180,14 +138,9 @@ class _Module:
                 parents = parents[: len(parents) - node.level + self.is_package]
                 base = ".".join([*parents, *([base] if base else [])])
             for item in node.names:
-                if self._sources.has(base):
-                    yield _Import(item.asname or item.name, base, item.name)
-                elif base != "__future__":
-                    self._add_foreign(item, base)
-
-    def _add_foreign(self, item: ast.alias, base: str) -> None:
-        alias = (item.asname or item.name).partition(".")[0]
-        self.foreign.setdefault(alias, set()).add(f"{base} {item.name}")
+                is_ours = self._sources.path(base) is not None
+                name = item.name if is_ours else f"{base} {item.name}"
+                yield _Import(item.asname or item.name, base if is_ours else None, name)
 
 
 class Sources:
@@ -201,17 +154,18 @@ class Sources:
 
     def __init__(self, **folders: Path) -> None:
         self._folders = folders
-        self._modules: dict[str, _Module] = {}
         self._paths: dict[str, Path | None] = {}
-        self._contents: dict[tuple[str, str | None], str] = {}
+        self._modules: dict[str, _Module] = {}
         self._keys: dict[tuple[tuple[str, str | None], ...], str] = {}
 
-    def has(self, name: str) -> bool:
-        """Whether a dotted name is that of a module here."""
-        return self._path(name) is not None
-
     def key(self, *made_by: tuple[str, str | None]) -> str:
-        """Hash of the code that is reached from modules, or from names that they define."""
+        """Hash of the code that is reached from modules, or from names that they define.
+
+        Raises
+        ------
+        InputError
+            If one of them is of another package.
+        """
         if made_by not in self._keys:
             self._keys[made_by] = _hash(sorted(self.parts(*made_by).values()))
         return self._keys[made_by]
@@ -222,103 +176,76 @@ class Sources:
         left = list(made_by)
         while left:
             name, wanted = left.pop()
-            before = reached.setdefault(name, set())
-            if wanted not in before:
-                before.add(wanted)
-                left += [self._home(found) for _, found in self._followed(name, before)]
-        return {name: self._part(name, wanted) for name, wanted in reached.items()}
+            names = reached.setdefault(name, set())
+            if wanted not in names:
+                names.add(wanted)
+                left += [home for _, home in self._followed(self._module(name), names) if home[0]]
+        return {name: self._part(self._module(name), names) for name, names in reached.items()}
 
-    def _part(self, name: str, wanted: set[str | None]) -> str:
-        module = self._module(name)
+    def _part(self, module: _Module, names: set[str | None]) -> str:
+        """Hash of what counts of a module, and of what it imports, that one's imports apart."""
         bound = set()
-        for alias, found in self._followed(name, wanted):
-            home, original = self._home(found)
-            bound.add((alias, original or "", self._content(home, original)))
-        return module.hash_of(self._statements(name, wanted), sorted(bound))
+        for alias, (name, original) in self._followed(module, names):
+            content = [s.text for s in self._module(name).counting({original})] if name else ()
+            bound.add((alias, original or "", _hash(content)))
+        return _hash([s.text for s in module.counting(names)], sorted(bound))
 
-    def _content(self, name: str, wanted: str | None) -> str:
-        """Hash of a module, or of what counts of it where a name is wanted, its imports apart."""
-        if (name, wanted) not in self._contents:
-            found = self._module(name).hash_of(self._statements(name, {wanted}))
-            self._contents[name, wanted] = found
-        return self._contents[name, wanted]
-
-    def _statements(self, name: str, wanted: set[str | None]) -> list[_Statement]:
-        module = self._module(name)
-        if None in wanted or not module.is_sliced:
-            return module.statements
-        return module.reached(filter(None, wanted))
-
-    def _followed(self, module_name: str, wanted: set[str | None]) -> Iterator[tuple[str, _Import]]:
-        """Names of a module that are imported there, and from where."""
-        module = self._module(module_name)
-        statements = self._statements(module_name, wanted)
-        uses = {name for s in statements for name in s.uses}
+    def _followed(
+        self, module: _Module, names: set[str | None]
+    ) -> Iterator[tuple[str, tuple[str, str | None]]]:
+        """Names that are imported for some names of a module, and their homes."""
+        statements = module.counting(names)
+        uses = set[str]().union(*(s.uses for s in statements))
         every = statements is module.statements
-        imports = [
-            *(i for i in module.imports.values() if every or i.alias.partition(".")[0] in uses),
-            *(i for s in statements for i in s.imports),
-        ]
-        for found in imports:
+        above = [i for i in module.imports if every or i.alias.partition(".")[0] in uses]
+        for found in above + [i for s in statements for i in s.imports]:
+            if found.module is None:
+                yield found.alias, ("", found.name)
+                continue
             package = self._module(found.module)
             if found.name is not None or not package.is_package:
-                yield found.alias, found
+                yield found.alias, self._home(found.module, found.name)
                 continue
             # A package by its name: what is asked of it, or all that it offers.
             asked = {u.partition(".")[2] for u in uses if u.startswith(f"{found.alias}.")}
-            if "." in found.alias:
-                asked = {*package.imports, *package.for_types}
-            for name in asked:
-                yield f"{found.alias}.{name}", _Import(name, found.module, name)
+            for name in package.offers if "." in found.alias else asked:
+                yield f"{found.alias}.{name}", self._home(found.module, name)
 
-    def _home(self, found: _Import) -> tuple[str, str | None]:
-        """The module that defines what is imported, and its name there."""
-        if found.name is None:
-            return found.module, None
-        module = self._module(found.module)
-        further = module.imports.get(found.name) or module.for_types.get(found.name)
-        if module.is_package and further is not None:
-            return self._home(further)
-        inner = f"{found.module}.{found.name}"
-        if module.is_package and self.has(inner):
-            return inner, None
-        return found.module, found.name
+    def _home(self, module: str, name: str | None) -> tuple[str, str | None]:
+        """The module that defines a name which another one offers, and the name there."""
+        package = self._module(module)
+        if name is None or not package.is_package:
+            return module, name
+        further = package.offers.get(name)
+        if further is not None and further.module is not None:
+            return self._home(further.module, further.name)
+        inner = f"{module}.{name}"
+        return (inner, None) if self.path(inner) else (module, name)
 
     def _module(self, name: str) -> _Module:
         if name not in self._modules:
-            path = self._path(name)
+            path = self.path(name)
             if path is None:
                 raise InputError(f"{name} is no module of {' or '.join(self._folders)}")
-            # Trees are many small objects, of which none is garbage before the last is there.
-            was_enabled = gc.isenabled()
-            gc.disable()
-            try:
-                self._modules[name] = _Module(name, path, self)
-            finally:
-                if was_enabled:
-                    gc.enable()
+            self._modules[name] = _Module(name, path, self)
         return self._modules[name]
 
-    def _path(self, name: str) -> Path | None:
+    def path(self, name: str) -> Path | None:
+        """The file of a module; None if it is none of these packages."""
         if name not in self._paths:
             top, *rest = name.split(".")
-            found = None
+            found = []
             if top in self._folders and all(part.isidentifier() for part in rest):
                 place = self._folders[top].joinpath(*rest)
-                for path in (place / "__init__.py", place.with_name(f"{place.name}.py")):
-                    if path.is_file() and (rest or path.name == "__init__.py"):
-                        found = path
-                        break
-            self._paths[name] = found
+                found = [
+                    p for p in (place / "__init__.py", place.with_suffix(".py")) if p.is_file()
+                ]
+            self._paths[name] = found[0] if found else None
         return self._paths[name]
 
 
 def _hash(*parts: Any) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def _is_for_types(node: ast.stmt) -> TypeGuard[ast.If]:
-    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
 
 
 def _is_text(node: ast.AST) -> bool:
@@ -327,19 +254,13 @@ def _is_text(node: ast.AST) -> bool:
 
 def _binds(node: ast.stmt) -> frozenset[str]:
     """Names that a statement defines, if that is all it does."""
-    match node:
-        case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-            return frozenset([node.name])
-        case ast.Assign():
-            targets = node.targets
-        case ast.AnnAssign():
-            targets = [node.target]
-        case _:
-            return frozenset()
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return frozenset([node.name])
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", node)]
     names = [part for target in targets for part in getattr(target, "elts", [target])]
-    if not all(isinstance(part, ast.Name) for part in names):
-        return frozenset()
-    return frozenset(part.id for part in names if isinstance(part, ast.Name))
+    is_plain = isinstance(node, ast.Assign | ast.AnnAssign)
+    plain = [part.id for part in names if is_plain and isinstance(part, ast.Name)]
+    return frozenset(plain if len(plain) == len(names) else ())
 
 
 SOURCES = Sources(mvest=Path(mvest.__file__).parent, experiments=Path(experiments.__file__).parent)

@@ -106,6 +106,8 @@ def test_the_imports_are_followed(code):
         "experiments.build", "experiments.base", "mvest.law", "mvest.units", "mvest.rooms",
         "mvest.rooms.tools",
     }  # fmt: skip
+    edit(code, "experiments/build.py", "LIMIT, helper", "LIMIT, helper, second")
+    assert "mvest.rooms.second" in sources(code).parts(ENTRY)
     # What another definition needs counts with that one; a whole module with all it imports.
     assert "mvest.far" in sources(code).parts(("experiments.build", "report"))
     assert {"mvest.far", "mvest.law"} <= set(sources(code).parts(("experiments.build", None)))
@@ -189,10 +191,26 @@ def test_a_package_by_its_own_name_is_what_is_asked_of_it(code, inside):
     reached = sources(code).parts(ENTRY)
     assert "mvest.law" in reached
     assert "mvest.far" not in reached
-    # Where what is asked is not seen, it is all that there is.
-    edit(code, name, "LIMIT, helper", "LIMIT")
-    edit(code, name, "stress(helper())", "stress(mvest.rooms.helper())")
+
+
+def test_a_package_by_a_name_with_dots_is_all_that_it_offers(code):
+    edit(code, "experiments/build.py", "LIMIT, helper", "LIMIT")
+    assert "mvest.rooms.tools" not in sources(code).parts(ENTRY)
+    edit(code, "experiments/build.py", "stress(helper())", "stress(mvest.rooms.helper())")
     assert "mvest.rooms.tools" in sources(code).parts(ENTRY)
+
+
+def test_two_names_that_change_places_are_another_code(code):
+    edit(code, "mvest/units.py", "SCALE = 2.0", "from mvest.far import other\nSCALE = other()")
+    edit(code, "experiments/build.py", "return 5", "return other()")
+    old, new = "from mvest.far import other", "from mvest.rooms.second import helper as other"
+    edit(code, "experiments/build.py", "LIMIT, helper", "LIMIT, helper; import mvest.rooms.second")
+    before = sources(code)
+    assert {"mvest.far", "mvest.rooms.second"} <= set(before.parts(ENTRY))
+    edit(code, "experiments/build.py", old, new)
+    after = sources(code)
+    assert set(after.parts(ENTRY)) == set(before.parts(ENTRY))
+    assert after.key(ENTRY) != before.key(ENTRY)
 
 
 def test_modules_may_be_moved_and_renamed(code):

@@ -13,6 +13,7 @@ from experiments import tables
 from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
+from mvest.files import PREFIX
 from tests.places import ROOT
 
 REQUIRED = {
@@ -80,7 +81,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
         "valve.pdf",
         "config.json",
     } <= names
-    assert not [name for name in names if name.endswith(".tmp")]
+    assert not [name for name in names if name.startswith(PREFIX)]
     assert not (tmp_path / "results").exists()
 
     with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
