@@ -23,7 +23,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.proximity import surface_edges
-from mvest.valve.geometry.surfaces import check_surface
+from mvest.valve.geometry.surface_checks import check_surface
 
 __all__ = [
     "at",

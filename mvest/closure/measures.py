@@ -12,7 +12,7 @@ from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.geometry.proximity import intersecting_triangles
-from mvest.valve.geometry.surfaces import thicken
+from mvest.valve.geometry.thickening import thicken
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import coaptation_length, orifice_area
 from mvest.valve.measure.passing_ball import largest_passing_ball

@@ -14,6 +14,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import BandGrid, band_grid
 
 __all__ = ["ValveLayout"]
 
@@ -50,29 +51,28 @@ class ValveLayout:
         return self.columns * self.rows
 
     @cached_property
+    def _grid(self) -> BandGrid:
+        return band_grid(self.columns, self.rows)
+
+    @property
     def phi(self) -> FloatArray:
         """``(n,)`` degrees."""
-        return np.tile(360.0 * np.arange(self.columns) / self.columns, self.rows)
+        return self._grid.phi
 
-    @cached_property
+    @property
     def s(self) -> FloatArray:
         """``(n,)`` from 0 to 1."""
-        return np.repeat(np.arange(self.rows) / (self.rows - 1), self.columns)
+        return self._grid.s
 
-    @cached_property
+    @property
     def triangles(self) -> IntArray:
         """``(m, 3)``, normals to the ventricle where phi runs as in the template."""
-        i, j = (v.ravel() for v in np.meshgrid(np.arange(self.columns), np.arange(self.rows - 1)))
-        a = j * self.columns + i
-        b = j * self.columns + (i + 1) % self.columns
-        c, d = b + self.columns, a + self.columns
-        return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
+        return self._grid.triangles
 
-    @cached_property
+    @property
     def region(self) -> IntArray:
         """``(m,)`` leaflet of each triangle."""
-        i = np.tile(np.arange(self.columns), self.rows - 1)
-        return np.tile((2 * i >= self.columns).astype(np.int64), 2)
+        return self._grid.region
 
     @property
     def annulus(self) -> IntArray:

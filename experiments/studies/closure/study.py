@@ -17,7 +17,7 @@ from experiments.studies.closure.report import closure_text, write_closure
 from experiments.studies.closure.settings import Settings
 from mvest.closure.measures import measure_steps
 from mvest.typing import FloatArray
-from mvest.valve.geometry.surfaces import thicken
+from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.embedding import embed
 
 __all__ = ["STUDY", "run_closure_study"]

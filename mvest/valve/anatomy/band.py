@@ -13,9 +13,9 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve
+from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, band_grid
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
-from mvest.valve.geometry.surfaces import smooth_vertex_normals
+from mvest.valve.geometry.thickening import smooth_vertex_normals
 
 __all__ = ["Band"]
 
@@ -209,17 +209,12 @@ class Band:
             raise InputError(
                 f"valve of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
             )
-        i, j = np.meshgrid(np.arange(columns), np.arange(rows))
-        phi, s = (360.0 * i / columns).ravel(), (j / (rows - 1)).ravel()
-        cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
-        a = cell_j * columns + cell_i
-        b = cell_j * columns + (cell_i + 1) % columns
-        c, d = b + columns, a + columns
+        phi, s, triangles, region = band_grid(columns, rows)
         vertex_region = np.where((phi > 0) & (phi < 180), 0, 1)
         surface = LeafletSurface(
             self.position(phi, s),
-            np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]),
-            np.tile(np.where(2 * cell_i < columns, 0, 1), 2),
+            triangles,
+            region,
             self.region_names,
             self.fibre(phi, s, vertex_region),
             self.thickness(phi, s),

@@ -20,7 +20,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
-from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
+from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, band_grid
 
 __all__ = ["ChordLayout", "Template", "TemplateParameters"]
 
@@ -298,15 +298,7 @@ class Template:
             raise InputError(
                 f"template of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
             )
-        i, j = np.meshgrid(np.arange(columns), np.arange(rows))
-        phi, s = (360.0 * i / columns).ravel(), (j / (rows - 1)).ravel()
-        cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
-        a = cell_j * columns + cell_i
-        b = cell_j * columns + (cell_i + 1) % columns
-        c, d = b + columns, a + columns
-        # (r x t) points to the ventricle: a, d, c turns that way.
-        triangles = np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
-        region = np.tile(np.where(2 * cell_i < columns, ANTERIOR, POSTERIOR), 2)
+        phi, s, triangles, region = band_grid(columns, rows)
         vertex_region = np.where((phi > 0) & (phi < 180), ANTERIOR, POSTERIOR)
         surface = LeafletSurface(
             self.position(phi, s),

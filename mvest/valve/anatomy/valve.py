@@ -8,22 +8,37 @@ entry.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Chordae", "LeafletSurface", "Motion", "Valve", "lumped_areas", "vertex_normals"]
+__all__ = [
+    "BandGrid",
+    "Chordae",
+    "LeafletSurface",
+    "Motion",
+    "Valve",
+    "band_grid",
+    "checked_floats",
+    "checked_indices",
+    "lumped_areas",
+    "vertex_normals",
+]
 
 
-def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
-    """A copy of ``array`` as float64, its shape (None: any length) and finiteness checked."""
+def checked_floats(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
+    """A read-only copy as float64, its shape (None: any length) and finiteness checked.
+
+    Raises
+    ------
+    InputError
+        Another shape, or an entry that is not finite.
+    """
     result = np.array(array, dtype=np.float64, order="C")
-    if result.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
-    ):
-        raise InputError(f"{name}: shape {result.shape}, expected {shape} (None: any length)")
+    _check_shape(name, result.shape, shape)
     bad = np.argwhere(~np.isfinite(result))
     if bad.size:
         raise InputError(f"{name}: entry {tuple(int(i) for i in bad[0])} is not finite")
@@ -31,22 +46,71 @@ def _finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> Floa
     return result
 
 
-def _indices(name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]) -> IntArray:
-    """A copy of ``array`` as int64, its shape and ``0 <= array < upper`` checked."""
+def checked_indices(
+    name: str, array: IntArray, upper: int, shape: tuple[int | None, ...]
+) -> IntArray:
+    """A read-only copy as int64, its shape and ``0 <= array < upper`` checked.
+
+    Raises
+    ------
+    InputError
+        Another shape or type, or an entry out of range.
+    """
     given = np.asarray(array)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"{name}: {given.dtype}, expected integers")
     result = np.array(given, dtype=np.int64, order="C")
-    if result.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, result.shape, strict=True)
-    ):
-        raise InputError(f"{name}: shape {result.shape}, expected {shape} (None: any length)")
+    _check_shape(name, result.shape, shape)
     bad = np.argwhere((result < 0) | (result >= upper))
     if bad.size:
         where = tuple(int(i) for i in bad[0])
         raise InputError(f"{name}: entry {where} is {result[where]}, expected 0 to {upper - 1}")
     result.setflags(write=False)
     return result
+
+
+def _check_shape(name: str, shape: tuple[int, ...], expected: tuple[int | None, ...]) -> None:
+    if len(shape) != len(expected) or any(
+        want is not None and want != got for want, got in zip(expected, shape, strict=True)
+    ):
+        raise InputError(f"{name}: shape {shape}, expected {expected} (None: any length)")
+
+
+class BandGrid(NamedTuple):
+    """A grid of two leaflets from annulus to free edge, in material coordinates.
+
+    Attributes
+    ----------
+    phi : (n,) degrees
+    s : (n,)
+    triangles : (m, 3)
+    region : (m,)
+        Leaflet of each triangle.
+    """
+
+    phi: FloatArray
+    s: FloatArray
+    triangles: IntArray
+    region: IntArray
+
+
+def band_grid(columns: int, rows: int) -> BandGrid:
+    """A grid of ``columns x rows`` vertices from the annulus to the free edge of two leaflets.
+
+    Vertex ``j * columns + i`` is column i, row j: the first row is the annulus, the last one the
+    free edge. Normals of triangles point to the ventricle where phi runs as in the template.
+    """
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows)))
+    cell_i, cell_j = (v.ravel() for v in np.meshgrid(np.arange(columns), np.arange(rows - 1)))
+    a = cell_j * columns + cell_i
+    b = cell_j * columns + (cell_i + 1) % columns
+    c, d = b + columns, a + columns
+    return BandGrid(
+        phi=360.0 * i / columns,
+        s=j / (rows - 1),
+        triangles=np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)]),
+        region=np.tile((2 * cell_i >= columns).astype(np.int64), 2),
+    )
 
 
 def vertex_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -103,20 +167,20 @@ class LeafletSurface:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "vertices", _finite("vertices", self.vertices, (None, 3)))
+        set_(self, "vertices", checked_floats("vertices", self.vertices, (None, 3)))
         n = len(self.vertices)
-        set_(self, "triangles", _indices("triangles", self.triangles, n, (None, 3)))
+        set_(self, "triangles", checked_indices("triangles", self.triangles, n, (None, 3)))
         m = len(self.triangles)
-        set_(self, "region", _indices("region", self.region, len(self.region_names), (m,)))
-        set_(self, "thickness", _finite("thickness", self.thickness, (n,)))
+        set_(self, "region", checked_indices("region", self.region, len(self.region_names), (m,)))
+        set_(self, "thickness", checked_floats("thickness", self.thickness, (n,)))
         if np.any(self.thickness <= 0):
             i = int(np.argmin(self.thickness))
             raise GeometryError(f"thickness of vertex {i} is {self.thickness[i]} mm, expected > 0")
-        fibre = _finite("fibre", self.fibre, (n, 3))
+        fibre = checked_floats("fibre", self.fibre, (n, 3))
         length = np.linalg.norm(fibre, axis=1)
         if np.any(length < 1e-8):
             raise GeometryError(f"fibre of vertex {int(np.argmin(length))} has no direction")
-        set_(self, "fibre", _finite("fibre", fibre / length[:, None], (n, 3)))
+        set_(self, "fibre", checked_floats("fibre", fibre / length[:, None], (n, 3)))
 
     @property
     def normals(self) -> FloatArray:
@@ -167,13 +231,13 @@ class Chordae:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "insertion", _finite("chordae insertion", self.insertion, (None, 3)))
+        set_(self, "insertion", checked_floats("chordae insertion", self.insertion, (None, 3)))
         c = len(self.insertion)
-        set_(self, "tip", _indices("chordae tip", self.tip, np.iinfo(np.int64).max, (c,)))
+        set_(self, "tip", checked_indices("chordae tip", self.tip, np.iinfo(np.int64).max, (c,)))
         n_families = len(self.family_names)
-        set_(self, "family", _indices("chordae family", self.family, n_families, (c,)))
+        set_(self, "family", checked_indices("chordae family", self.family, n_families, (c,)))
         for name in ("rest_length", "axial_stiffness"):
-            value = _finite(f"chordae {name}", getattr(self, name), (c,))
+            value = checked_floats(f"chordae {name}", getattr(self, name), (c,))
             if np.any(value <= 0):
                 i = int(np.argmin(value))
                 raise InputError(f"{name} of chord {i} is {value[i]}, expected > 0")
@@ -206,12 +270,12 @@ class Motion:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "phase", _finite("motion phase", self.phase, (None,)))
+        set_(self, "phase", checked_floats("motion phase", self.phase, (None,)))
         f = len(self.phase)
         if f < 2 or self.phase[0] != 0 or self.phase[-1] != 1 or np.any(np.diff(self.phase) <= 0):
             raise InputError(f"motion phase {self.phase}: expected strictly increasing from 0 to 1")
-        set_(self, "annulus", _finite("motion annulus", self.annulus, (f, None, 3)))
-        tips = _finite("motion papillary_tips", self.papillary_tips, (f, None, 3))
+        set_(self, "annulus", checked_floats("motion annulus", self.annulus, (f, None, 3)))
+        tips = checked_floats("motion papillary_tips", self.papillary_tips, (f, None, 3))
         set_(self, "papillary_tips", tips)
 
 
@@ -243,9 +307,11 @@ class Valve:
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         n = len(self.surface.vertices)
-        set_(self, "annulus", _indices("annulus", self.annulus, n, (None,)))
-        set_(self, "free_edge", _indices("free_edge", self.free_edge, n, (None,)))
-        set_(self, "papillary_tips", _finite("papillary_tips", self.papillary_tips, (None, 3)))
+        set_(self, "annulus", checked_indices("annulus", self.annulus, n, (None,)))
+        set_(self, "free_edge", checked_indices("free_edge", self.free_edge, n, (None,)))
+        set_(
+            self, "papillary_tips", checked_floats("papillary_tips", self.papillary_tips, (None, 3))
+        )
         n_tips = len(self.papillary_tips)
         if len(self.chordae) and int(self.chordae.tip.max()) >= n_tips:
             i = int(np.argmax(self.chordae.tip))

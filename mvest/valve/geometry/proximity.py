@@ -207,7 +207,7 @@ def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
 
     Triangles that share a vertex are not tested against each other's common edges, and two
     overlapping triangles in one plane are not seen; duplicates are found by
-    `mvest.valve.geometry.surfaces.check_surface`.
+    `mvest.valve.geometry.surface_checks.check_surface`.
 
     Parameters
     ----------

@@ -96,7 +96,7 @@ def read_mesh(path: Path | str) -> meshio.Mesh:
 def read_surface(path: Path | str) -> SurfaceFile:
     """Read a triangulated surface with its data.
 
-    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surfaces`.
+    Whether it is closed or manifold is not checked here; see `mvest.valve.geometry.surface_checks`.
 
     Raises
     ------

@@ -10,7 +10,7 @@ import numpy as np
 from mvest.elements import FACES, Element, element
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import _finite, _indices
+from mvest.valve.anatomy.valve import checked_floats, checked_indices
 
 __all__ = ["SolidMesh", "jacobian_determinants"]
 
@@ -63,24 +63,28 @@ class SolidMesh:
     def __post_init__(self) -> None:
         set_ = object.__setattr__
         reference = element(self.element_type)
-        set_(self, "nodes", _finite("mesh nodes", self.nodes, (None, 3)))
+        set_(self, "nodes", checked_floats("mesh nodes", self.nodes, (None, 3)))
         n = len(self.nodes)
-        set_(self, "elements", _indices("elements", self.elements, n, (None, reference.n_nodes)))
+        set_(
+            self,
+            "elements",
+            checked_indices("elements", self.elements, n, (None, reference.n_nodes)),
+        )
         m = len(self.elements)
         if m == 0:
             raise InputError("the mesh has no elements")
         n_regions = len(self.region_names)
-        set_(self, "region", _indices("element region", self.region, n_regions, (m,)))
+        set_(self, "region", checked_indices("element region", self.region, n_regions, (m,)))
         fibre = np.asarray(self.fibre, dtype=np.float64)
         if fibre.shape == (n, 3):
             fibre = fibre[self.elements]
-        set_(self, "fibre", _finite("mesh fibre", fibre, (m, reference.n_nodes, 3)))
+        set_(self, "fibre", checked_floats("mesh fibre", fibre, (m, reference.n_nodes, 3)))
         blank = np.argwhere(np.linalg.norm(self.fibre, axis=2) < 1e-8)
         if blank.size:
             e, a = blank[0]
             raise GeometryError(f"fibre at node {a} of element {e} has no direction")
         face_nodes = FACES[reference.face].n_nodes
-        faces = _indices("pressure_faces", self.pressure_faces, n, (None, face_nodes))
+        faces = checked_indices("pressure_faces", self.pressure_faces, n, (None, face_nodes))
         set_(self, "pressure_faces", faces)
         used = np.zeros(n, dtype=bool)
         used[self.elements] = True

@@ -6,7 +6,7 @@ import pytest
 from mvest.elements import ELEMENTS, FACES
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
+from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.io.leaflet_surfaces import (
     read_leaflets,
     read_surface,

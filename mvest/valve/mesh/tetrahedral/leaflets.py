@@ -14,7 +14,7 @@ from mvest.errors import InputError, MeshingError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surfaces import FACE_KINDS, ClosedSurface, thicken
+from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.tetrahedral.cells import outer_faces, promote_to_tet10, tri6_faces
 from mvest.valve.mesh.tetrahedral.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
@@ -43,7 +43,7 @@ def tetrahedral_leaflets(
     element_type
         ``"tet10"`` or ``"tet4"``.
     normals
-        Offset directions of `mvest.valve.geometry.surfaces.thicken`.
+        Offset directions of `mvest.valve.geometry.thickening.thicken`.
     """
     closed = thicken(surface, normals)
     mesh = tetrahedralize(closed.vertices, closed.triangles, settings, store)

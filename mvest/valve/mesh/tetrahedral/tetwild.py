@@ -23,7 +23,7 @@ from mvest.errors import ConfigurationError, GeometryError, MeshingError
 from mvest.kept import Entry
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.surfaces import check_surface, enclosed_volume
+from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.mesh.quality import QualityReport, mesh_quality
 from mvest.valve.mesh.tetrahedral.cells import (
     content_sha256,

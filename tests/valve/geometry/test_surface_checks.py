@@ -3,13 +3,8 @@ import pytest
 
 from mvest.errors import GeometryError
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.geometry.surfaces import (
-    FACE_KINDS,
-    check_surface,
-    enclosed_volume,
-    smooth_vertex_normals,
-    thicken,
-)
+from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
+from mvest.valve.geometry.thickening import FACE_KINDS, smooth_vertex_normals, thicken
 
 
 def leaflet(shapes, vertices, triangles, thickness=1.2):

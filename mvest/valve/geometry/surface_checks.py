@@ -1,4 +1,4 @@
-"""Triangulated surfaces: checks, normals, volume, and thickening a midsurface to a closed surface.
+"""Whether a triangulation is a surface in good order, and what it encloses.
 
 Every fault of a surface is one `GeometryError` that begins with the fault's name and gives the
 numbers of the triangles, edges or vertices concerned.
@@ -6,31 +6,19 @@ numbers of the triangles, edges or vertices concerned.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
-from mvest.valve.geometry.proximity import intersecting_triangles, surface_edges
+from mvest.valve.geometry.proximity import intersecting_triangles
 
-__all__ = [
-    "FACE_KINDS",
-    "ClosedSurface",
-    "check_surface",
-    "enclosed_volume",
-    "smooth_vertex_normals",
-    "thicken",
-]
-
-FACE_KINDS = ("ventricular", "atrial", "rim")
-"""What a triangle of a thickened leaflet bounds."""
+__all__ = ["check_surface", "edge_table", "enclosed_volume", "listed"]
 
 
-def _listed(numbers: IntArray, count: int = 8) -> str:
+def listed(numbers: IntArray, count: int = 8) -> str:
+    """The first numbers in words, for a message."""
     shown = ", ".join(str(int(i)) for i in numbers[:count])
     return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > count else "")
 
@@ -97,11 +85,11 @@ def _check_arrays(points: FloatArray, faces: IntArray, name: str) -> None:
         raise GeometryError(f"{name}: no triangles; expected at least one")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise GeometryError(f"{name}: not finite: vertices {_listed(bad)}; expected numbers in mm")
+        raise GeometryError(f"{name}: not finite: vertices {listed(bad)}; expected numbers in mm")
     bad = np.flatnonzero(((faces < 0) | (faces >= len(points))).any(axis=1))
     if len(bad):
         raise GeometryError(
-            f"{name}: index out of range: triangles {_listed(bad)} name vertices outside 0 to "
+            f"{name}: index out of range: triangles {listed(bad)} name vertices outside 0 to "
             f"{len(points) - 1}"
         )
 
@@ -115,7 +103,7 @@ def _check_triangles(points: FloatArray, faces: IntArray, name: str) -> None:
     bad = np.flatnonzero(doubled_area <= 1e-6 * longest**2)
     if len(bad):
         raise GeometryError(
-            f"{name}: degenerate triangle: triangles {_listed(bad)} have no area or repeat a "
+            f"{name}: degenerate triangle: triangles {listed(bad)} have no area or repeat a "
             f"vertex; remove them"
         )
     _, first, count = np.unique(
@@ -123,12 +111,12 @@ def _check_triangles(points: FloatArray, faces: IntArray, name: str) -> None:
     )
     if (count > 1).any():
         raise GeometryError(
-            f"{name}: duplicate triangle: triangles {_listed(first[count > 1])} occur again with "
+            f"{name}: duplicate triangle: triangles {listed(first[count > 1])} occur again with "
             f"the same three vertices; keep one of each"
         )
 
 
-def _edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+def edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Half-edges ``(3 m, 2)``, edges ``(e, 2)``, the edge of each half-edge, and their number.
 
     Half-edge ``3 t + i`` runs from corner i of triangle t to the next.
@@ -141,13 +129,13 @@ def _edge_table(faces: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray
 
 
 def _check_edges(faces: IntArray, closed: bool, name: str) -> None:
-    half, edges, inverse, count = _edge_table(faces)
+    half, edges, inverse, count = edge_table(faces)
     if (count > 2).any():
         bad = np.flatnonzero(count > 2)
         owners = np.flatnonzero(np.isin(inverse, bad)) // 3
         raise GeometryError(
             f"{name}: non-manifold edge: {len(bad)} edges belong to more than two triangles, "
-            f"among them {edges[bad[:3]].tolist()} (triangles {_listed(np.unique(owners))})"
+            f"among them {edges[bad[:3]].tolist()} (triangles {listed(np.unique(owners))})"
         )
     forward = np.bincount(inverse, half[:, 0] < half[:, 1], minlength=len(edges))
     bad = np.flatnonzero((count == 2) & (forward != 1))
@@ -155,20 +143,20 @@ def _check_edges(faces: IntArray, closed: bool, name: str) -> None:
         owners = np.flatnonzero(np.isin(inverse, bad)) // 3
         raise GeometryError(
             f"{name}: inconsistent orientation: neighbours run the same way along {len(bad)} "
-            f"edges (triangles {_listed(np.unique(owners))}); orient all triangles alike"
+            f"edges (triangles {listed(np.unique(owners))}); orient all triangles alike"
         )
     if closed and (count == 1).any():
         bad = np.flatnonzero(count == 1)
         owners = np.flatnonzero(np.isin(inverse, bad)) // 3
         raise GeometryError(
             f"{name}: open surface: {len(bad)} boundary edges, at triangles "
-            f"{_listed(np.unique(owners))}; expected none"
+            f"{listed(np.unique(owners))}; expected none"
         )
 
 
 def _check_vertex_fans(faces: IntArray, name: str) -> None:
     """Raise where the triangles round a vertex do not form one fan (two sheets meet in a point)."""
-    _, _, inverse, count = _edge_table(faces)
+    _, _, inverse, count = edge_table(faces)
     order = np.argsort(inverse, kind="stable")
     ends = np.cumsum(count)
     second = order[ends[count == 2] - 1]
@@ -185,7 +173,7 @@ def _check_vertex_fans(faces: IntArray, name: str) -> None:
     if (number > 1).any():
         raise GeometryError(
             f"{name}: non-manifold vertex: sheets touch only in vertices "
-            f"{_listed(vertex[number > 1])}; split or remove them"
+            f"{listed(vertex[number > 1])}; split or remove them"
         )
 
 
@@ -201,134 +189,3 @@ def enclosed_volume(vertices: FloatArray, triangles: IntArray) -> float:
     points = np.asarray(vertices, dtype=np.float64)
     a, b, c = np.moveaxis((points - points.mean(axis=0))[triangles], 1, 0)
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
-
-
-def smooth_vertex_normals(
-    vertices: FloatArray, triangles: IntArray, iterations: int = 10
-) -> FloatArray:
-    """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
-
-    Each iteration replaces a normal by the normalised mean of itself and the mean of its
-    neighbours. Thickening along raw normals makes triangles cross where a leaflet bends sharply,
-    at the commissures above all.
-
-    Raises
-    ------
-    GeometryError
-        A vertex without triangles, or where opposite normals cancel.
-    """
-    if iterations < 0:
-        raise GeometryError(f"normal smoothing: {iterations} iterations; expected 0 or more")
-    n = len(vertices)
-    unused = np.setdiff1d(np.arange(n), triangles)
-    if len(unused):
-        raise GeometryError(f"normals: vertices {_listed(unused)} belong to no triangle")
-    edges = surface_edges(np.asarray(triangles))
-    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
-    adjacency = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    degree = np.asarray(adjacency.sum(axis=1)).ravel()
-    normals = vertex_normals(np.asarray(vertices, dtype=np.float64), np.asarray(triangles))
-    for _ in range(iterations):
-        mean = 0.5 * (normals + (adjacency @ normals) / degree[:, None])
-        length = np.linalg.norm(mean, axis=1)
-        bad = np.flatnonzero(~(length > 1e-6))
-        if len(bad):
-            raise GeometryError(f"normals: those round vertices {_listed(bad)} cancel each other")
-        normals = mean / length[:, None]
-    return normals
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClosedSurface:
-    """Outer surface of thickened leaflets, outward normals.
-
-    Attributes
-    ----------
-    vertices
-        ``(n, 3)`` mm.
-    triangles
-        ``(m, 3)``.
-    region
-        ``(m,)`` index into `region_names`.
-    region_names
-        Names of the leaflets.
-    kind
-        ``(m,)`` index into `FACE_KINDS`.
-
-    Raises
-    ------
-    GeometryError
-        The surface is not closed, manifold, outward and free of self-intersections, or labels are
-        missing or unknown.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
-    region: IntArray
-    region_names: tuple[str, ...]
-    kind: IntArray
-
-    def __post_init__(self) -> None:
-        check_surface(self.vertices, self.triangles, closed=True, name="closed surface")
-        for what, labels, known in (
-            ("region", self.region, self.region_names),
-            ("kind", self.kind, FACE_KINDS),
-        ):
-            labels = np.asarray(labels)
-            if labels.shape != (len(self.triangles),):
-                raise GeometryError(
-                    f"closed surface: {what} has shape {labels.shape}, expected "
-                    f"({len(self.triangles)},)"
-                )
-            bad = np.flatnonzero((labels < 0) | (labels >= len(known)))
-            if len(bad):
-                raise GeometryError(
-                    f"closed surface: unknown {what} at triangles {_listed(bad)}; known are "
-                    f"0 to {len(known) - 1} ({', '.join(known)})"
-                )
-
-    @property
-    def volume(self) -> float:
-        """Enclosed volume, mm³."""
-        return enclosed_volume(self.vertices, self.triangles)
-
-
-def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> ClosedSurface:
-    """Close a midsurface: offset both sides by half the thickness and stitch the rim.
-
-    Vertex ``i`` of the midsurface becomes vertices ``i`` (ventricular side, along the normal) and
-    ``i + n`` (atrial side). Every boundary edge, annulus and free edge alike, gives two rim
-    triangles.
-
-    Parameters
-    ----------
-    surface
-        Midsurface with thickness; normals towards the ventricle.
-    normals
-        ``(n, 3)`` unit offset directions; default `smooth_vertex_normals`.
-
-    Raises
-    ------
-    GeometryError
-        The midsurface is faulty, or the thickened one passes through itself (thickness larger than
-        the radius of curvature).
-    """
-    check_surface(surface.vertices, surface.triangles, name="midsurface")
-    if normals is None:
-        normals = smooth_vertex_normals(surface.vertices, surface.triangles)
-    n = len(surface.vertices)
-    offset = 0.5 * surface.thickness[:, None] * normals
-    half, _, inverse, count = _edge_table(surface.triangles)
-    boundary = np.flatnonzero(count[inverse] == 1)
-    a, b = half[boundary].T
-    rim = np.concatenate([np.column_stack([b, a, a + n]), np.column_stack([b, a + n, b + n])])
-    m = len(surface.triangles)
-    return ClosedSurface(
-        vertices=np.concatenate([surface.vertices + offset, surface.vertices - offset]),
-        triangles=np.concatenate([surface.triangles, surface.triangles[:, ::-1] + n, rim]),
-        region=np.concatenate(
-            [surface.region, surface.region, np.tile(surface.region[boundary // 3], 2)]
-        ),
-        region_names=surface.region_names,
-        kind=np.repeat(np.arange(3), [m, m, len(rim)]),
-    )

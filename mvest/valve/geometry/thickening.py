@@ -1,0 +1,155 @@
+"""Thickening a midsurface to the closed surface of its leaflets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
+from mvest.valve.geometry.proximity import surface_edges
+from mvest.valve.geometry.surface_checks import (
+    check_surface,
+    edge_table,
+    enclosed_volume,
+    listed,
+)
+
+__all__ = ["FACE_KINDS", "ClosedSurface", "smooth_vertex_normals", "thicken"]
+
+FACE_KINDS = ("ventricular", "atrial", "rim")
+"""What a triangle of a thickened leaflet bounds."""
+
+
+def smooth_vertex_normals(
+    vertices: FloatArray, triangles: IntArray, iterations: int = 10
+) -> FloatArray:
+    """Unit normals ``(n, 3)`` after Laplacian smoothing over neighbouring vertices.
+
+    Each iteration replaces a normal by the normalised mean of itself and the mean of its
+    neighbours. Thickening along raw normals makes triangles cross where a leaflet bends sharply,
+    at the commissures above all.
+
+    Raises
+    ------
+    GeometryError
+        A vertex without triangles, or where opposite normals cancel.
+    """
+    if iterations < 0:
+        raise GeometryError(f"normal smoothing: {iterations} iterations; expected 0 or more")
+    n = len(vertices)
+    unused = np.setdiff1d(np.arange(n), triangles)
+    if len(unused):
+        raise GeometryError(f"normals: vertices {listed(unused)} belong to no triangle")
+    edges = surface_edges(np.asarray(triangles))
+    rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
+    adjacency = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    normals = vertex_normals(np.asarray(vertices, dtype=np.float64), np.asarray(triangles))
+    for _ in range(iterations):
+        mean = 0.5 * (normals + (adjacency @ normals) / degree[:, None])
+        length = np.linalg.norm(mean, axis=1)
+        bad = np.flatnonzero(~(length > 1e-6))
+        if len(bad):
+            raise GeometryError(f"normals: those round vertices {listed(bad)} cancel each other")
+        normals = mean / length[:, None]
+    return normals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedSurface:
+    """Outer surface of thickened leaflets, outward normals.
+
+    Attributes
+    ----------
+    vertices
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    region
+        ``(m,)`` index into `region_names`.
+    region_names
+        Names of the leaflets.
+    kind
+        ``(m,)`` index into `FACE_KINDS`.
+
+    Raises
+    ------
+    GeometryError
+        The surface is not closed, manifold, outward and free of self-intersections, or labels are
+        missing or unknown.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray
+    region_names: tuple[str, ...]
+    kind: IntArray
+
+    def __post_init__(self) -> None:
+        check_surface(self.vertices, self.triangles, closed=True, name="closed surface")
+        for what, labels, known in (
+            ("region", self.region, self.region_names),
+            ("kind", self.kind, FACE_KINDS),
+        ):
+            labels = np.asarray(labels)
+            if labels.shape != (len(self.triangles),):
+                raise GeometryError(
+                    f"closed surface: {what} has shape {labels.shape}, expected "
+                    f"({len(self.triangles)},)"
+                )
+            bad = np.flatnonzero((labels < 0) | (labels >= len(known)))
+            if len(bad):
+                raise GeometryError(
+                    f"closed surface: unknown {what} at triangles {listed(bad)}; known are "
+                    f"0 to {len(known) - 1} ({', '.join(known)})"
+                )
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume, mm³."""
+        return enclosed_volume(self.vertices, self.triangles)
+
+
+def thicken(surface: LeafletSurface, normals: FloatArray | None = None) -> ClosedSurface:
+    """Close a midsurface: offset both sides by half the thickness and stitch the rim.
+
+    Vertex ``i`` of the midsurface becomes vertices ``i`` (ventricular side, along the normal) and
+    ``i + n`` (atrial side). Every boundary edge, annulus and free edge alike, gives two rim
+    triangles.
+
+    Parameters
+    ----------
+    surface
+        Midsurface with thickness; normals towards the ventricle.
+    normals
+        ``(n, 3)`` unit offset directions; default `smooth_vertex_normals`.
+
+    Raises
+    ------
+    GeometryError
+        The midsurface is faulty, or the thickened one passes through itself (thickness larger than
+        the radius of curvature).
+    """
+    check_surface(surface.vertices, surface.triangles, name="midsurface")
+    if normals is None:
+        normals = smooth_vertex_normals(surface.vertices, surface.triangles)
+    n = len(surface.vertices)
+    offset = 0.5 * surface.thickness[:, None] * normals
+    half, _, inverse, count = edge_table(surface.triangles)
+    boundary = np.flatnonzero(count[inverse] == 1)
+    a, b = half[boundary].T
+    rim = np.concatenate([np.column_stack([b, a, a + n]), np.column_stack([b, a + n, b + n])])
+    m = len(surface.triangles)
+    return ClosedSurface(
+        vertices=np.concatenate([surface.vertices + offset, surface.vertices - offset]),
+        triangles=np.concatenate([surface.triangles, surface.triangles[:, ::-1] + n, rim]),
+        region=np.concatenate(
+            [surface.region, surface.region, np.tile(surface.region[boundary // 3], 2)]
+        ),
+        region_names=surface.region_names,
+        kind=np.repeat(np.arange(3), [m, m, len(rim)]),
+    )
