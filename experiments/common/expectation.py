@@ -15,11 +15,11 @@ from experiments.common.progress import SolveBar
 from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
-from mvest.personalise.chain import foresee_case
-from mvest.problem.expectation import Foresight, foresee, foresee_model
+from mvest.personalise.chain import expect_case
+from mvest.problem.expectation import Expectation, expect, expect_of_model
 from mvest.problem.synthetic import simulate_observation
 from mvest.provenance import config_hash
-from mvest.reporting.expectation import foresight_text
+from mvest.reporting.expectation import expectation_text
 from mvest.typing import FloatArray
 
 __all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "told"]
@@ -59,7 +59,7 @@ class TwinForesight:
         return told(title, _foreseen(twin, self._known[key], start), _noise(config))
 
 
-def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Foresight | str:
+def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Expectation | str:
     """What to expect where the model is known at the start alone; the reason if it is not."""
 
     def model(m: FloatArray) -> Prediction:
@@ -78,7 +78,7 @@ def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Foresight | s
         rng=np.random.default_rng(0),
     )
     assert data.observation is not None
-    return foresee(replace(twin.problem, model=model), data.observation)
+    return expect(replace(twin.problem, model=model), data.observation)
 
 
 def _noise(config: Values) -> str:
@@ -100,7 +100,7 @@ def foresee_own(config: Values, _folder: Path | None = None) -> str:
     case, settings = read_configured(config), settings_of(config)
     store = Path(config["paths"]["outputs"]) / "meshes"
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        found = foresee_case(case, settings, store=store, on_step=bar.step)
+        found = expect_case(case, settings, store=store, on_step=bar.step)
     doubt = case.uncertainty
     length = doubt.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"
@@ -121,7 +121,7 @@ def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
     model = cycle_model(config)
     with SolveBar(config["name"], len(model.protocol.steps()), 1) as bar:
         model.closure.on_step = bar.step
-        found = foresee_model(
+        found = expect_of_model(
             stored_cycle(config, model),
             prior,
             noise**2,
@@ -134,7 +134,7 @@ def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
     )
 
 
-def told(title: str, found: Foresight | str, noise: str) -> str:
+def told(title: str, found: Expectation | str, noise: str) -> str:
     """A foresight as text."""
     if isinstance(found, str) or found.data is None:
         reason = found if isinstance(found, str) else found.reason
@@ -142,7 +142,7 @@ def told(title: str, found: Foresight | str, noise: str) -> str:
             f"{title}: what the data will tell is not known, the model has no prediction at the "
             f"assumed parameters ({reason})"
         )
-    return foresight_text(
+    return expectation_text(
         title,
         found.assumed,
         found.prior,

@@ -18,7 +18,7 @@ from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
 __all__ = ["ErrorSamples", "Frame", "Role", "Uncertainty", "ValveCase"]
 
-FEWEST_SAMPLES, MOST_SAMPLES = 4, 500
+MIN_SAMPLES, MAX_SAMPLES = 4, 500
 LARGEST_ERROR = 20.0
 """mm, displacement of a point in any sample."""
 
@@ -173,10 +173,8 @@ class ErrorSamples:
                 f"error samples: {self.vertices.shape[:2]} samples and frames of the vertices, "
                 f"{self.tips.shape[:2]} of the tips; expected as many"
             )
-        if not FEWEST_SAMPLES <= len(self) <= MOST_SAMPLES:
-            raise InputError(
-                f"{len(self)} error samples, expected {FEWEST_SAMPLES} to {MOST_SAMPLES}"
-            )
+        if not MIN_SAMPLES <= len(self) <= MAX_SAMPLES:
+            raise InputError(f"{len(self)} error samples, expected {MIN_SAMPLES} to {MAX_SAMPLES}")
 
     def __len__(self) -> int:
         return len(self.vertices)

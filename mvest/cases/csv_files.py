@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.cases.schema import LARGEST_NUMBER
+from mvest.cases.schema import MAX_NUMBER
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
@@ -56,10 +56,10 @@ def numbers(file: Path, name: str, cells: Sequence[str]) -> FloatArray:
             value = float(cell)
         except ValueError:
             value = math.nan
-        if not abs(value) <= LARGEST_NUMBER:
+        if not abs(value) <= MAX_NUMBER:
             raise InputError(
                 f"{file}: {name} of row {row} is {cell[:40]!r}, expected a finite number "
-                f"(at most {LARGEST_NUMBER:g})"
+                f"(at most {MAX_NUMBER:g})"
             )
         result.append(value)
     return np.array(result, dtype=np.float64)

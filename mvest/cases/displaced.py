@@ -48,7 +48,7 @@ def displaced_case(case: ValveCase, sample: int) -> ValveCase:
     )
     number = next(k for k, frame in enumerate(case.frames) if frame.role is Role.REFERENCE)
     surface = replace(case.surface, vertices=frames[number].vertices)
-    # What is told of the errors is of the case as it was seen.
+    # What is stated of the errors is of the case as it was seen.
     moved = replace(case, surface=surface, frames=frames, error_samples=None)
     return replace(moved, chordae=_chordae(case, moved, moves[number]))
 

@@ -1,7 +1,7 @@
 """The two edges of a leaflet band, its commissures, and matching one annulus to another.
 
 All loops run in the direction of their triangles. With normals towards the ventricle in both
-frames, two such loops run alike, so that commissures are told apart by which region begins there.
+frames, two such loops run alike, so that commissures differ by which region begins there.
 """
 
 from __future__ import annotations

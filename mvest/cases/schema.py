@@ -17,7 +17,7 @@ from mvest.cases.yaml_file import read_yaml
 from mvest.errors import InputError
 
 __all__ = [
-    "LARGEST_NUMBER",
+    "MAX_NUMBER",
     "VERSION",
     "CaseFile",
     "ChordaeEntry",
@@ -32,9 +32,9 @@ __all__ = [
 
 VERSION = 1
 """The version of the format that is read and written."""
-LARGEST_NUMBER = 1e9
+MAX_NUMBER = 1e9
 """Of any number in a case, whatever its unit: far beyond sense, and far from overflow."""
-LONGEST_FAULT = 800
+MAX_FAULT_LENGTH = 800
 """Characters; what other libraries say of a damaged file may quote much of it."""
 
 
@@ -49,10 +49,8 @@ def _kind(value: Any) -> str:
     return "<text>" if isinstance(value, str) else "<number>"
 
 
-Number = Annotated[
-    float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)
-]
-NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST_NUMBER)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_NUMBER)]
 Text = Annotated[str, Field(strict=True)]
 Name = Annotated[str, Field(strict=True, min_length=1)]
 Index = Annotated[int, Field(strict=True, ge=0)]
@@ -221,7 +219,9 @@ def case_schema() -> dict[str, Any]:
 def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
     """The error for one field of a case: file, field, and what is wrong with it, in one line."""
     line = " ".join(what.split())
-    return kind(f"{file}: {field}: {line if len(line) <= LONGEST_FAULT else line[:LONGEST_FAULT]}")
+    return kind(
+        f"{file}: {field}: {line if len(line) <= MAX_FAULT_LENGTH else line[:MAX_FAULT_LENGTH]}"
+    )
 
 
 def read_case_file(file: Path) -> CaseFile:

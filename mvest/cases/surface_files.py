@@ -19,7 +19,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mvest.cases.schema import LARGEST_NUMBER
+from mvest.cases.schema import MAX_NUMBER
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
@@ -90,10 +90,10 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
 
 def _read(file: Path) -> SurfaceFile:
     found = read_surface(file)
-    far = np.flatnonzero((np.abs(found.vertices) > LARGEST_NUMBER).any(axis=1))
+    far = np.flatnonzero((np.abs(found.vertices) > MAX_NUMBER).any(axis=1))
     if len(far):
         raise GeometryError(
-            f"{file}: points {far[:5].tolist()} have coordinates beyond {LARGEST_NUMBER:g}"
+            f"{file}: points {far[:5].tolist()} have coordinates beyond {MAX_NUMBER:g}"
         )
     for data, rows in (
         (found.cell_data, len(found.triangles)),

@@ -15,7 +15,7 @@ from mvest.errors import InputError
 
 __all__ = ["read_yaml"]
 
-LARGEST_FILE = 1_000_000
+MAX_FILE_SIZE = 1_000_000
 """Bytes; a description of a case is a few thousand."""
 DEEPEST_NESTING = 20
 
@@ -33,8 +33,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = path.read_bytes()
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
-    if len(content) > LARGEST_FILE:
-        raise InputError(f"{path}: {len(content)} bytes, expected at most {LARGEST_FILE}")
+    if len(content) > MAX_FILE_SIZE:
+        raise InputError(f"{path}: {len(content)} bytes, expected at most {MAX_FILE_SIZE}")
     try:
         text = content.decode("utf-8")
         _check_events(path, text)

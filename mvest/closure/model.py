@@ -332,14 +332,14 @@ class ClosureModel:
         """
         closure = self.close(m, sensitivities=False)
         system, simulation = closure.system, closure.simulation
-        found: list[FloatArray | None] = []
+        frames: list[FloatArray | None] = []
         for state in states:
             loading = held_loading(system, self.contact_valve, state)
             if simulation.converged:
                 simulation = self._rest(system, loading, simulation.frames[-1])
             converged = simulation.converged
-            found.append(self.observed(simulation.frames[-1]) if converged else None)
-        return found
+            frames.append(self.observed(simulation.frames[-1]) if converged else None)
+        return frames
 
     def _rest(
         self, system: System, loading: Callable[[float], Loads], start: FloatArray

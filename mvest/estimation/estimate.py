@@ -234,7 +234,7 @@ class Filter(Protocol):
         """Estimate the parameters of `model` from the observation y (n,) with noise R.
 
         `prior` is N(m, P) of the parameters themselves, `transform` (default `Identity`) chooses
-        the coordinates to work in, `on_iterate` is told of each iterate.
+        the coordinates to work in, `on_iterate` is called with each iterate.
         """
         ...
 

@@ -2,7 +2,7 @@
 
 Errors of what a model is built from are alike all over an observation, and known by a few samples
 only. K samples d₁ ... d_K of the error of the innovation y − h, which is all of it, could be added
-to the noise as R + 1/K Σ d dᵀ. But a filter that is told so avoids the K directions that it was
+to the noise as R + 1/K Σ d dᵀ. But a filter that assumes so avoids the K directions that it was
 shown, and is as sure as if there were no other: with twelve samples its intervals of 95 % held the
 truth in 70 % (simulated). So the noise is what the filter weighs with, and no more. The covariance
 of its estimate is taken from the samples themselves, through a gain K that has not seen them::

@@ -131,12 +131,12 @@ def filter_frames(
     known = prior
     for k, frame in enumerate(frames):
         predicted = Gaussian(known.mean, known.covariance + walk) if k else known
-        found = kalman_update(predicted, frame.y - frame.H @ predicted.mean, frame.H, frame.noise)
-        known = found.posterior
+        update = kalman_update(predicted, frame.y - frame.H @ predicted.mean, frame.H, frame.noise)
+        known = update.posterior
         gain = _log_determinant(frame, predicted)
         states.append(
             FrameState(
-                predicted, known, found.nis, frame.noise.size, found.log_likelihood, 0.5 * gain
+                predicted, known, update.nis, frame.noise.size, update.log_likelihood, 0.5 * gain
             )
         )
     return tuple(states)

@@ -54,7 +54,7 @@ RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.
 ANSWERS = (RESPONSE, OBSERVATION, JACOBIAN)
 
 COORDINATES = ("x", "y", "z")
-LARGEST_JSON = 1_000_000
+MAX_JSON_SIZE = 1_000_000
 """Bytes of a response; more is none."""
 
 
@@ -72,7 +72,7 @@ class RunRequest:
     jacobian : bool
         Whether derivatives are of use.
     settings : mapping
-        Whatever else the program is to be told; plain data.
+        Whatever else the program needs; plain data.
 
     Raises
     ------
@@ -236,9 +236,9 @@ def _read_json(file: Path) -> dict[str, Any]:
     """A mapping of this format and version."""
     try:
         with file.open("rb") as stream:
-            text = stream.read(LARGEST_JSON + 1)
-        if len(text) > LARGEST_JSON:
-            raise InputError(f"{file.name}: more than {LARGEST_JSON} bytes")
+            text = stream.read(MAX_JSON_SIZE + 1)
+        if len(text) > MAX_JSON_SIZE:
+            raise InputError(f"{file.name}: more than {MAX_JSON_SIZE} bytes")
         data = json.loads(text, parse_constant=_refuse)
     except FileNotFoundError as error:
         raise InputError(f"{file.name} is missing") from error

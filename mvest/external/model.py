@@ -57,8 +57,8 @@ class ProcessModel:
     units : sequence of str, optional
         Of the parameters; empty if not given.
     points : ndarray, optional
-        ``(n, 3)`` mm reference positions of the points to be observed, where the program has to be
-        told.
+        ``(n, 3)`` mm reference positions of the points to be observed, where the program
+        needs them.
     settings : mapping, optional
         Plain data for the program, handed on as they are.
     differences : Differences or None

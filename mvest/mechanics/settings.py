@@ -1,4 +1,4 @@
-"""What the mechanics are told besides valve, mesh and unknowns: tissue, closure, numerics."""
+"""Settings of the mechanics besides valve, mesh and unknowns: tissue, closure, numerics."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Each error is a frozen value that changes observed positions. Errors are applied one after another,
 with one random generator; a vertex that is not seen has the position NaN from then on. What a
-filter is told about them is configured apart from them.
+filter assumes of them is configured apart from them.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ class CoaptationDropout:
             others = np.flatnonzero(own != region)
             triangles = surface.triangles[surface.region == region]
             if others.size and len(triangles):
-                found = closest_points(vertices[others], vertices, triangles)
-                near[others[found.distance < self.distance]] = True
+                closest = closest_points(vertices[others], vertices, triangles)
+                near[others[closest.distance < self.distance]] = True
         return near
 
 

@@ -444,15 +444,17 @@ def _curve(what: str, values: FloatArray) -> FloatArray:
     return curve
 
 
-def _numbers(what: str, values: IntArray, least: int, most: int | None) -> IntArray:
+def _numbers(what: str, values: IntArray, minimum: int, maximum: int | None) -> IntArray:
     given = np.asarray(values)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"{what}: {given.dtype}, expected integers")
     numbers = np.array(given, dtype=np.int64)
-    if numbers.size and (numbers.min() < least or (most is not None and numbers.max() > most)):
+    if numbers.size and (
+        numbers.min() < minimum or (maximum is not None and numbers.max() > maximum)
+    ):
         raise InputError(
-            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {least} to "
-            f"{'any' if most is None else most}"
+            f"{what}: numbers from {numbers.min()} to {numbers.max()}, expected {minimum} to "
+            f"{'any' if maximum is None else maximum}"
         )
     numbers.setflags(write=False)
     return numbers

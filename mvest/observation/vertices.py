@@ -66,11 +66,11 @@ class Observation:
         require_finite(variance, "R")
         if np.any(variance <= 0.0):
             raise InputError(f"R = {variance.min():g} mm^2, expected > 0")
-        told = self.correlation
-        if told is not None and len(told.points) != positions.shape[1]:
+        correlation = self.correlation
+        if correlation is not None and len(correlation.points) != positions.shape[1]:
             raise InputError(
-                f"R is correlated between {len(told.points)} vertices, but {positions.shape[1]} "
-                f"are observed"
+                f"R is correlated between {len(correlation.points)} vertices, but "
+                f"{positions.shape[1]} are observed"
             )
         for name, values in (("positions", positions), ("variance", variance)):
             values.setflags(write=False)
@@ -113,8 +113,8 @@ class Observation:
     def R(self) -> NoiseCovariance:
         """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
         counts = 3 * self.seen.sum(axis=1)
-        told = self.correlation
-        if told is None:
+        correlation = self.correlation
+        if correlation is None:
             variance = np.repeat(self.variance, counts)
             if self.scale is None:
                 return variance
@@ -126,7 +126,7 @@ class Observation:
         for seen, variance in zip(self.seen, self.variance, strict=True):
             if not seen.any():
                 continue
-            noise = told.of(seen).noise(float(variance), 3)
+            noise = correlation.of(seen).noise(float(variance), 3)
             if self.scale is not None:
                 noise = scaled_noise(noise, np.repeat(self.scale[seen], 3))
             blocks.append(noise)

@@ -1,4 +1,4 @@
-from .chain import foresee_case as foresee_case
+from .chain import expect_case as expect_case
 from .chain import personalise_case as personalise_case
 from .model import build_model as build_model
 from .result import FrameDistance as FrameDistance

@@ -42,18 +42,18 @@ from mvest.personalise.model import build_model
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.expectation import Foresight, foresee
+from mvest.problem.expectation import Expectation, expect
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.band import Band
 
-__all__ = ["foresee_case", "personalise_case"]
+__all__ = ["expect_case", "personalise_case"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
 
-MOST_VERTICES = 2000
+MAX_VERTICES = 2000
 """Vertices of a frame that are compared: more, nearer to each other than errors are alike, say
 nothing new, and their correlation is factorised."""
 
@@ -144,19 +144,19 @@ def personalise_case(
     )
 
 
-def foresee_case(
+def expect_case(
     case: ValveCase,
     settings: PersonaliseSettings,
     *,
     store: Path | None = None,
     on_step: OnStep | None = None,
-) -> Foresight:
+) -> Expectation:
     """What the closed frame of a case will tell, found out with one closure; see `personalise`.
 
     Errors that samples of the frames tell of are left out: each sample would be a closure.
     """
     chain = _Chain(case, settings, store, on_step)
-    return foresee(chain.problem(chain.filter), chain.plain_observation())
+    return expect(chain.problem(chain.filter), chain.plain_observation())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,14 +212,14 @@ class _Chain:
             Both frames as predicted at the start, stacked.
         """
         start = self.shared.start
-        self.geometry = found = sample_geometry(
+        self.geometry = geometry = sample_geometry(
             self.case, self.settings, self.registered.mechanical(start), store=self.store
         )
-        if found.too_few:
-            raise GeometryError(f"case {self.case.name}: {found.too_few}")
+        if geometry.too_few:
+            raise GeometryError(f"case {self.case.name}: {geometry.too_few}")
         observation = self.plain_observation()
         base = observation_noise(observation.R, len(observation.y))
-        self.errors = SampledErrors(base, errors_of(observation, self.closed, generic, found))
+        self.errors = SampledErrors(base, errors_of(observation, self.closed, generic, geometry))
 
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""
@@ -235,11 +235,11 @@ class _Chain:
         moduli of two simulated patients then came out two to four times too high, and the fitted
         valve farther from the frame than the generic one.
         """
-        told = self.case.uncertainty
-        frame, std = self.closed, told.typical_mm
+        uncertainty = self.case.uncertainty
+        frame, std = self.closed, uncertainty.typical_mm
         sampled = self.case.error_samples is not None and not stated
-        length = 0.0 if sampled else told.correlation_length_mm
-        scale = told.std_mm / std if isinstance(told.std_mm, np.ndarray) else None
+        length = 0.0 if sampled else uncertainty.correlation_length_mm
+        scale = uncertainty.std_mm / std if isinstance(uncertainty.std_mm, np.ndarray) else None
         kept = _thinned(len(frame.vertices))
         if self.corresponding:
             correlation = (
@@ -254,7 +254,7 @@ class _Chain:
             frame.free_edge,
             scale=None if scale is None else scale[kept],
         )
-        if told.correlation_length_mm > 0:
+        if uncertainty.correlation_length_mm > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
             border = BORDER * std * (1.0 if points.scale is None else points.scale)
             near = replace(points, annulus=frame.annulus).inner(border)
@@ -308,8 +308,8 @@ class _Chain:
         filtered = result.filtered
         if self.errors is None or filtered is None or filtered.prediction is None:
             return None
-        found = self.sampled_posterior(filtered)
-        share = np.diag(found.from_samples) / np.diag(found.covariance)
+        posterior = self.sampled_posterior(filtered)
+        share = np.diag(posterior.from_samples) / np.diag(posterior.covariance)
         return share[[u.is_modulus for u in self.unknowns]]
 
     def estimate_moduli(
@@ -359,14 +359,14 @@ class _Chain:
             Predicted frames at ``m``, stacked, the closed one last.
         """
         n = len(self.case.surface.vertices)
-        found = {self.closed.name: closed.reshape(-1, n, 3)[-1]}
+        frames = {self.closed.name: closed.reshape(-1, n, 3)[-1]}
         states = [self.held_state(frame) for frame in self.case.held_out]
         if states:
             held = self.model.held(self.registered.mechanical(m), states)
             for frame, points in zip(self.case.held_out, held, strict=True):
                 if points is not None:
-                    found[frame.name] = self.registered.seen(points, m)
-        return found
+                    frames[frame.name] = self.registered.seen(points, m)
+        return frames
 
     def compared(
         self, generic: Mapping[str, FloatArray], fitted: Mapping[str, FloatArray]
@@ -439,39 +439,39 @@ class _Chain:
         def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
             if self.errors is None:
                 return linear(P, scale)
-            found = self.errors.posterior(H * scale, P).covariance
-            return np.sqrt(np.diag(found))[moduli]
+            covariance = self.errors.posterior(H * scale, P).covariance
+            return np.sqrt(np.diag(covariance))[moduli]
 
-        found = {"now": std(prior.covariance)}
+        stds = {"now": std(prior.covariance)}
         for words, members in groups.items():
             known = np.isin(self.names, members)
             if known.any():
                 P = np.array(prior.covariance)
                 P[known] = 0.0
                 P[:, known] = 0.0
-                found[words] = std(P)
-        found["half the error of the image"] = std(prior.covariance, 2.0)
-        found["a frame without error"] = std(prior.covariance, 1e3)
+                stds[words] = std(P)
+        stds["half the error of the image"] = std(prior.covariance, 2.0)
+        stds["a frame without error"] = std(prior.covariance, 1e3)
         if self.errors is not None:
-            found["geometry known exactly"] = linear(prior.covariance)
-        return found
+            stds["geometry known exactly"] = linear(prior.covariance)
+        return stds
 
     def confirm(self, result: StudyResult) -> float | None:
         """Largest distance (mm) of the fitted closed valve from one closed from the open state."""
         assert result.estimate is not None
         assert result.fitted is not None
         anew = replace(self.model, continuation=False, guide=None, repeat=True)
-        found = RegisteredModel(anew, self.names)(result.estimate)
-        if not found.converged:
+        prediction = RegisteredModel(anew, self.names)(result.estimate)
+        if not prediction.converged:
             return None
-        closed = found.y.reshape(2, -1, 3)[1]
+        closed = prediction.y.reshape(2, -1, 3)[1]
         return float(np.linalg.norm(closed - result.fitted[-1], axis=1).max())
 
 
 def _thinned(n: int) -> BoolArray:
     """Which of n vertices are compared: all, or evenly spread ones if there are very many."""
     kept = np.zeros(n, dtype=np.bool_)
-    kept[:: -(-n // MOST_VERTICES)] = True
+    kept[:: -(-n // MAX_VERTICES)] = True
     return kept
 
 

@@ -31,8 +31,8 @@ from mvest.typing import FloatArray
 
 __all__ = ["GeometryErrors", "WeighedObservation", "errors_of", "sample_geometry"]
 
-MOST_FAILURES = 0.25
-"""Share of the samples that need not close; those that do not are counted and told."""
+MAX_FAILED_SHARE = 0.25
+"""Share of the samples that need not close; those that do not are counted and reported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +61,11 @@ class GeometryErrors:
     @property
     def too_few(self) -> str:
         """Why the samples that closed do not stand for all; empty if they do."""
-        if len(self.failures) <= MOST_FAILURES * self.asked and len(self.predicted) >= 2:
+        if len(self.failures) <= MAX_FAILED_SHARE * self.asked and len(self.predicted) >= 2:
             return ""
         return (
             f"{len(self.failures)} of {self.asked} error samples do not close, expected at most "
-            f"{MOST_FAILURES:.0%}; the first: {self.failures[0]}"
+            f"{MAX_FAILED_SHARE:.0%}; the first: {self.failures[0]}"
         )
 
 
@@ -104,13 +104,13 @@ def sample_geometry(
     predicted, seen, failures = [], [], []
     for k in range(len(samples)):
         try:
-            found = _closed(build_coarse(displaced_case(case, k), settings, store), m)
+            closed = _closed(build_coarse(displaced_case(case, k), settings, store), m)
         except MvestError as fault:
-            found = str(fault)
-        if isinstance(found, str):
-            failures.append(f"sample {k}: {found}")
+            closed = str(fault)
+        if isinstance(closed, str):
+            failures.append(f"sample {k}: {closed}")
         else:
-            predicted.append(found - first)
+            predicted.append(closed - first)
             seen.append(samples.vertices[k, number])
         if on_sample is not None:
             on_sample(k + 1)
@@ -120,12 +120,12 @@ def sample_geometry(
 
 def _closed(model: ClosureModel, m: FloatArray) -> FloatArray | str:
     """Vertices ``(n, 3)`` mm of the closed valve, or why there are none."""
-    found = model(m)
-    return found.y.reshape(2, -1, 3)[1] if found.converged else found.reason
+    prediction = model(m)
+    return prediction.y.reshape(2, -1, 3)[1] if prediction.converged else prediction.reason
 
 
 def errors_of(
-    observation: Observed, closed: Frame, generic: FloatArray, found: GeometryErrors
+    observation: Observed, closed: Frame, generic: FloatArray, geometry: GeometryErrors
 ) -> FloatArray:
     """Samples of the error of an observation's innovation ``(k, K)`` mm, one in each column.
 
@@ -136,11 +136,11 @@ def errors_of(
     closed : Frame
     generic : array
         Both frames as they are predicted, stacked.
-    found : GeometryErrors
+    geometry : GeometryErrors
         About this prediction.
     """
     if isinstance(observation, Observation):
-        moved = found.predicted - found.seen
+        moved = geometry.predicted - geometry.seen
         return np.asarray(moved[:, observation.seen[0]].reshape(len(moved), -1).T)
     assert isinstance(observation, SurfaceObservation)
     points = observation.seen[-1]
@@ -155,7 +155,7 @@ def errors_of(
 
     first = distances(plain, np.zeros(half))
     columns = []
-    for predicted, seen in zip(found.predicted, found.seen, strict=True):
+    for predicted, seen in zip(geometry.predicted, geometry.seen, strict=True):
         there = replace(
             points,
             points=points.points + seen[at],

@@ -130,7 +130,7 @@ class StudyResult:
         if self.estimate is None or self.std is None:
             return ()
         truth = None if self.truth is None else self.truth.values
-        found = []
+        moduli = []
         for k, parameter in enumerate(self.parameters):
             kind, _, region = parameter.partition(".")
             if kind != "E_f":
@@ -138,7 +138,7 @@ class StudyResult:
             unit = self.tissue[region].material(1.0)
             for name, factor in (("E_f", 1.0), ("E_perp", unit.E_p), ("G", unit.G)):
                 true = None if truth is None else factor * float(truth[k])
-                found.append(
+                moduli.append(
                     Modulus(
                         region,
                         name,
@@ -147,7 +147,7 @@ class StudyResult:
                         true,
                     )
                 )
-        return tuple(found)
+        return tuple(moduli)
 
 
 def estimate(

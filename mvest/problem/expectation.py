@@ -19,11 +19,11 @@ from mvest.estimation.transform import Transform, to_filter
 from mvest.problem.problem import Observed, Problem
 from mvest.typing import FloatArray
 
-__all__ = ["Foresight", "foresee", "foresee_model"]
+__all__ = ["Expectation", "expect", "expect_of_model"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Foresight:
+class Expectation:
     """What can be expected of an estimation, or why that is not known.
 
     Attributes
@@ -72,7 +72,7 @@ class Foresight:
         return self.transform.inverse(z - reach), self.transform.inverse(z + reach)
 
 
-def foresee(problem: Problem, observation: Observed) -> Foresight:
+def expect(problem: Problem, observation: Observed) -> Expectation:
     """Expected intervals of an estimation that is not run.
 
     Parameters
@@ -83,7 +83,7 @@ def foresee(problem: Problem, observation: Observed) -> Foresight:
         Which points are seen, and how well; the values that were seen play no part where points
         correspond.
     """
-    return foresee_model(
+    return expect_of_model(
         observation.of(problem.model),
         problem.prior,
         observation.R,
@@ -93,7 +93,7 @@ def foresee(problem: Problem, observation: Observed) -> Foresight:
     )
 
 
-def foresee_model(
+def expect_of_model(
     model: ObservationModel,
     prior: Gaussian,
     R: NoiseCovariance,
@@ -101,7 +101,7 @@ def foresee_model(
     parameters: tuple[str, ...],
     transform: Transform,
     frames: tuple[str, ...],
-) -> Foresight:
+) -> Expectation:
     """Expected intervals of an estimation of any model that is not run.
 
     Parameters
@@ -113,7 +113,7 @@ def foresee_model(
     R : noise covariance
         Of the observation.
     parameters, transform, frames
-        See `Foresight`.
+        See `Expectation`.
     """
     # As filters start, whose first prediction may be shared.
     assumed = transform.inverse(transform.forward(prior.mean))
@@ -127,7 +127,7 @@ def foresee_model(
             inner = to_filter(transform, prior).covariance
             known = Gaussian(assumed, inner * np.outer(D, D))
             informed = identifiability(predicted.jacobian, R, scale, prior=known, names=parameters)
-    return Foresight(
+    return Expectation(
         parameters,
         assumed,
         prior,

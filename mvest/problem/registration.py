@@ -114,16 +114,16 @@ class RegisteredModel:
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict, as an ``ObservationModel`` does."""
-        found = self.model(self.mechanical(m))
-        if not found.converged:
-            return found
-        half = len(found.y) // 2
-        closed = found.y[half:].reshape(-1, 3)
+        prediction = self.model(self.mechanical(m))
+        if not prediction.converged:
+            return prediction
+        half = len(prediction.y) // 2
+        closed = prediction.y[half:].reshape(-1, 3)
         registration = registration_of(self.names, m)
         turn = Rotation.from_rotvec(registration[3:], degrees=True).as_matrix()
-        by_own = found.jacobian[half:].reshape(len(closed), 3, -1)
-        jacobian = np.zeros((len(found.y), len(self.names)))
-        jacobian[:half, self._own] = found.jacobian[:half]
+        by_own = prediction.jacobian[half:].reshape(len(closed), 3, -1)
+        jacobian = np.zeros((len(prediction.y), len(self.names)))
+        jacobian[:half, self._own] = prediction.jacobian[:half]
         jacobian[half:, self._own] = np.einsum("ij,njp->nip", turn, by_own).reshape(half, -1)
         turns = _turn_derivatives(np.deg2rad(registration[3:]))
         for k, name in enumerate(self.names):
@@ -135,4 +135,6 @@ class RegisteredModel:
                 by_radian = (closed - self.centre) @ turns[i].T
                 jacobian[half:, k] = np.deg2rad(by_radian).ravel()
         seen = displace(closed, registration, self.centre)
-        return replace(found, y=np.concatenate([found.y[:half], seen.ravel()]), jacobian=jacobian)
+        return replace(
+            prediction, y=np.concatenate([prediction.y[:half], seen.ravel()]), jacobian=jacobian
+        )

@@ -65,9 +65,9 @@ def simulate_observation(
     frames : sequence of str
         Which of ``FRAMES`` are observed.
     variance : float or (f,) mm²
-        What the filter is told about the errors.
+        What the filter is to assume of the errors.
     correlation : SpatialCorrelation, optional
-        What the filter is told about their correlation; None for independent errors.
+        What the filter is to assume of their correlation; None for independent errors.
     errors : sequence of ObservationError
         What makes the observation differ from the truth, in this order.
     rng : numpy.random.Generator

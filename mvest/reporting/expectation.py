@@ -15,7 +15,7 @@ from mvest.estimation.transform import Transform
 from mvest.reporting.markup import MISSING, number
 from mvest.typing import FloatArray
 
-__all__ = ["alike_words", "confounded_record", "confounded_words", "foresight_text"]
+__all__ = ["alike_words", "confounded_record", "confounded_words", "expectation_text"]
 
 STEP = 0.1
 """Change by which it is shown how parameters make up for each other, in parts of a scale."""
@@ -24,7 +24,7 @@ UNITS = {"E_f": "MPa", "G": "MPa", "shift": "mm", "turn": "degrees"}
 """Of parameters by the first part of their name; the others are factors."""
 
 
-def foresight_text(
+def expectation_text(
     title: str,
     assumed: FloatArray,
     prior: Gaussian,
@@ -124,15 +124,15 @@ def alike_words(group: Mapping[str, Any], labels: Mapping[str, str] | None = Non
         What parameters are called.
     """
     names: Sequence[str] = group["parameters"]
-    told = [(labels or {}).get(name, name) for name in names]
+    labelled = [(labels or {}).get(name, name) for name in names]
     moved = [
         f"{_change(name, change, relative)} of {label}"
         for name, label, change, relative in zip(
-            names, told, group["changes"], group["relative"], strict=True
+            names, labelled, group["changes"], group["relative"], strict=True
         )
     ]
     return (
-        f"The data hardly tell apart {_listed(told)} (correlations of at least "
+        f"The data hardly tell apart {_listed(labelled)} (correlations of at least "
         f"{np.floor(1000 * group['correlation']) / 1000:.3g}): {moved[0]} with "
         f"{_listed(moved[1:])} looks almost the same."
     )

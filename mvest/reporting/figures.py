@@ -1,7 +1,7 @@
 """Figures of a run: how the estimate came about, and the valve open and closed.
 
 Colours are those of Okabe and Ito, which people with colour-blindness can tell apart; every line is
-also told apart by its marker. Nothing touches matplotlib's global state or needs a display.
+also distinguished by its marker. Nothing touches matplotlib's global state or needs a display.
 """
 
 from __future__ import annotations

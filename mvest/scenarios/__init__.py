@@ -5,7 +5,7 @@ valve under it is computed at the estimate and at samples of its posterior, so t
 comes with the uncertainty of the estimate.
 
 * ``scenarios``: what is changed, as value objects, and the model under it;
-* ``stress``, ``measures``: what is told of a closed valve;
+* ``stress``, ``measures``: what is measured of a closed valve;
 * ``posterior``: samples of the estimate, and what is said of a sampled number;
 * ``predict``: all of it together.
 """

@@ -1,4 +1,4 @@
-"""What is told of a predicted closed valve: gap, coaptation, tenting, annulus and peak stress."""
+"""Measures of a predicted closed valve: gap, coaptation, tenting, annulus and peak stress."""
 
 from __future__ import annotations
 
@@ -103,18 +103,18 @@ def measure_closed(
     annulus = vertices[valve.annulus]
     pair = surface.triangles[surface.region == 0], surface.triangles[surface.region == 1]
     shape = _Shape(vertices, pair, annulus, plane_of(valve, annulus))
-    found = _closure(shape, contact_reach(model))
+    measures = _closure(shape, contact_reach(model))
     tenting = measure_tenting(vertices, surface.triangles, annulus, shape.plane)
-    found |= {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
+    measures |= {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
     size = measure_annulus(annulus, shape.plane)
-    found["coaptation_height_mm"] = found["coaptation_area_mm2"] / size.commissural_diameter
-    found["ap_diameter_mm"] = size.anteroposterior_diameter
-    found["annulus_circumference_mm"] = size.circumference
+    measures["coaptation_height_mm"] = measures["coaptation_area_mm2"] / size.commissural_diameter
+    measures["ap_diameter_mm"] = size.anteroposterior_diameter
+    measures["annulus_circumference_mm"] = size.circumference
     for region, peak in peak_stress(system, x, dict(changes or {})).items():
-        found[f"stress_p95_{region}_mpa"] = peak.p95
-        found[f"stress_p99_{region}_mpa"] = peak.p99
-        found[f"stress_max_{region}_mpa"] = peak.largest
-    return found
+        measures[f"stress_p95_{region}_mpa"] = peak.p95
+        measures[f"stress_p99_{region}_mpa"] = peak.p99
+        measures[f"stress_max_{region}_mpa"] = peak.largest
+    return measures
 
 
 def _closure(shape: _Shape, reach: float) -> Measured:

@@ -166,15 +166,15 @@ def predict_scenario(
         shape = model.observed(x)
         spread = _first_order(model, system, x, dx, estimate)
     start = model.closed
-    found = []
+    predicted = []
     for number, m in enumerate(samples):
         # Each from the same start, so that no sample depends on the one before.
         model.restart(start)
-        found.append(closed_valve(model, m)[0])
+        predicted.append(closed_valve(model, m)[0])
         if on_sample is not None:
             on_sample(number)
     check = None if finer is None else closed_valve(finer, estimate.mean)[0]
-    return PredictedScenario(first, shape, spread, tuple(found), check)
+    return PredictedScenario(first, shape, spread, tuple(predicted), check)
 
 
 def _first_order(

@@ -88,11 +88,11 @@ def peak_stress(
     if not np.isfinite(values).all():
         raise InputError("the stress is not finite: an element is turned inside out")
     mesh = solid.mesh
-    found = {}
+    peaks = {}
     for number, name in enumerate(mesh.region_names):
         own = mesh.region == number
-        found[name] = _peaks(values[own].ravel(), solid.volumes[own].ravel())
-    return found
+        peaks[name] = _peaks(values[own].ravel(), solid.volumes[own].ravel())
+    return peaks
 
 
 def _peaks(values: FloatArray, volumes: FloatArray) -> PeakStress:

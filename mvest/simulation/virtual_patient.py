@@ -1,4 +1,4 @@
-"""Virtual patients: cases that a simulation wrote, with everything that an estimator is not told.
+"""Virtual patients: cases that a simulation wrote, with everything that no estimator is given.
 
 A virtual patient is closed on another mesh than any estimator's, under a pressure, with chordae and
 seen with errors that its case does not state. What was hidden is returned beside the case and
@@ -200,8 +200,8 @@ def simulate_patient(
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
     true = {
-        frame: displace(found, registration, centre)
-        for frame, found in close_patient(name, model, values, simulation).items()
+        frame: displace(vertices, registration, centre)
+        for frame, vertices in close_patient(name, model, values, simulation).items()
     }
     case = _case(name, description, seen, true, simulation, mechanics, rng)
     return VirtualPatient(case, Hidden(dict(values), {REFERENCE: seen.surface.vertices, **true}))
@@ -267,10 +267,10 @@ def close_patient(
         raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
     true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
     held = held_states(simulation, model.contact_valve)
-    for frame, found in zip(held, model.held(at, tuple(held.values())), strict=True):
-        if found is None:
+    for frame, vertices in zip(held, model.held(at, tuple(held.values())), strict=True):
+        if vertices is None:
             raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
-        true[frame] = found
+        true[frame] = vertices
     return true
 
 

@@ -21,7 +21,7 @@ from mvest.estimation import (
 )
 from mvest.estimation.prediction import as_prediction, predict
 from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of
-from mvest.problem.expectation import foresee_model
+from mvest.problem.expectation import expect_of_model
 
 H = np.random.default_rng(5).standard_normal((6, 2))
 Y = H @ np.array([1.0, 2.0]) + 0.01
@@ -68,7 +68,7 @@ def run_profile(model):
 
 
 def run_expectation(model):
-    return foresee_model(
+    return expect_of_model(
         model, PRIOR, 0.1, parameters=("a", "b"), transform=Identity(), frames=("closed",)
     )
 

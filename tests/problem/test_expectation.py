@@ -7,9 +7,9 @@ from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
 from mvest.mechanics.settings import TissueSettings
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
-from mvest.problem.expectation import foresee
+from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
-from mvest.reporting.expectation import alike_words, confounded_record, foresight_text
+from mvest.reporting.expectation import alike_words, confounded_record, expectation_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")
 TRUTH = np.array([6.0, 2.0, 1.0])
@@ -47,7 +47,7 @@ def observation(noise):
 def test_the_foreseen_intervals_are_those_of_the_estimate():
     # At the prior's mean, where the noise-free truth lies, the filter linearises at the same point.
     case = case_of([3.0, 1.0, 0.1])
-    found = foresee(case, observation(0.02))
+    found = expect(case, observation(0.02))
     assert case.model.calls == 1
     later = estimate(case, observation(0.02))
     assert found.informed is not None
@@ -62,14 +62,14 @@ def test_the_foreseen_intervals_are_those_of_the_estimate():
 def test_what_was_seen_plays_no_part():
     case = case_of([3.0, 1.0, 0.1])
     moved = observation(0.02).positions + 5.0
-    other = foresee(case, Observation(("closed",), moved, np.array(0.02**2)))
-    np.testing.assert_array_equal(other.data.std, foresee(case, observation(0.02)).data.std)
+    other = expect(case, Observation(("closed",), moved, np.array(0.02**2)))
+    np.testing.assert_array_equal(other.data.std, expect(case, observation(0.02)).data.std)
 
 
 def test_the_text_names_what_is_told_badly_and_how_it_hides():
     case = case_of([3.0, 1.0, 0.1])
-    found = foresee(case, observation(0.02))
-    text = foresight_text(
+    found = expect(case, observation(0.02))
+    text = expectation_text(
         "twin", found.assumed, found.prior, found.transform, found.data, found.informed, "points"
     )
     # Only p/a and p/b are seen well: whatever the pressure, both moduli are as much larger.
@@ -89,16 +89,16 @@ def test_the_text_names_what_is_told_badly_and_how_it_hides():
 
 
 def test_a_prior_without_width_and_a_model_that_fails():
-    held = foresee(case_of([3.0, 1.0, 0.0]), observation(0.02))
+    held = expect(case_of([3.0, 1.0, 0.0]), observation(0.02))
     assert held.data is not None
     assert held.informed is None
     with pytest.raises(ValueError, match="nothing is known"):
         held.interval()
-    assert "–" in foresight_text(
+    assert "–" in expectation_text(
         "twin", held.assumed, held.prior, held.transform, held.data, None, "points"
     )
     failing = case_of([3.0, 1.0, 0.1])
     object.__setattr__(failing, "model", lambda m: Prediction.failed("no equilibrium"))
-    lost = foresee(failing, observation(0.02))
+    lost = expect(failing, observation(0.02))
     assert lost.data is None
     assert lost.reason == "no equilibrium"

@@ -27,7 +27,7 @@ class CaseFrames:
     held_out : mapping
         Further frames of the closed valve -> transmitral pressure in mmHg.
     derived : tuple of str
-        How frames were chosen that were not told.
+        How frames were chosen that were not stated.
     """
 
     open: int
@@ -64,7 +64,7 @@ def choose_frames(
     held_out: Mapping[int, float] | None = None,
     min_confidence: float = 0.6,
 ) -> CaseFrames:
-    """Choose the frames that were not told.
+    """Choose the frames that were not stated.
 
     The closed frame is the one in which the leaflets touch over the largest area, the open frame
     the one with the largest orifice, among frames that are as confident as asked for.
@@ -77,7 +77,7 @@ def choose_frames(
     pressure_mmhg : float
         In the closed frame.
     open_, closed : int, optional
-        Where they are told.
+        Where they are stated.
     held_out : mapping, optional
         Frame -> pressure, mmHg.
     min_confidence : float
@@ -86,7 +86,7 @@ def choose_frames(
     Raises
     ------
     InputError
-        A frame that is told does not exist, or none can be chosen.
+        A frame that is stated does not exist, or none can be chosen.
     """
     count, held = len(sequence.times), dict(held_out or {})
     for name, number in (("open", open_), ("closed", closed), *(("held-out", k) for k in held)):
@@ -98,22 +98,22 @@ def choose_frames(
         if sequence.frame_confidence[int(row["frame"] or 0)] >= min_confidence
         and row["orifice_mm2"] is not None
     ]
-    told = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
+    among = f"among {len(sure)} of {count} frames with a confidence of {min_confidence:g} or more"
     derived = []
     if closed is None:
         closed = closed_frame([row for row in sure if int(row["frame"] or 0) not in held])
         derived.append(
-            f"closed frame: {closed}, whose leaflets touch over the largest area, {told}"
+            f"closed frame: {closed}, whose leaflets touch over the largest area, {among}"
         )
     if open_ is None:
         others = [row for row in sure if int(row["frame"] or 0) not in {closed, *held}]
         best = max(others, key=lambda row: row["orifice_mm2"] or 0.0, default=None)
         open_ = None if best is None else int(best["frame"] or 0)
-        derived.append(f"open frame: {open_}, with the largest orifice, {told}")
+        derived.append(f"open frame: {open_}, with the largest orifice, {among}")
     if open_ is None or closed is None:
-        best_found = float(np.max(sequence.frame_confidence))
+        highest = float(np.max(sequence.frame_confidence))
         raise InputError(
-            f"no open and closed frame can be chosen {told} (the best: {best_found:.2f}); give the "
+            f"no open and closed frame can be chosen {among} (the best: {highest:.2f}); give the "
             "frames, or landmarks by hand"
         )
     return CaseFrames(open_, closed, pressure_mmhg, held, tuple(derived))

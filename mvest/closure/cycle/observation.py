@@ -53,14 +53,14 @@ class CycleObservation:
         frames: FloatArray,
         noise_mm: float,
         rng: np.random.Generator,
-        told_mm: float | None = None,
+        assumed_mm: float | None = None,
     ) -> CycleObservation:
         """Frames ``(f, n, 3)`` with independent noise of each coordinate.
 
-        ``told_mm`` is what the filter is told of the noise; default what it is.
+        ``assumed_mm`` is the noise that the filter assumes; default what it is.
         """
-        told = noise_mm if told_mm is None else told_mm
-        return cls(frames + noise_mm * rng.normal(size=frames.shape), np.full(len(frames), told))
+        assumed = noise_mm if assumed_mm is None else assumed_mm
+        return cls(frames + noise_mm * rng.normal(size=frames.shape), np.full(len(frames), assumed))
 
     def only(self, frames: Sequence[int]) -> CycleObservation:
         """The same with nothing seen in any other frame."""

@@ -102,7 +102,7 @@ class SchmidtFilter:
         noise = low_rank_noise(base, problem.columns)
         last: Estimate | None = None
         for _ in range(self.max_rounds):
-            found = filter_(
+            result = filter_(
                 problem,
                 estimated,
                 y,
@@ -111,18 +111,18 @@ class SchmidtFilter:
                 transform=problem.kept_transform,
                 on_iterate=on_iterate,
             )
-            solves += found.forward_solves
-            if not found.converged or (last is not None and self._settled(last, found)):
+            solves += result.forward_solves
+            if not result.converged or (last is not None and self._settled(last, result)):
                 break
-            last = found
-            problem(found.mean)
+            last = result
+            problem(result.mean)
             noise = low_rank_noise(base, problem.columns)
-            filter_ = replace(self.inner, start=tuple(map(float, found.mean)))
-        return problem.whole(found, noise, solves)
+            filter_ = replace(self.inner, start=tuple(map(float, result.mean)))
+        return problem.whole(result, noise, solves)
 
-    def _settled(self, last: Estimate, found: Estimate) -> bool:
-        change = np.abs(found.transformed_iterates[-1] - last.transformed_iterates[-1])
-        return bool(np.all(change <= self.tolerance * found.transformed.std))
+    def _settled(self, last: Estimate, new: Estimate) -> bool:
+        change = np.abs(new.transformed_iterates[-1] - last.transformed_iterates[-1])
+        return bool(np.all(change <= self.tolerance * new.transformed.std))
 
 
 class _Problem:
@@ -193,21 +193,21 @@ class _Problem:
             forward_solves=1,
         )
 
-    def whole(self, found: Estimate, noise: ObservationNoise, solves: int) -> Estimate:
+    def whole(self, part: Estimate, noise: ObservationNoise, solves: int) -> Estimate:
         """The estimate of all parameters, from that of the estimated ones."""
-        k = len(found.transformed_iterates)
+        k = len(part.transformed_iterates)
         prior = to_filter(self.transform, self.prior)
         iterates = np.tile(prior.mean, (k, 1))
-        iterates[:, self.kept] = found.transformed_iterates
+        iterates[:, self.kept] = part.transformed_iterates
         covariances = np.tile(prior.covariance, (k, 1, 1))
-        for c, P in zip(covariances, found.transformed_iterate_covariances, strict=True):
+        for c, P in zip(covariances, part.transformed_iterate_covariances, strict=True):
             c[np.ix_(self.kept, self.kept)] = P
         prediction = None
-        if found.prediction is not None and self(found.mean).converged and self._last is not None:
+        if part.prediction is not None and self(part.mean).converged and self._last is not None:
             prediction = self._last[1]
             covariances[-1] = self._with_cross(covariances[-1], iterates[-1], prediction, noise)
         return replace(
-            found,
+            part,
             names=self.names,
             prior=self.prior,
             transform=self.transform,

@@ -80,7 +80,7 @@ class DriftEstimate:
 class DriftSmoother:
     """Fixed-interval smoother of parameters that walk at random from frame to frame.
 
-    Finds the most probable trajectory Z = (z_1, ..., z_f), the least of::
+    Finds the most probable trajectory Z = (z_1, ..., z_f), the smallest of::
 
         J(Z) = ½ Σ (y_k − h_k(z_k))ᵀ R_k⁻¹ (y_k − h_k(z_k)) + ½ (z_1 − m)ᵀ P⁻¹ (z_1 − m)
              + ½ Σ (z_k − z_{k−1})ᵀ Q⁻¹ (z_k − z_{k−1})
@@ -139,7 +139,7 @@ class DriftSmoother:
             smoothed = smooth_frames(states)
             detail = f"{passes} passes over {len(self.sizes)} frames"
             step = smoothed.mean - point.mean
-            # The linearised objective is least at the end of the step.
+            # The linearised objective is smallest at the end of the step.
             decrease = point.objective - run.linear_objective(point.frames, smoothed.mean)
             if np.all(np.abs(step) <= self.tolerance * smoothed.std) or (
                 decrease <= ROUND_OFF * point.objective
@@ -149,12 +149,12 @@ class DriftSmoother:
             if passes > self.max_iterations:
                 reason = Reason.MAX_ITERATIONS
                 break
-            found = run.descend(point, step)
-            if not isinstance(found, _Path):
-                reason = Reason.NO_DECREASE if found is None else Reason.MODEL_FAILED
-                detail += "" if found is None else f"; {found}"
+            descent = run.descend(point, step)
+            if not isinstance(descent, _Path):
+                reason = Reason.NO_DECREASE if descent is None else Reason.MODEL_FAILED
+                detail += "" if descent is None else f"; {descent}"
                 break
-            point = found
+            point = descent
             objectives.append(point.objective)
         if not reason.converged:
             # Its step has not been tried, or was refused.
@@ -196,22 +196,22 @@ class _DriftRun:
         """Frame k linearised at z (p,) and its share of J, or why the model failed."""
         self.forward_solves += 1
         m = self.transform.inverse(z)
-        found = predict(partial(self.model.frame, k), m, len(self.y[k]), derivatives=True)
-        if not found.converged:
-            return f"frame {k} at {m}: {found.reason}"
-        H = found.jacobian * self.transform.derivative(z)
-        misfit = self.noises[k].whiten(self.y[k] - found.y)
-        return LinearFrame(self.y[k] - found.y + H @ z, H, self.noises[k]), _half(misfit)
+        prediction = predict(partial(self.model.frame, k), m, len(self.y[k]), derivatives=True)
+        if not prediction.converged:
+            return f"frame {k} at {m}: {prediction.reason}"
+        H = prediction.jacobian * self.transform.derivative(z)
+        misfit = self.noises[k].whiten(self.y[k] - prediction.y)
+        return LinearFrame(self.y[k] - prediction.y + H @ z, H, self.noises[k]), _half(misfit)
 
     def extend(self) -> str | None:
         """The first pass, or why the model failed in it."""
         frames: list[LinearFrame] = []
         for k in range(len(self.y)):
             # The prediction of frame k depends on no observation of it.
-            found = self.frame(k, self.extended[-1].filtered.mean if k else self.prior.mean)
-            if isinstance(found, str):
-                return found
-            frames.append(found[0])
+            linear = self.frame(k, self.extended[-1].filtered.mean if k else self.prior.mean)
+            if isinstance(linear, str):
+                return linear
+            frames.append(linear[0])
             self.extended = filter_frames(self.prior, frames, self.Q)
         return None
 
@@ -219,11 +219,11 @@ class _DriftRun:
         """All frames linearised at the trajectory ``mean (f, p)``."""
         frames, objective = [], self._prior_objective(mean)
         for k, z in enumerate(mean):
-            found = self.frame(k, z)
-            if isinstance(found, str):
-                return found
-            frames.append(found[0])
-            objective += found[1]
+            linear = self.frame(k, z)
+            if isinstance(linear, str):
+                return linear
+            frames.append(linear[0])
+            objective += linear[1]
         return _Path(mean, frames, objective)
 
     def descend(self, path: _Path, step: FloatArray) -> "_Path | str | None":
@@ -233,11 +233,11 @@ class _DriftRun:
         """
         failure: str | None = None
         for k in range(HALVINGS + 1):
-            found = self.linearise(path.mean + 0.5**k * step)
-            if isinstance(found, str):
-                failure = found
-            elif found.objective < path.objective:
-                return found
+            trial = self.linearise(path.mean + 0.5**k * step)
+            if isinstance(trial, str):
+                failure = trial
+            elif trial.objective < path.objective:
+                return trial
             else:
                 failure = None
         return failure

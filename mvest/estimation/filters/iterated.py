@@ -29,7 +29,7 @@ SUFFICIENT_DECREASE = 1e-4
 and Wright, Numerical Optimization, 2nd ed. 2006, algorithm 4.1 and section 3.1)."""
 
 ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)
-"""Relative decrease of the objective that cannot be told from rounding."""
+"""Relative decrease of the objective that cannot be distinguished from rounding."""
 
 GOOD_DECREASE = 0.5
 """Part of the predicted decrease from which on the linearisation is trusted with less damping."""

@@ -134,10 +134,10 @@ class MonteCarloFilter:
         run.record(z, P, float(first.objective[-1]), float(first.log_likelihood[-1]))
 
         rng = np.random.default_rng(self.seed)
-        found = self._explore(_Runs(run, kept), _standard(run, first.transformed), rng)
-        if isinstance(found, Prediction):
-            return run.fail(z, P, found)
-        surrogate, at, error, rounds = found
+        explored = self._explore(_Runs(run, kept), _standard(run, first.transformed), rng)
+        if isinstance(explored, Prediction):
+            return run.fail(z, P, explored)
+        surrogate, at, error, rounds = explored
         density = log_posterior(surrogate.misfit(run.y, run.noise))
         draws = draw(density, at, self.sampler, rng)
         L, x = run.prior.factor, draws.points.mean(axis=0)
@@ -204,7 +204,7 @@ class _Runs:
             if np.linalg.norm(x) <= FURTHEST:
                 self.run.predict(self.run.prior.mean + self._L @ x, derivatives=False)
 
-    def fit(self, region: Region, most: int) -> Surrogate | None:
+    def fit(self, region: Region, max_degree: int) -> Surrogate | None:
         """The polynomial through all runs in a region; None if there are fewer than 3 p."""
         z = np.array([self.run.transform.forward(m) for m, _ in self._kept])
         offset = (z - self.run.prior.mean).T
@@ -220,7 +220,7 @@ class _Runs:
             pairs = zip(z[inside], predictions, strict=True)
             jacobians = np.array([self.run.jacobian(at, one) @ self._L for at, one in pairs])
         numbers = r if jacobians is None else r * (1 + p)
-        degree = affordable_degree(numbers, p, most)
+        degree = affordable_degree(numbers, p, max_degree)
         return fit_surrogate(points[inside], values, jacobians, region, degree)
 
     def check(self, misfit: Misfit, points: FloatArray) -> float:

@@ -53,7 +53,7 @@ class SamplerSettings:
             )
         if not self.largest_r_hat > 1.0 or not self.least_effective > 0.0:
             raise InputError(
-                f"the largest R-hat must be above 1 and the least number of effective draws "
+                f"the largest R-hat must be above 1 and the smallest number of effective draws "
                 f"positive; got {self.largest_r_hat} and {self.least_effective}"
             )
 
@@ -165,10 +165,10 @@ def _starts(
     density: LogDensity, start: Gaussian, walkers: int, rng: np.random.Generator
 ) -> FloatArray:
     """Walkers (w, p) of positive density."""
-    found = np.empty((0, start.size))
+    starts = np.empty((0, start.size))
     for _ in range(100):
         drawn = start.mean + rng.standard_normal((walkers, start.size)) @ start.factor.T
-        found = np.vstack([found, drawn[np.isfinite(density(drawn))]])
-        if len(found) >= walkers:
-            return found[:walkers]
+        starts = np.vstack([starts, drawn[np.isfinite(density(drawn))]])
+        if len(starts) >= walkers:
+            return starts[:walkers]
     raise InputError("no start of positive density is found for the walkers of a sampler")

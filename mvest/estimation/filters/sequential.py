@@ -112,10 +112,10 @@ class SequentialFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Estimate; see `Filter` for the arguments."""
-        found = self.run(
+        result = self.run(
             model, prior, y, R, names=names, transform=transform, on_iterate=on_iterate
         )
-        return found.estimate
+        return result.estimate
 
     def run(
         self,
@@ -186,21 +186,21 @@ class SequentialFilter:
         reason: Reason | None = None
         passes = 0
         while reason is None:
-            found, failure = _descend(run, point, target)
-            if found is None:
+            lower, failure = _descend(run, point, target)
+            if lower is None:
                 reason = Reason.NO_DECREASE if failure is None else Reason.MODEL_FAILED
             else:
-                point, passes = found, passes + 1
+                point, passes = lower, passes + 1
             states = filter_frames(run.prior, self._linear(run, noises, point.z, point.prediction))
             known = states[-1].filtered
             H = run.jacobian(point.z, point.prediction)
             innovation = run.y - point.prediction.y + H @ (point.z - run.prior.mean)
             update = kalman_update(run.prior, innovation, H, run.noise)
-            if found is None:
+            if lower is None:
                 break
             target = known.mean
             run.record(point.z, known.covariance, point.objective, update.log_likelihood)
-            # The least value of the linearised objective is half of eᵀ S⁻¹ e.
+            # The smallest value of the linearised objective is half of eᵀ S⁻¹ e.
             decrease = point.objective - 0.5 * update.nis
             if run.negligible(target - point.z, point.z, known.covariance, self.tolerance) or (
                 decrease <= max(OBJECTIVE_TOLERANCE, ROUND_OFF * point.objective)

@@ -145,9 +145,9 @@ def fit_surrogate(
     return Surrogate(region, powers, coefficients)
 
 
-def affordable_degree(numbers: int, size: int, most: int, spare: float = 1.6) -> int:
-    """Largest degree, up to ``most``, with ``spare`` times fewer terms than numbers to fit."""
-    fitting = [d for d in range(1, most + 1) if spare * comb(size + d, size) <= numbers]
+def affordable_degree(numbers: int, size: int, max_degree: int, spare: float = 1.6) -> int:
+    """Largest degree, up to ``max_degree``, of ``spare`` times fewer terms than numbers to fit."""
+    fitting = [d for d in range(1, max_degree + 1) if spare * comb(size + d, size) <= numbers]
     return max(fitting, default=1)
 
 
@@ -175,9 +175,9 @@ def _slopes(u: FloatArray, powers: IntArray) -> FloatArray:
 
 def _factors(u: FloatArray, powers: IntArray, *, derivative: bool = False) -> FloatArray:
     """Legendre polynomials (k, p, t) of each coordinate, of the degree that each term has in it."""
-    most = int(powers.max(initial=1)) or 1
-    values = legendre.legvander(u, most)
+    max_degree = int(powers.max(initial=1)) or 1
+    values = legendre.legvander(u, max_degree)
     if derivative:
-        values = values[..., :most] @ legendre.legder(np.eye(most + 1))
+        values = values[..., :max_degree] @ legendre.legder(np.eye(max_degree + 1))
     coordinate = np.arange(u.shape[1])[:, None]
     return np.asarray(values[:, coordinate, powers.T])

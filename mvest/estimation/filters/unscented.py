@@ -95,11 +95,11 @@ class UnscentedFilter:
         at, before = unit, unit
         share, change = 1.0, np.inf
         for rounds in range(1, self.max_iterations + 1):
-            found = self._linearise(run, L, at, before.mean)
-            if isinstance(found, Prediction):
+            linearised = self._linearise(run, L, at, before.mean)
+            if isinstance(linearised, Prediction):
                 z = run.prior.mean + L @ at.mean
-                return run.fail(z, L @ at.covariance @ L.T, found)
-            at, mean, H = found
+                return run.fail(z, L @ at.covariance @ L.T, linearised)
+            at, mean, H = linearised
             z, e = run.prior.mean + L @ at.mean, run.y - mean
             update = kalman_update(unit, e + H @ at.mean, H, run.noise)
             white = run.noise.whiten(e)

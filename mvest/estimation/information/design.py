@@ -102,10 +102,10 @@ class Design:
 
     def std(self, name: str, noise: float, knowledge: Mapping[str, float] | None = None) -> float:
         """Relative standard deviation of one parameter; infinite if it is not determined."""
-        found = self.at(noise, knowledge)
-        if name not in found.names:
-            raise InputError(f"{name!r} is not to be found out; expected one of {found.names}")
-        return float(found.std[found.names.index(name)])
+        bound = self.at(noise, knowledge)
+        if name not in bound.names:
+            raise InputError(f"{name!r} is not to be found out; expected one of {bound.names}")
+        return float(bound.std[bound.names.index(name)])
 
     def needed_noise(
         self, name: str, target: float, knowledge: Mapping[str, float] | None = None
@@ -152,8 +152,8 @@ class Design:
         """
 
         def excess(log_std: float) -> float:
-            told = {**(knowledge or {}), about: float(np.exp(log_std))}
-            return float(np.log(self.std(name, noise, told) / target))
+            known = {**(knowledge or {}), about: float(np.exp(log_std))}
+            return float(np.log(self.std(name, noise, known) / target))
 
         low, high = np.log(KNOWLEDGE_RANGE)
         if excess(low) > 0.0:

@@ -101,7 +101,7 @@ class Identifiability:
 
         Two belong to one group if the size of their correlation at the bound is at least `limit`,
         and both are known to no better than `width` parts of their scales: what is known well is
-        told apart, however correlated it is. What is not determined at all has no correlation;
+        distinguished, however correlated it is. What is not determined at all has no correlation;
         `flat` tells of it.
         """
         uncertain = self.std / self.scale >= width
@@ -109,7 +109,7 @@ class Identifiability:
         # NaN compares as false.
         alike = sparse.coo_array(size >= limit)
         count, group = connected_components(cast(Any, alike), directed=False)
-        found = []
+        groups = []
         for label in range(count):
             members = np.flatnonzero(group == label)
             if members.size < 2:
@@ -119,14 +119,14 @@ class Identifiability:
             scaled = self.covariance[:, first] / (self.scale * self.scale[first])
             exchange = scaled / scaled[first]
             order = [int(first), *others]
-            found.append(
+            groups.append(
                 Confounded(
                     tuple(self.names[i] for i in order),
                     tuple(float(exchange[i]) for i in order),
                     float(size[first, others].min()),
                 )
             )
-        return tuple(sorted(found, key=lambda one: -len(one.names)))
+        return tuple(sorted(groups, key=lambda one: -len(one.names)))
 
 
 def identifiability(

@@ -31,10 +31,10 @@ PRECISION = 1e-6
 threshold of a 95 % interval is 3.84."""
 
 ROUND_OFF = 1e-12
-"""Decrease of the deviance, as a part of it, that cannot be told from rounding."""
+"""Decrease of the deviance, as a part of it, that cannot be distinguished from rounding."""
 
-MOST_STEPS = 20
-MOST_HALVINGS = 8
+MAX_STEPS = 20
+MAX_HALVINGS = 8
 
 BEYOND = 2.0
 """Standard deviations beyond the threshold up to which a profile is followed."""
@@ -42,7 +42,7 @@ BEYOND = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """The least misfit with one parameter held at each of g values.
+    """The smallest misfit with one parameter held at each of g values.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Profile:
     index : int
         Which parameter is held.
     path : (g, p) in the units of the parameters
-        All parameters where the misfit is least, the held one ascending: the floor of the valley.
+        All parameters where the misfit is smallest, the held one ascending: the valley's floor.
     deviance : (g,)
         D less its smallest value on the path, D = ``|W (y - h(m))|²`` plus the prior's part; -2 log
         of the profile likelihood ratio.
@@ -235,7 +235,7 @@ class _Fit:
 
         Where no step helps any more, that is as good as the model can be evaluated.
         """
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             J = point.jacobian[:, free]
             # The smallest of all steps where the data leave a combination undetermined.
             step = np.linalg.lstsq(J, -point.residual, rcond=None)[0]
@@ -243,7 +243,7 @@ class _Fit:
             gain = point.deviance - float(left @ left)
             if gain <= max(PRECISION, ROUND_OFF * point.deviance):
                 return point
-            for halving in range(MOST_HALVINGS + 1):
+            for halving in range(MAX_HALVINGS + 1):
                 z = point.z.copy()
                 z[free] += step * 0.5**halving
                 trial = self.point(z)
@@ -261,7 +261,7 @@ def _side(
     """Points of one side, outwards, and why they end."""
     free = np.delete(np.arange(best.z.size), index)
     point = best
-    found: list[_Point] = []
+    points: list[_Point] = []
     for offset in offsets:
         change = best.z[index] + offset - point.z[index]
         z = point.z.copy()
@@ -273,13 +273,13 @@ def _side(
             z[free] += follow
         trial = fit.point(z)
         if isinstance(trial, str):
-            return found, f"the model has no prediction: {trial}"
+            return points, f"the model has no prediction: {trial}"
         point = fit.minimise(trial, free) if free.size else trial
-        found.append(point)
+        points.append(point)
         if np.sqrt(max(point.deviance - best.deviance, 0.0)) > np.sqrt(threshold) + BEYOND:
             break
-    reached = any(point.deviance - best.deviance > threshold for point in found)
-    return found, CROSSED if reached else GRID_ENDED
+    reached = any(point.deviance - best.deviance > threshold for point in points)
+    return points, CROSSED if reached else GRID_ENDED
 
 
 def _crossing(z: FloatArray, deviance: FloatArray, threshold: float) -> float | None:

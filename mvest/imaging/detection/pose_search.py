@@ -172,7 +172,7 @@ class PoseSearch:
         rating = self.coarse(features(frame, COARSE, every.centre, every.axes))[:, 0]
         best = np.argsort(-rating, kind="stable")[:REFINED]
         poses, rating = self.refined(frame, every[best], REFINED)
-        # Front and back are told apart last, so the best ones are tried the other way round too.
+        # Front and back are distinguished last, so the best ones are tried the other way round too.
         back = poses[:TURNED].moved(np.tile(HALF_TURN, (len(poses[:TURNED]), 1)))
         back, rated = self.refined(frame, back, TURNED)
         poses, rating = Poses.joined([poses, back]), np.concatenate([rating, rated])

@@ -14,7 +14,7 @@ from mvest.typing import FloatArray, IntArray
 
 __all__ = ["biaxial_stress"]
 
-MOST_ITERATIONS = 100
+MAX_ITERATIONS = 100
 TOLERANCE = 1e-12
 """Change of the thickness strain at which the stretch of the thickness is found."""
 
@@ -48,7 +48,7 @@ def biaxial_stress(law: _Stressed, stretches: FloatArray, region: int = 0) -> Fl
     green[:, 0, :2] = 0.5 * (stretches**2 - 1)
     thickness = 1 / stretches.prod(axis=1)
     where, none = np.full(len(stretches), region), np.zeros_like(green)
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         green[:, 0, 2] = 0.5 * (thickness**2 - 1)
         stress, tangent = law.response(green, where, none, 0.0)
         # In the logarithm of the thickness, which stays positive whatever the step.

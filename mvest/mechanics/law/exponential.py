@@ -26,7 +26,7 @@ place of :math:`(\lambda - 1)^4`. Three things are added to it:
   the exponential on the isochoric :math:`\bar I_1`, so that at rest there is no stress; the fibre
   term is not split, since fibres feel their full stretch.
 
-Every term is polyconvex. Beyond Q = ``LARGEST_EXPONENT`` the exponential goes on as its own
+Every term is polyconvex. Beyond Q = ``MAX_EXPONENT`` the exponential goes on as its own
 parabola, so that a Newton iterate far away does not overflow; no tissue gets there.
 
 Kelvin-Voigt damping adds the stress ``rate (E - E_n) V`` with ``rate = beta / dt`` and the constant
@@ -49,7 +49,7 @@ from mvest.typing import FloatArray, IntArray
 
 __all__ = ["ExponentialLaw"]
 
-LARGEST_EXPONENT = 12.0
+MAX_EXPONENT = 12.0
 """Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
 
 TURNED_OVER = 1e4
@@ -181,11 +181,11 @@ def _metric(green: FloatArray, h: FloatArray) -> tuple[float, float]:
 
 @nb.njit(cache=True)
 def _exponential(q: float) -> tuple[float, float, float]:
-    """exp(q) - 1 and its first two derivatives, a parabola beyond ``LARGEST_EXPONENT``."""
-    if q <= LARGEST_EXPONENT:
+    """exp(q) - 1 and its first two derivatives, a parabola beyond ``MAX_EXPONENT``."""
+    if q <= MAX_EXPONENT:
         e = np.exp(q)
         return np.expm1(q), e, e
-    e, d = np.exp(LARGEST_EXPONENT), q - LARGEST_EXPONENT
+    e, d = np.exp(MAX_EXPONENT), q - MAX_EXPONENT
     return e * (1.0 + d + 0.5 * d * d) - 1.0, e * (1.0 + d), e
 
 

@@ -24,7 +24,7 @@ class RegionalLaw:
     laws : tuple of Law
         One per region, each of a body of one region.
     region : ndarray
-        ``(e,)`` of the elements, which laws are not told when they are asked for a strain.
+        ``(e,)`` of the elements, which laws do not know when they are asked for a strain.
     """
 
     laws: tuple[Law, ...]

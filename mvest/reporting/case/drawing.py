@@ -43,7 +43,7 @@ LIFT_MM = 0.7
 """By which lines are drawn nearer, so that the surface they lie on does not swallow them."""
 LARGEST_EDGE_MM = 1.2
 """Triangles are drawn by the depth of their middles; below this, touching leaflets stay apart."""
-MOST_SPLITS = 2
+MAX_SPLITS = 2
 LINE_PIECES = 6
 SCALE_MM = 10.0
 
@@ -137,13 +137,13 @@ def draw_valve(
 def _surface(
     points: FloatArray, triangles: IntArray, colours: FloatArray, view: View, strength: float
 ) -> Part:
-    """Shaded triangles, small enough to be told apart in depth where leaflets touch."""
+    """Shaded triangles, small enough to be distinguished in depth where leaflets touch."""
     # A vertex of no triangle that is drawn has no normal, and none is asked for.
     with np.errstate(invalid="ignore"):
         normals = vertex_normals(points, triangles)
     corner, normal = points[triangles], normals[triangles]
     edge = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2)
-    for _ in range(MOST_SPLITS):
+    for _ in range(MAX_SPLITS):
         if not len(edge) or np.median(edge) <= LARGEST_EDGE_MM:
             break
         corner, normal, colours = (quartered(values) for values in (corner, normal, colours))

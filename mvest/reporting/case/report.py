@@ -225,8 +225,8 @@ def _where(
         if not parts:
             text = "the closed valve does not depend on it at all."
         else:
-            told = ", ".join(f"{place} ({words.percent(share)})" for place, share in parts)
-            text = f"learnt mostly from the {told}. "
+            places = ", ".join(f"{place} ({words.percent(share)})" for place, share in parts)
+            text = f"learnt mostly from the {places}. "
             text += f"{words.percent(one.kept)} of the information remains beyond the nuisances"
             if one.kept < FLAT_SHARE:
                 text += ": what the images show of it could as well be their doing"

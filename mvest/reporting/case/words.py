@@ -90,9 +90,9 @@ def badges(record: Record) -> list[str]:
     found = [str(text) for text in record.get("badges") or []]
     if case.get("simulated"):
         found.append("SIMULATED")
-    told = " ".join(str(case.get(key) or "") for key in ("name", "description", "source")).lower()
-    if "tricuspid" in told and not any("TRICUSPID" in text.upper() for text in found):
-        found.append("DONOR TRICUSPID" if "donor" in told else "TRICUSPID")
+    stated = " ".join(str(case.get(key) or "") for key in ("name", "description", "source")).lower()
+    if "tricuspid" in stated and not any("TRICUSPID" in text.upper() for text in found):
+        found.append("DONOR TRICUSPID" if "donor" in stated else "TRICUSPID")
     status = record.get("status")
     if status and status != CONVERGED:
         found.append(f"RUN {str(status).upper()}")
@@ -231,11 +231,11 @@ def identifiability_words(record: Record) -> list[str]:
     bound = found.get("cramer_rao_std")
     columns = columns_of(record.get("parameters") or [], len(bound or []))
     if bound and columns:
-        told = ", ".join(
+        bounds = ", ".join(
             f"{p['label']} {number(s, 2)} {p.get('unit') or ''}".rstrip()
             for p, s in zip(columns, bound, strict=True)
         )
-        words.append(f"Smallest standard deviations that the data alone allow: {told}.")
+        words.append(f"Smallest standard deviations that the data alone allow: {bounds}.")
     return words
 
 

@@ -33,7 +33,7 @@ COLUMNS = ("commissural", "anteroposterior", "at the annulus", "at the free edge
 
 ABOVE_EDGE_MM = 1.0
 STEP_MM = 0.4
-"""Between pixels, if not told otherwise."""
+"""Between pixels, if not stated otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

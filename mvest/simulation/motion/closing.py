@@ -159,12 +159,12 @@ def close_in_motion(
     model = closing.model
     states = _held(settings, model.contact_valve, mechanics.protocol.pressure_mmHg)
     held = []
-    for state, found in zip(states, model.held(closing.at, states), strict=True):
-        if found is None:
+    for state, vertices in zip(states, model.held(closing.at, states), strict=True):
+        if vertices is None:
             raise RefusedError(
                 name, Refusal.NOT_HELD, f"no equilibrium under {state.pressure_mmHg:.0f} mmHg"
             )
-        held.append(found)
+        held.append(vertices)
     valve = moving_valve(
         name,
         template,

@@ -131,10 +131,10 @@ def _read(path: Path) -> dict[str, Any]:
     arrays: dict[str, Any] = {}
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            found = set(file.files)
-            if found != set(ARRAYS):
+            names = set(file.files)
+            if names != set(ARRAYS):
                 raise InputError(
-                    f"{path}: holds {', '.join(sorted(found))}; expected "
+                    f"{path}: holds {', '.join(sorted(names))}; expected "
                     f"{', '.join(sorted(ARRAYS))}"
                 )
             for name, kind in ARRAYS.items():

@@ -11,7 +11,7 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.biaxial import biaxial_stress
 from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
-from mvest.mechanics.law.exponential import LARGEST_EXPONENT, ExponentialLaw
+from mvest.mechanics.law.exponential import MAX_EXPONENT, ExponentialLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.solid import Solid
@@ -148,7 +148,7 @@ def test_slack_fibres_bear_nothing():
 def test_far_beyond_tissue_the_law_stays_finite_and_smooth():
     # Fibres at twice their length would give e^900. Either side of the last exponent, stress and
     # tangent are the same.
-    limit = 1 + (LARGEST_EXPONENT / 900.0) ** 0.25
+    limit = 1 + (MAX_EXPONENT / 900.0) ** 0.25
     green = np.zeros((3, 1, 6))
     green[:, 0, 0] = 0.5 * (np.array([limit - 1e-9, limit + 1e-9, 2.0]) ** 2 - 1)
     # The other stretches keep the isochoric invariant where its share of Q is zero: c1 = 0.

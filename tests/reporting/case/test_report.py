@@ -19,7 +19,7 @@ PICTURES = (
     "shapes", "figure3", "estimates", "identifiability", "iterations", "innovation",
     "innovation_map", "distances", "narrow",
 )  # fmt: skip
-MOST_BYTES = 8_000_000
+MAX_BYTES = 8_000_000
 HOSTILE = "<script>alert(1)</script>"
 
 
@@ -56,7 +56,7 @@ def quickly(*arguments):
     """The same report with coarse pictures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvest.reporting.figures.DPI", 30)
-        patch.setattr("mvest.reporting.case.drawing.MOST_SPLITS", 0)
+        patch.setattr("mvest.reporting.case.drawing.MAX_SPLITS", 0)
         return write_case_report(*arguments)
 
 
@@ -114,7 +114,7 @@ def test_the_page_loads_nothing_and_is_not_too_large(written, html) -> None:
     # Whatever a script might ask for, the policy refuses it.
     assert "default-src 'none'" in html
     assert not re.search(r"(script|img|connect|default)-src[^;\"]*https?:", html)
-    assert written[0].stat().st_size < MOST_BYTES
+    assert written[0].stat().st_size < MAX_BYTES
 
 
 def test_pictures_are_written_as_png_and_pdf(written) -> None:
