@@ -279,6 +279,23 @@ class ValveCase:
                 "correspond; expected frames that all do"
             )
 
+    def __str__(self) -> str:
+        regions = ", ".join(self.surface.region_names)
+        frames = ", ".join(
+            f"{frame.name} ({frame.role.value.replace('_', ' ')}, {frame.pressure_mmHg:.3g} mmHg)"
+            for frame in self.frames
+        )
+        doubt = self.uncertainty
+        length = doubt.correlation_length_mm
+        return (
+            f"case {self.name}{' (simulated)' if self.simulated else ''}: {regions}\n"
+            f"{len(self.surface.vertices)} vertices, {len(self.chordae)} chordae\n"
+            f"frames: {frames}\n"
+            f"seen within {doubt.typical_mm:.3g} mm, "
+            f"{f'alike over {length:g} mm' if length else 'independent'}"
+            + (f"; {len(self.error_samples)} error samples" if self.error_samples else "")
+        )
+
     def frame(self, role: Role) -> Frame:
         """The only frame of a role (reference or closed)."""
         return next(frame for frame in self.frames if frame.role is role)

@@ -140,6 +140,28 @@ class Estimate:
     forward_solves: int
     transformed_samples: FloatArray | None = None
 
+    def __str__(self) -> str:
+        return self.summary()
+
+    def summary(self, units: Sequence[str] = ()) -> str:
+        """The estimate in a few lines: each parameter ± one standard deviation, and how it ended.
+
+        Parameters
+        ----------
+        units : sequence of str, (p,), optional
+            Of the parameters; an empty one for what has none.
+        """
+        width = max(map(len, self.names))
+        rows = [
+            f"{name:<{width}}  {mean:.4g} ± {std:.2g} {unit}".rstrip()
+            for name, mean, std, unit in zip(
+                self.names, self.mean, self.std, units or ("",) * len(self.names), strict=True
+            )
+        ]
+        counts = f"{self.iterations} iterations, {self.forward_solves} forward solves"
+        detail = "" if self.converged or not self.detail else f" ({self.detail})"
+        return "\n".join([*rows, f"{self.reason.value}{detail}; {counts}"])
+
     @property
     def converged(self) -> bool:
         """Whether the filter stopped because it had converged."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from mvest.cases.case import ValveCase
 from mvest.estimation.gaussian import Gaussian
 from mvest.personalise.geometry_errors import GeometryErrors
@@ -91,3 +93,12 @@ class Personalised:
     seconds: Mapping[str, float]
     geometry: GeometryErrors | None = None
     image_share: FloatArray | None = None
+
+    def __str__(self) -> str:
+        distances = [
+            f"{one.frame}: {np.nanmean(one.generic):.2f} mm generic, "
+            f"{np.nanmean(one.personalised):.2f} mm personalised"
+            + ("" if one.seen else " (held out)")
+            for one in self.distances
+        ]
+        return "\n".join([f"case {self.case.name}", str(self.result), *distances])

@@ -17,6 +17,7 @@ from mvest.estimation.estimate import Estimate, OnIterate
 from mvest.estimation.information.identifiability import Identifiability, identifiability
 from mvest.mechanics.settings import TissueSettings
 from mvest.problem.problem import Observed, Problem
+from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth
 from mvest.typing import FloatArray
 
@@ -75,6 +76,18 @@ class StudyResult:
     seconds: float
     fitted: FloatArray | None = None
     truth: Truth | None = None
+
+    def __str__(self) -> str:
+        if self.filtered is None or self.estimate is None:
+            return f"no estimate: {self.reason}" + (f" ({self.detail})" if self.detail else "")
+        units = [unit_of(name) for name in self.parameters]
+        lines = [f"{self.filtered.summary(units)}, {self.seconds:.1f} s"]
+        if self.distance is not None:
+            lines.append(f"fitted to observed: {np.nanmean(self.distance):.2f} mm on average")
+        if self.truth is not None:
+            true = dict(zip(self.parameters, self.truth.values, strict=True))
+            lines.append("truth: " + ", ".join(f"{name} {v:.4g}" for name, v in true.items()))
+        return "\n".join(lines)
 
     @classmethod
     def failed(cls, problem: Problem, reason: str, seconds: float) -> StudyResult:

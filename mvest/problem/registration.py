@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
+from mvest.mechanics.parameters import KINDS
 from mvest.typing import FloatArray
 
-__all__ = ["REGISTRATION", "RegisteredModel", "displace", "registration_of"]
+__all__ = ["REGISTRATION", "RegisteredModel", "displace", "registration_of", "unit_of"]
 
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
@@ -28,6 +29,14 @@ def registration_of(names: tuple[str, ...], m: FloatArray) -> FloatArray:
     """Shift and turn ``(6,)`` out of parameters ``m (p,)``; zero where ``names`` lacks one."""
     values = dict(zip(names, map(float, m), strict=True))
     return np.array([values.get(name, 0.0) for name in REGISTRATION])
+
+
+def unit_of(name: str) -> str:
+    """Unit of a parameter of a closure or of a displacement; empty for what has none."""
+    if name in REGISTRATION:
+        return "mm" if name.startswith("shift") else "degrees"
+    kind = KINDS.get(name.partition(".")[0])
+    return "" if kind is None else kind.unit
 
 
 def displace(points: FloatArray, registration: FloatArray, centre: FloatArray) -> FloatArray:

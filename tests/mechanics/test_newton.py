@@ -1,5 +1,7 @@
 """Newton's method: quadratic where it converges, a value with a reason where it does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from mvest.mechanics import (
 )
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.solid import Solid
+from mvest.mechanics.steps import Simulation, StepRecord
 from tests.mechanics.bodies import MATERIALS, block, sandwich
 
 
@@ -239,3 +242,21 @@ def test_an_equilibrium_that_is_never_found_is_a_failure(monkeypatch):
     result = sheet(static=True)
     assert result.reason is StepReason.NO_CONVERGENCE
     assert len(result.times) == 1
+
+
+def test_a_simulation_prints_how_it_went():
+    # Two steps of 3 and 2 residuals, the last of which is after the last iteration.
+    records = tuple(
+        StepRecord(t, 0.1, residuals, 0, 0)
+        for t, residuals in ((0.1, (1.0, 1e-3, 1e-9)), (0.2, (1.0, 1e-9)))
+    )
+    frames = np.zeros((3, 7, 3))
+    done = Simulation(
+        np.array([0.0, 0.1, 0.2]), frames, np.zeros((3, 2, 7, 3)), StepReason.COMPLETED, records
+    )
+    assert str(done) == (
+        "completed at t = 0.2 s: 3 frames of 7 nodes, 2 sensitivities; 2 steps, 3 Newton iterations"
+    )
+    assert str(replace(done, reason=StepReason.SINGULAR)).startswith(
+        "the tangent could not be factorised at t = 0.2 s"
+    )

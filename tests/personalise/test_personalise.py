@@ -68,6 +68,15 @@ def test_a_twin_without_noise_gives_back_the_moduli_and_what_was_hidden(monkeypa
         assert distance.personalised.max() < 1e-3
         assert distance.generic.mean() > 1.0
         assert distance.registered.mean() < distance.generic.mean()
+    lines = str(found).splitlines()
+    assert lines[0] == f"case {found.case.name}"
+    assert lines[1].startswith("E_f.anterior")
+    assert lines[1].endswith("MPa")
+    closed, late = (d.generic.mean() for d in found.distances)
+    assert lines[-2:] == [
+        f"closed: {closed:.2f} mm generic, 0.00 mm personalised",
+        f"late: {late:.2f} mm generic, 0.00 mm personalised (held out)",
+    ]
 
 
 def test_noise_is_covered_by_the_intervals(monkeypatch):

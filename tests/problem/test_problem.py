@@ -14,6 +14,7 @@ from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteN
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Problem
+from mvest.problem.registration import unit_of
 from mvest.problem.synthetic import Truth, TwinData, simulate_observation
 
 NAMES = ("E_f.anterior", "E_f.posterior")
@@ -345,3 +346,41 @@ def test_estimates_from_a_shared_start_do_not_depend_on_each_other() -> None:
     ]
     # The model is one for which this is not a matter of course.
     assert estimates([0, 1, 2], shared=False)[2] != estimates([2], shared=False)[0]
+
+
+def test_a_result_prints_what_a_person_wants_to_know() -> None:
+    data = observe(noise_mm=0.05)
+    assert data.observation is not None
+    result = dataclasses.replace(
+        estimate(case(), data.observation).against(data.truth), seconds=1.25
+    )
+    assert result.filtered is not None
+    std = result.filtered.std
+    rows = str(result).splitlines()
+    assert rows[0] == f"E_f.anterior   {result.filtered.mean[0]:.4g} ± {std[0]:.2g} MPa"
+    assert rows[1].startswith("E_f.posterior  2.")
+    assert rows[2].startswith("converged: the change of every parameter is below the tolerance")
+    assert f"{result.filtered.iterations} iterations" in rows[2]
+    assert rows[2].endswith(f"{result.filtered.forward_solves} forward solves, 1.2 s")
+    assert rows[3] == f"fitted to observed: {np.mean(result.distance):.2f} mm on average"
+    assert rows[4:] == ["truth: E_f.anterior 6.23, E_f.posterior 2.09"]
+    # An estimate by itself knows no units.
+    assert str(result.filtered).splitlines()[0] == rows[0].removesuffix(" MPa")
+
+
+def test_a_result_without_an_estimate_prints_why() -> None:
+    assert str(StudyResult.failed(case(), "no frame", 0.0)) == "no estimate: no frame"
+    data = observe()
+    assert data.observation is not None
+    failed = estimate(case(failing), data.observation)
+    assert str(failed).startswith("no estimate: not converged: the model gives no prediction")
+    assert "Newton's method did not converge" in str(failed)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("E_f.anterior", "MPa"), ("pressure_scale", ""), ("shift.x", "mm"), ("turn.z", "degrees"),
+     ("m[0]", "")],
+)  # fmt: skip
+def test_units_of_parameters(name: str, unit: str) -> None:
+    assert unit_of(name) == unit
