@@ -9,9 +9,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.cases.blind import SECRET
 from experiments.common.cases.own_case import run_case
-from experiments.common.expectation import foresee_patient
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import make_patient, reveal, run_patient
+from experiments.studies.patient.study import foresee_patient, make_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
