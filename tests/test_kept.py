@@ -1,12 +1,16 @@
 """Entries of a store: made once, whole, in the order in which they are asked for."""
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
+import mvest.kept
 from mvest.errors import InputError, MeshingError
 from mvest.kept import Counts, Entry, get_or_make
 
@@ -83,8 +87,10 @@ def test_what_would_not_be_the_same_again_is_refused(tmp_path):
 
     (tmp_path / "entry").touch()
     entry = Entry(tmp_path / "entry", refuse, remake=False)
+    make = made("a")
     with pytest.raises(MeshingError, match="is damaged"):
-        entry.get_or_make(made("a"), write)
+        entry.get_or_make(make, write)
+    assert make.calls == 0
 
 
 def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
@@ -155,6 +161,57 @@ def test_of_several_that_need_the_same_entries_one_makes_them_and_no_two_wait_fo
         thread.join(20)
         assert not thread.is_alive()
     assert len(calls) == 3
+
+
+MAKER = """
+import sys, time
+from pathlib import Path
+from mvest.kept import Entry
+
+folder, name = Path(sys.argv[1]), sys.argv[2]
+
+def write(path, value):
+    path.write_text(value)
+    (folder / f"{name} writes").touch()
+    if name == "killed":
+        time.sleep(60)
+
+print(Entry(folder / "entry", Path.read_text).get_or_make(lambda: name, write))
+"""
+
+
+def test_after_a_process_was_killed_while_it_wrote_one_of_those_that_wait_makes_the_entry(tmp_path):
+    def start(name):
+        command = [sys.executable, "-c", MAKER, str(tmp_path), name]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+    first = start("killed")
+    while not (tmp_path / "killed writes").exists():
+        assert first.poll() is None
+        time.sleep(0.01)
+    others = [start(name) for name in ("second", "third")]
+    time.sleep(0.2)
+    assert not (tmp_path / "entry").exists()
+    first.kill()
+    first.communicate()
+    said = {other.communicate(timeout=30)[0].strip() for other in others}
+    assert len(said) == 1
+    assert said <= {"second", "third"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "entry", ".entry.lock", "killed writes", f"{said.pop()} writes",
+    }  # fmt: skip
+
+
+def test_locks_are_taken_in_one_order_whatever_the_order_of_the_entries(tmp_path, monkeypatch):
+    taken = []
+
+    def lock(path):
+        taken.append(path.name)
+        return FileLock(path)
+
+    monkeypatch.setattr(mvest.kept, "FileLock", lock)
+    get_or_make([Entry(tmp_path / name, read) for name in "bca"], lambda numbers: numbers, write)
+    assert taken == [".a.lock", ".b.lock", ".c.lock"]
 
 
 def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):

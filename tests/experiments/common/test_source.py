@@ -203,7 +203,8 @@ def test_a_package_by_a_name_with_dots_is_all_that_it_offers(code):
 def test_two_names_that_change_places_are_another_code(code):
     edit(code, "mvest/units.py", "SCALE = 2.0", "from mvest.far import other\nSCALE = other()")
     edit(code, "experiments/build.py", "return 5", "return other()")
-    old, new = "from mvest.far import other", "from mvest.rooms.second import helper as other"
+    edit(code, "mvest/rooms/second.py", "helper", "other")
+    old, new = "from mvest.far import other", "from mvest.rooms.second import other"
     edit(code, "experiments/build.py", "LIMIT, helper", "LIMIT, helper; import mvest.rooms.second")
     before = sources(code)
     assert {"mvest.far", "mvest.rooms.second"} <= set(before.parts(ENTRY))
