@@ -65,61 +65,60 @@ for way in sys.stdin.read().splitlines():
 """
 
 
-@pytest.fixture
-def root(tmp_path):
-    folder = tmp_path / "root"
+OTHERS = [
+    "open(os.path.join('case', 'hidden.json')).read()",
+    # Only begins alike.
+    "open(os.path.join('hidden_from_nobody', 'hidden.json')).read()",
+    "os.listdir(root)",
+    "Path('out.json').write_text('x')",
+    "os.mkdir('more')",
+]
+WALK = "print(*[name for _, _, names in os.walk(root) for name in names], file=sys.stderr)"
+
+
+@pytest.fixture(scope="module")
+def attempts(tmp_path_factory):
+    """What came of every way in one sealed process, the folder they went for, and the walk's names.
+
+    A process of its own for each would import for seconds.
+    """
+    folder = tmp_path_factory.mktemp("sealed") / "root"
     for name in ("hidden", "case", "hidden_from_nobody"):
         (folder / name).mkdir(parents=True)
         (folder / name / "hidden.json").write_text('{"E_f.anterior": 4.321}')
         (folder / name / "positions.npz").write_bytes(b"")
     (folder / "door").symlink_to("hidden", target_is_directory=True)
     (folder / "window.json").symlink_to(Path("hidden") / "hidden.json")
-    return folder
-
-
-def attempt(root, ways):
+    ways = [*WAYS.values(), WALK, *OTHERS]
     finished = subprocess.run(
-        [sys.executable, "-c", ATTEMPT, str(root)],
+        [sys.executable, "-c", ATTEMPT, str(folder)],
         input="\n".join(ways),
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=True,
     )
-    return dict(zip(ways, finished.stdout.splitlines(), strict=True))
+    outcome = dict(zip(ways, finished.stdout.splitlines(), strict=True))
+    return outcome, folder, finished.stderr.split()
 
 
-def test_a_sealed_folder_cannot_be_opened_in_any_usual_way(root):
-    outcome = attempt(root, list(WAYS.values()))
+def test_a_sealed_folder_cannot_be_opened_in_any_usual_way(attempts):
+    outcome, root, _ = attempts
     assert {way: outcome[code] for way, code in WAYS.items()} == dict.fromkeys(WAYS, "sealed")
     assert sorted(path.name for path in (root / "hidden").iterdir()) == [
         "hidden.json", "positions.npz"
     ]  # fmt: skip
 
 
-def test_all_other_folders_can(root):
-    ways = [
-        "open(os.path.join('case', 'hidden.json')).read()",
-        # Only begins alike.
-        "open(os.path.join('hidden_from_nobody', 'hidden.json')).read()",
-        "os.listdir(root)",
-        "Path('out.json').write_text('x')",
-        "os.mkdir('more')",
-    ]
-    assert set(attempt(root, ways).values()) == {"done"}
+def test_all_other_folders_can(attempts):
+    outcome, _, _ = attempts
+    assert {outcome[way] for way in OTHERS} == {"done"}
 
 
-def test_a_walk_does_not_name_what_is_sealed(root):
-    way = "print(*[name for _, _, names in os.walk(root) for name in names], file=sys.stderr)"
-    finished = subprocess.run(
-        [sys.executable, "-c", ATTEMPT, str(root)],
-        input=way,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert finished.stderr.split().count("hidden.json") == 2
+def test_a_walk_does_not_name_what_is_sealed(attempts):
+    outcome, _, names = attempts
+    assert outcome[WALK] == "done"
+    assert names.count("hidden.json") == 2
 
 
 def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
