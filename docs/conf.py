@@ -32,6 +32,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "api_pages",
+    "rooms",
     "study_pages",
     "computed_tables",
 ]
@@ -85,9 +86,10 @@ README_PAGES = {
 
 
 def link_to_pages(app: Sphinx, path: Path, docname: str, content: list[str]) -> None:
-    """Turn the links between included READMEs into links between pages."""
+    """Turn the links between included files into links between pages."""
     for readme, page in README_PAGES.items():
         content[0] = re.sub(rf"\({re.escape(readme)}(#[^)]*)?\)", f"({page})", content[0])
+    content[0] = re.sub(r"\(docs/(\w+\.md)\)", r"(\1)", content[0])
 
 
 def setup(app: Sphinx) -> None:

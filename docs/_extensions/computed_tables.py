@@ -18,7 +18,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
-from mvest.mechanics.parameters import KINDS, Part
+from mvest.mechanics.parameters import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,7 +37,7 @@ def parameter_table() -> str:
     rows = []
     for name, kind in KINDS.items():
         names = [f"`{name}`"] if kind.whole else []
-        names += [f"`{name}.{kind.part.value}`"] if kind.part is not Part.NONE else []
+        names += [f"`{name}.{kind.part.value}`"] if kind.part.value else []
         names = [text.replace(" or ", f"`, `{name}.") for text in names]
         rows.append(
             [

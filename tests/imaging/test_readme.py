@@ -12,16 +12,21 @@ from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from tests.places import ROOT
 
-OWN, MAIN = (ROOT / "mvest" / "imaging" / "README.md", ROOT / "README.md")
+OWN, PAGE = ROOT / "mvest" / "imaging" / "README.md", ROOT / "docs" / "volume.md"
+SETTINGS = {"imaged": ImagedSettings, "imaging": ImagingSettings}
 
 
-@pytest.mark.parametrize("path", [OWN, MAIN], ids=["imaging", "main"])
-def test_settings_that_are_named_exist(path):
+@pytest.mark.parametrize(
+    ("path", "parts"),
+    [(OWN, ("imaged", "imaging")), (PAGE, ("imaged",))],
+    ids=["imaging", "volume"],
+)
+def test_settings_that_are_named_exist(path, parts):
     text = path.read_text(encoding="utf-8")
-    for part, config in (("imaged", ImagedSettings), ("imaging", ImagingSettings)):
+    for part in parts:
         named = set(re.findall(rf"(?<![\w./]){part}\.(\w+)\b", text)) - {"md"}
         assert named, part
-        assert named <= {f.name for f in fields(config)}
+        assert named <= {f.name for f in fields(SETTINGS[part])}
 
 
 def test_all_stages_and_landmarks_are_named():

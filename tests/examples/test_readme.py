@@ -1,0 +1,42 @@
+"""The README: short, its example runs, its table is the published one, its links lead somewhere."""
+
+import re
+
+from tests.places import ROOT
+
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_it_is_short():
+    assert len(TEXT.splitlines()) <= 150
+
+
+def test_the_example_prints_what_it_says(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", TEXT, flags=re.DOTALL)
+    lines = [line for line in code.splitlines() if line.strip()]
+    assert len([line for line in lines if not line.startswith((" ", "import"))]) <= 12
+    exec(compile(code, "README.md", "exec"), {})
+    promised = re.search(r"# (\[.*\]) MPa$", lines[-1])
+    assert promised is not None
+    assert capsys.readouterr().out.strip() == promised[1]
+
+
+def cells(line):
+    return [cell.strip().strip("*") for cell in line.strip("|").split("|")]
+
+
+def test_table_1_is_the_published_one():
+    published = (ROOT / "results" / "table1.md").read_text(encoding="utf-8")
+    rows = {row[0]: row for row in map(cells, published.splitlines()) if len(row) > 8}
+    section = TEXT.partition("## Table 1")[2].partition("\n## ")[0]
+    shown = [cells(line) for line in section.splitlines() if line.startswith("|")][2:]
+    assert [row[0] for row in shown] == list(rows)[2:]
+    for row in shown:
+        # Of the columns of the published table: estimates, their errors, distance and solves.
+        assert row == [rows[row[0]][k] for k in (0, 1, 2, 3, 4, 6, 8)]
+
+
+def test_local_links_lead_somewhere():
+    targets = re.findall(r"\]\((?!https?:|#)([^)#]+)", TEXT)
+    assert len(targets) > 15
+    assert [target for target in targets if not (ROOT / target).exists()] == []
