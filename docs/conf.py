@@ -72,6 +72,7 @@ sphinx_gallery_conf = {
     "min_reported_time": 1,
     "image_scrapers": ("matplotlib", "figure_scraper"),
     "ignore_pattern": "drawing",
+    "run_stale_examples": True,  # what they call may have changed
     "within_subsection_order": "FileNameSortKey",
 }
 

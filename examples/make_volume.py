@@ -13,6 +13,7 @@ import mvest
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume, true_sequence
 from mvest.imaging.writing.slicer import write_sequence_nrrd
 from mvest.simulation.motion import MotionSettings, close_in_motion
+from mvest.valve.anatomy.dimensions import AnnulusDimensions
 
 MODULI = {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
 TISSUE = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSettings(1.11)}
@@ -20,7 +21,7 @@ TISSUE = {"anterior": mvest.TissueSettings(2.65), "posterior": mvest.TissueSetti
 
 def make_volume(frames=4, seed=3):
     """The volume and, for comparison, where the valve in it truly is."""
-    template = mvest.Template(mvest.TemplateParameters(half_commissural=17.2, half_ap=13.4))
+    template = mvest.Template(mvest.TemplateParameters(AnnulusDimensions(17.2, 13.4)))
     settings = MotionSettings(frames=frames, held_pressure=(), held_relaxation=())
     valve = close_in_motion("example", template, MODULI, settings, mvest.MechanicsSettings(TISSUE))
     probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))

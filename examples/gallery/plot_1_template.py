@@ -11,12 +11,21 @@ from drawing import draw, same_scale
 
 import mvest
 from mvest.reporting.case.drawing import ATRIUM, SIDE
+from mvest.valve.anatomy.dimensions import (
+    AnnulusDimensions,
+    FreeEdge,
+    LeafletDimensions,
+    LeafletPair,
+)
 from mvest.valve.measure.clinical import clinical_measurements
 
+posterior = LeafletDimensions(length=22.0, thickness=1.26)
 anatomies = {
     "template": mvest.TemplateParameters(),
-    "wide annulus": mvest.TemplateParameters(half_commissural=20.5, half_ap=17.0),
-    "long posterior leaflet": mvest.TemplateParameters(length_posterior=22.0, edge_posterior=8.5),
+    "wide annulus": mvest.TemplateParameters(annulus=AnnulusDimensions(20.5, 17.0)),
+    "long posterior leaflet": mvest.TemplateParameters(
+        leaflets=LeafletPair(posterior=posterior), free_edge=FreeEdge(posterior_depth=8.5)
+    ),
 }
 drawn = []
 figure, panels = plt.subplots(2, 3, figsize=(9, 6.2), layout="constrained")

@@ -64,7 +64,7 @@ def test_there_are_scripts_and_they_are_short():
     for path in GALLERY:
         text = path.read_text(encoding="utf-8")
         code = [line for line in text.splitlines() if line and not line.startswith("#")]
-        assert len(code) <= 56, path.name
+        assert len(code) <= 60, path.name
         assert re.match(r'"""\n.+\n=+\n\n', text), f"{path.name} has no title"
 
 
