@@ -53,7 +53,7 @@ class ImagedSettings:
     held_out: tuple[Any, ...] = ()  # [frame, mmHg]: closed frames not shown
     thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
     valve_confidence: float = 0.6  # of the best frame; below it there is no valve (0: show it)
-    least_confidence: float = 0.6  # of the frames that are chosen
+    min_confidence: float = 0.6  # of the frames that are chosen
     error_samples: int = 20  # at most, with which the valve is closed anew
     name: str | None = None  # null: the name of the file
     description: str = ""

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.common.plain import flat
 from experiments.run import main
 from mvest.external import write_points
 from tests.external.programs import SPRINGS, springs
@@ -52,7 +53,7 @@ def run(tmp_path, monkeypatch, capsys):
 def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     status, said = run()
     assert status == 0, said.err
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     # Data without noise; the prior's weight is that of 0.01 mm against 3 N/mm, about 1e-3.
     np.testing.assert_allclose(record["estimate"], M, rtol=2e-3)
     # The covariance of least squares, from the derivatives by hand.
@@ -69,7 +70,7 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     assert "differences of its predictions" in said.out
     # The runs are kept: the same study again starts no program.
     status, said = run()
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     assert (status, record["program"]["runs"]) == (0, 0)
     assert record["program"]["reused"] == program["runs"]
 
@@ -93,7 +94,7 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     (tmp_path / "solve.py").write_text("import sys; sys.exit('out of licences')")
     status, said = run()
     assert status == 1
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     assert record["status"] == "failed"
     assert "out of licences" in record["detail"]
     assert record["estimate"] is None

@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_dir
 
 from experiments.common.build import build_filter
 from experiments.common.config import plain, register
+from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.filters.problem import (
     FilterProblem,
@@ -159,7 +160,7 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     ]
     monkeypatch.setattr(sys, "argv", arguments)
     assert main() == 0
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     (problem,) = record["problems"]
     found = problem["filters"]
     assert list(found) == ["extended", "iterated", "unscented", "ensemble", "monte_carlo"]
@@ -187,5 +188,5 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     store.write_text(json.dumps(changed))
     monkeypatch.setattr(sys, "argv", [*arguments, "force=true"])
     assert main() == 0
-    again = json.loads((folder / "result.json").read_text())
+    again = flat(json.loads((folder / "result.json").read_text()))
     assert again["problems"][0]["filters"]["iterated"]["detail"] == "from the store"

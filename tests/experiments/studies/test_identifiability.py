@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
 from experiments.studies.identifiability.report import write_identifiability_study
@@ -65,7 +66,7 @@ def made(tmp_path_factory):
             ["run", *SMALL, "experiment=identifiability", *TINY, "hydra.run.dir=here"],
         )  # fmt: skip
         assert main() == 0
-    record = json.loads((place / "here" / "result.json").read_text())
+    record = flat(json.loads((place / "here" / "result.json").read_text()))
     return record, place / "here", seen
 
 
@@ -145,7 +146,7 @@ def test_a_valve_that_does_not_close_is_a_failed_record(tmp_path, monkeypatch, c
     )
     assert status == 1
     assert "closed at 4 mmHg: no equilibrium" in said.err
-    assert json.loads((tmp_path / "here" / "result.json").read_text())["status"] == "failed"
+    assert flat(json.loads((tmp_path / "here" / "result.json").read_text()))["status"] == "failed"
 
 
 def test_sets_of_vertices():

@@ -2,13 +2,16 @@
 
 import json
 
+import pandas as pd
 import pytest
 
+from experiments.common.record import record_from
+from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
-from experiments.studies.imaged_patient.report import publish_volume
-from experiments.studies.imaged_patient.study import ImagedPlace, volume_rows
+from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
 from mvest.errors import InputError
 from tests.reporting.records import record as a_record
+from tests.reporting.records import stored
 
 
 def estimated(anterior, posterior, status="converged"):
@@ -49,17 +52,23 @@ def test_what_is_hidden_lies_together(tmp_path):
 
 
 def test_the_table_is_that_of_all_patients(tmp_path):
+    def kept(name: str, rows) -> None:
+        made = {**a_record(), "table": "volume", "rows": rows}
+        record = record_from(stored(made, "imaged_patient"), dict, name)
+        publish(STUDY, tmp_path, f"volumes-{name}", record, tmp_path / "no such folder")
+
     for name, found in (("a", estimated(5.0, 2.5)), ("b", None)):
-        rows = volume_rows(name, found, estimated(5.8, 2.1), TRUTH)
-        publish_volume(tmp_path, f"volumes-{name}", {**a_record(), "rows": rows})
-    kept = json.loads((tmp_path / "volume.json").read_text())
-    assert [row["patient"] for row in kept["rows"]] == ["a", "a", "b", "b"]
-    assert (tmp_path / "volume" / "volumes-b.json").is_file()
+        kept(name, volume_rows(name, found, estimated(5.8, 2.1), TRUTH))
+    assert {path.stem for path in (tmp_path / "records" / "volume").iterdir()} == {
+        "volumes-a", "volumes-b"
+    }  # fmt: skip
+    table = pd.read_csv(tmp_path / "volume.csv", comment="#")
+    assert list(table["patient"]) == ["a", "a", "b", "b"]
     # Run again, a patient takes its own place.
-    rows = volume_rows("a", estimated(5.5, 2.2), estimated(5.8, 2.1), TRUTH)
-    publish_volume(tmp_path, "volumes-a", {**a_record(), "rows": rows})
-    kept = json.loads((tmp_path / "volume.json").read_text())
-    assert [row["estimate"] for row in kept["rows"]] == [5.5, 2.2, None, None]
+    kept("a", volume_rows("a", estimated(5.5, 2.2), estimated(5.8, 2.1), TRUTH))
+    table = pd.read_csv(tmp_path / "volume.csv", comment="#")
+    assert list(table["estimate [MPa]"][:2]) == [5.5, 2.2]
+    assert table["estimate [MPa]"][2:].isna().all()
     assert list(tmp_path.glob("volume.md"))
 
 

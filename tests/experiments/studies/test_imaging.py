@@ -14,11 +14,13 @@ from omegaconf import OmegaConf
 
 from experiments import tables
 from experiments.common.config import register
+from experiments.common.plain import flat
+from experiments.common.record import read_record
+from experiments.results.keep import publish
 from experiments.run import main
 from experiments.studies.imaging import study as imaging
 from experiments.studies.imaging.held_out import HeldOut
 from experiments.studies.imaging.record import _confidences, _threshold, learning_rows, table_row
-from experiments.studies.imaging.report import publish_imaging
 from experiments.studies.imaging.store import ImagingStore, StoredSamples
 from experiments.studies.imaging.trials import KINDS, Trial
 from mvest.errors import ConfigurationError, InputError
@@ -66,7 +68,7 @@ def done(tmp_path_factory) -> Path:
 
 
 def record_of(place: Path, run: str = "run") -> dict:
-    return json.loads((place / run / "result.json").read_text(encoding="utf-8"))
+    return flat(json.loads((place / run / "result.json").read_text(encoding="utf-8")))
 
 
 def changed(place: Path) -> dict[str, int]:
@@ -147,13 +149,14 @@ def test_tables_and_figures_are_made_and_made_again(
     # Overrides keep a run out of the results.
     assert not (done / "results").exists()
     results = tmp_path / "results"
-    publish_imaging(results, record_of(done))
+    record = read_record(done / "run" / "result.json", imaging.STUDY.findings)
+    publish(imaging.STUDY, results, "imaging", record, done / "run")
     assert (results / "imaging.md").read_text(encoding="utf-8") == text
-    assert "volumes" not in json.loads((results / "imaging.json").read_text(encoding="utf-8"))
+    kept = json.loads((results / "records" / "imaging" / "imaging.json").read_text("utf-8"))
+    assert "volumes" in record.findings
+    assert "volumes" not in kept["findings"]
     for path in results.glob("imaging*.md"):
         path.unlink()
-    # Only its own record is there: the others' tables are asked for by name.
-    monkeypatch.setattr(tables, "regenerate", lambda _results: [])
     assert tables.main([str(results)]) == 0
     assert (results / "imaging.md").read_text(encoding="utf-8") == text
     assert "imaging_std.png" in capsys.readouterr().out

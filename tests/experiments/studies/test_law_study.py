@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.common.plain import flat
 from experiments.run import main
 
 SMALL = (
@@ -45,7 +46,7 @@ def run(tmp_path, monkeypatch, capsys):
         status = main()
         folder = tmp_path / "here"
         file = folder / "result.json"
-        record = json.loads(file.read_text()) if file.is_file() else None
+        record = flat(json.loads(file.read_text())) if file.is_file() else None
         return status, record, folder, capsys.readouterr()
 
     return call

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.models.report import models_text, write_models_tables
 from experiments.studies.models.study import OTHER_LAW, OWN, PROGRAM, PROGRAM_ALONE, SECOND
@@ -37,7 +38,7 @@ def done(tmp_path_factory):
         patch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)
         patch.setattr(sys, "argv", ["experiments.run", *SMALL])
         assert main() == 0
-    return json.loads((folder / "here" / "result.json").read_text()), folder / "here"
+    return flat(json.loads((folder / "here" / "result.json").read_text())), folder / "here"
 
 
 def test_every_model_estimates_from_the_data(done):

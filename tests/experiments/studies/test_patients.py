@@ -2,6 +2,8 @@
 
 import copy
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,31 +11,26 @@ import pytest
 from matplotlib.figure import Figure
 
 from experiments.common.cases import tables as patient_tables
-from experiments.common.cases.report import (
-    KEPT_ARRAYS,
-    case_text,
-    publish_patient,
-    write_case_tables,
-)
-from experiments.common.cases.tables import (
-    figure3,
-    read_kept,
-    table2,
-    table3,
-    write_patient_tables,
-)
+from experiments.common.cases.report import case_text, write_case_tables
+from experiments.common.cases.tables import figure3, in_order, table2, table3, write_patient_tables
+from experiments.common.record import record_from
+from experiments.results.keep import publish
 from experiments.studies.patient.population import (
     _clopper_pearson,
     population_figure,
     population_frame,
     write_population_tables,
 )
+from experiments.studies.patient.report import KEPT_ARRAYS
+from experiments.studies.patient.study import STUDY
 from mvest.errors import InputError
-from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from tests.reporting.case.made_up_case import arrays
+from tests.reporting.records import record as a_record
+from tests.reporting.records import stored
 
 TRUTH = {"E_f.anterior": 6.0, "E_f.posterior": 2.0, "pressure_scale": 1.05, "shift.x": 0.4}
+PLACE, DRAWN = Path("records") / "patients", Path("records") / "population"
 UNIT = {"E_f": "MPa", "shift": "mm"}
 
 
@@ -131,10 +128,18 @@ def failed(name="prolapse"):
     )
 
 
-def keep(results, records, table="patients"):
-    (results / table).mkdir(parents=True, exist_ok=True)
-    for record in records:
-        write_json(results / table / f"{record['case']['name']}.json", record)
+def by_name(records) -> dict:
+    """As the tables take them: in their order."""
+    return in_order({record["case"]["name"]: record for record in records})
+
+
+def published(results, name, record, fields):
+    """Publish a run that left ``fields`` in its folder."""
+    folder = results / "run"
+    folder.mkdir(exist_ok=True)
+    shutil.copy(fields, folder / "fields.npz")
+    made = record_from(stored({**a_record(), **record}, "patient"), dict, name)
+    return publish(STUDY, results, name, made, folder)
 
 
 @pytest.fixture(scope="module")
@@ -181,8 +186,7 @@ def test_the_words_count_what_the_tables_hold(tmp_path):
     other = made_up("normal_large")
     other["unknowns"][1] = row("E_f.posterior", 4.0, 0.5)
     other["distances"][0] = distance("closed", True, 1.0, 0.9, 1.2)
-    keep(tmp_path, [made_up(), other])
-    write_patient_tables(tmp_path)
+    write_patient_tables(tmp_path, by_name([made_up(), other]), {})
     second = (tmp_path / "table2.md").read_text()
     assert "contains the truth for 3 of 4 moduli" in second
     assert "without nuisances for 2 of 4" in second
@@ -203,16 +207,14 @@ def test_the_words_count_what_the_tables_hold(tmp_path):
 
 def test_patients_come_in_their_order_and_others_by_name(tmp_path):
     names = ["zebra", "prolapse", "aardvark", "normal_small", "fibroelastic"]
-    keep(tmp_path, [made_up(name) for name in names])
-    assert [r["case"]["name"] for r in read_kept(tmp_path, "patients").values()] == [
+    assert list(by_name(made_up(name) for name in names)) == [
         "normal_small", "prolapse", "fibroelastic", "aardvark", "zebra"
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("records", [[failed()], [made_up(), failed()]], ids=["alone", "beside"])
 def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
-    keep(tmp_path, records)
-    write_patient_tables(tmp_path)
+    write_patient_tables(tmp_path, by_name(records), {})
     text = (tmp_path / "table2.md").read_text()
     assert "prolapse" in text
     assert "nan" not in text
@@ -225,54 +227,40 @@ def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
 
 
 def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
-    keep(tmp_path, [made_up(without_nuisances=None, as_in_the_paper=None)])
-    write_patient_tables(tmp_path)
+    write_patient_tables(
+        tmp_path, by_name([made_up(without_nuisances=None, as_in_the_paper=None)]), {}
+    )
     text = (tmp_path / "table2.md").read_text()
     assert "without nuisances for" not in text
     mixed = made_up("prolapse")
     mixed["as_in_the_paper"]["parameters"] = moduli(None, None)
-    keep(tmp_path, [mixed])
-    write_patient_tables(tmp_path)
+    write_patient_tables(tmp_path, by_name([mixed]), {})
     text = (tmp_path / "table2.md").read_text()
     assert "without nuisances for 1 of 2" in text
     assert "paper's filter for" not in text
 
 
-def test_without_patients_there_is_nothing_to_write(tmp_path):
-    assert write_patient_tables(tmp_path) == []
-    assert write_population_tables(tmp_path) == []
-
-
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"case": 1}'])
-def test_a_damaged_record_is_named(tmp_path, text):
-    (tmp_path / "patients").mkdir()
-    (tmp_path / "patients" / "bad.json").write_text(text)
-    with pytest.raises(InputError, match=r"bad\.json is no record of a patient"):
-        write_patient_tables(tmp_path)
-
-
 def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file):
-    written = publish_patient(tmp_path, "patients-normal-small", made_up(), fields_file)
+    written = published(tmp_path, "patients-normal-small", made_up(), fields_file)
     assert {path.name for path in written} == {
         f"{table}.{kind}" for table in ("table2", "table3") for kind in ("csv", "md", "tex")
     } | {"figure3.png", "figure3.pdf"}
-    kept = json.loads((tmp_path / "patients" / "patients-normal-small.json").read_text())
-    assert kept["unknowns"] == made_up()["unknowns"]
-    with np.load(tmp_path / "patients" / "patients-normal-small.npz") as stored:
+    kept = json.loads((tmp_path / PLACE / "patients-normal-small.json").read_text())
+    assert kept["findings"]["unknowns"] == made_up()["unknowns"]
+    with np.load(tmp_path / PLACE / "patients-normal-small.npz") as stored:
         assert set(stored.files) <= set(KEPT_ARRAYS)
         assert "sensitivity" not in stored.files
         assert "truth" not in stored.files
     first = {path: path.read_bytes() for path in written}
-    again = publish_patient(tmp_path, "patients-normal-small", made_up(), fields_file)
+    again = published(tmp_path, "patients-normal-small", made_up(), fields_file)
     assert {path: path.read_bytes() for path in again} == first
-    publish_patient(tmp_path, "patients-prolapse", made_up("prolapse"), fields_file)
+    published(tmp_path, "patients-prolapse", made_up("prolapse"), fields_file)
     table = pd.read_csv(tmp_path / "table2.csv", comment="#")
     assert list(table["patient"].unique()) == ["normal_small", "prolapse"]
 
 
 def test_a_table_reads_back_as_it_was(tmp_path):
-    keep(tmp_path, [made_up(), made_up("prolapse")])
-    write_patient_tables(tmp_path)
+    write_patient_tables(tmp_path, by_name([made_up(), made_up("prolapse")]), {})
     back = pd.read_csv(tmp_path / "table3.csv", comment="#")
     pd.testing.assert_frame_equal(back, table3([made_up(), made_up("prolapse")]))
     assert (tmp_path / "table3.csv").read_text().startswith("# ")
@@ -338,8 +326,7 @@ def test_bounds_of_a_share(inside, n, low, high):
 
 
 def test_the_population_counts_how_often_intervals_hold(tmp_path):
-    keep(tmp_path, population(), "population")
-    write_population_tables(tmp_path)
+    write_population_tables(tmp_path, population())
     text = (tmp_path / "population.md").read_text()
     line = next(x for x in text.splitlines() if "with nuisances" in x and "anterior" in x)
     assert "18 (90 %)" in line
@@ -364,14 +351,13 @@ def test_the_population_counts_how_often_intervals_hold(tmp_path):
 
 def test_failures_of_the_population_are_counted_and_not_drawn(tmp_path):
     lost = [failed("drawn_98") | {"table": "population"}]
-    keep(tmp_path, [*population(4, 1), *lost], "population")
-    write_population_tables(tmp_path)
+    write_population_tables(tmp_path, [*population(4, 1), *lost])
     text = (tmp_path / "population.md").read_text()
     assert "4 of 5" in text
     assert "nan" not in text
     only = tmp_path / "only"
-    keep(only, lost, "population")
-    write_population_tables(only)
+    only.mkdir()
+    write_population_tables(only, lost)
     text = (only / "population.md").read_text()
     assert "0 of 1" in text
     assert "nan" not in text
@@ -387,10 +373,10 @@ def test_the_population_s_figure_draws_every_interval():
 
 def test_only_the_tables_parts_of_a_drawn_patient_are_kept(tmp_path, fields_file):
     record = population(1, 0)[0]
-    publish_patient(tmp_path, "population-drawn-0", record, fields_file)
-    kept = json.loads((tmp_path / "population" / "population-drawn-0.json").read_text())
-    assert not {"settings", "measurements"} & set(kept)
-    assert [path.suffix for path in (tmp_path / "population").iterdir()] == [".json"]
+    published(tmp_path, "population-drawn-0", record, fields_file)
+    kept = json.loads((tmp_path / DRAWN / "population-drawn-0.json").read_text())
+    assert not {"settings", "measurements"} & set(kept["findings"])
+    assert [path.suffix for path in (tmp_path / DRAWN).iterdir()] == [".json"]
 
 
 def test_a_finished_case_is_told():

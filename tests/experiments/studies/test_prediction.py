@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.prediction import study as prediction
 from experiments.studies.prediction.figure import PANELS, prediction_figure
@@ -86,7 +87,7 @@ def run(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", command)
         status = main()
         path = tmp_path / "here" / "result.json"
-        record = json.loads(path.read_text()) if path.is_file() else None
+        record = flat(json.loads(path.read_text())) if path.is_file() else None
         return status, record, tmp_path / "here", capsys.readouterr()
 
     return call

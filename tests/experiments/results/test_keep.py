@@ -1,19 +1,27 @@
 import json
+from typing import Any
 
 import pytest
 
-from experiments.studies.twin.publish import publish, read_records, regenerate
+from experiments.common.record import Record, record_from
+from experiments.results.keep import publish, regenerate
+from experiments.studies.twin.study import STUDY
 from mvest.errors import InputError
-from tests.reporting.records import failed_record, record
+from tests.reporting.records import failed_record, record, stored
+
+
+def kept(results, name: str, data: dict[str, Any]) -> None:
+    """Publish a made-up run that left no arrays."""
+    made: Record[dict] = record_from(stored(data), dict, name)
+    publish(STUDY, results, name, made, results / "no such folder")
 
 
 def test_tables_grow_with_the_records_and_need_nothing_else(tmp_path) -> None:
-    publish(tmp_path, "table1", record(), tmp_path / "none.npz")
-    publish(
+    kept(tmp_path, "table1", record())
+    kept(
         tmp_path,
         "table1_independent",
         record(row="independent truth", experiment="table1_independent"),
-        tmp_path / "none.npz",
     )
     before = {path.name: path.read_bytes() for path in tmp_path.glob("table1.*")}
     assert set(before) == {"table1.csv", "table1.md", "table1.tex", "table1.png", "table1.pdf"}
@@ -26,8 +34,8 @@ def test_tables_grow_with_the_records_and_need_nothing_else(tmp_path) -> None:
 
 
 def test_each_table_takes_its_own_records(tmp_path) -> None:
-    publish(tmp_path, "table1", record(), tmp_path / "none.npz")
-    publish(tmp_path, "meshes-a", failed_record(table="meshes", row="a"), tmp_path / "none.npz")
+    kept(tmp_path, "table1", record())
+    kept(tmp_path, "meshes-a", failed_record(table="meshes", row="a"))
     assert "a" not in [
         line.split("|")[1].strip() for line in (tmp_path / "table1.md").read_text().splitlines()[3:]
         if line.startswith("|")
@@ -42,10 +50,16 @@ def test_an_empty_folder_says_what_to_run(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{", "not JSON"), (json.dumps({"a": 1}), "lacks experiment"), ("3", "lacks")],
+    [
+        ("{", "not JSON"),
+        (json.dumps({"study": "twin", "a": 1}), "no record of a run: schema: Field required"),
+        (json.dumps({"a": 1}), "study = 'None', expected one of"),
+        ("3", "holds a int"),
+    ],
 )
 def test_a_damaged_record_is_named(tmp_path, text: str, words: str) -> None:
-    (tmp_path / "records").mkdir()
-    (tmp_path / "records" / "bad.json").write_text(text)
+    place = tmp_path / "records" / "table1"
+    place.mkdir(parents=True)
+    (place / "bad.json").write_text(text)
     with pytest.raises(InputError, match=words):
-        read_records(tmp_path)
+        regenerate(tmp_path)
