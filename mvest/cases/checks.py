@@ -22,8 +22,8 @@ from mvest.cases.schema import CaseFile, wrong
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae
-from mvest.valve.geometry.proximity import surface_edges
 from mvest.valve.geometry.surface_checks import check_surface
+from mvest.valve.geometry.triangles import area_vectors, surface_edges
 
 __all__ = [
     "at",
@@ -197,8 +197,7 @@ def check_normals(
     The vector area of all triangles is that of the annulus less that of the smaller orifice, so its
     side does not depend on how the leaflets lie.
     """
-    corner = vertices[triangles]
-    area = 0.5 * np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).sum(axis=0)
+    area = area_vectors(vertices, triangles).sum(axis=0)
     towards = tips.mean(axis=0) - vertices[annulus].mean(axis=0)
     if area @ towards <= 0:
         raise GeometryError(

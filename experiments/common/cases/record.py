@@ -16,7 +16,7 @@ from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.proximity import surface_edges
+from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.clinical import clinical_measurements
 
 __all__ = ["case_record", "fields_of", "of_all_unknowns"]

@@ -9,7 +9,8 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.moving_valve import MovingValve
-from mvest.valve.geometry.proximity import intersecting_triangles, surface_edges
+from mvest.valve.geometry.proximity import intersecting_triangles
+from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
 

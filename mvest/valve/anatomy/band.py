@@ -16,6 +16,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, band_grid
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.thickening import smooth_vertex_normals
+from mvest.valve.geometry.triangles import directed_edges
 
 __all__ = ["Band"]
 
@@ -70,14 +71,8 @@ class Band:
 
         theta runs as phi does, and is unwrapped about each line's beginning.
         """
-        ends = np.vstack(
-            [
-                surface.triangles[:, [0, 1]],
-                surface.triangles[:, [1, 2]],
-                surface.triangles[:, [2, 0]],
-            ]
-        )
-        edges, number = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+        ends = np.sort(directed_edges(surface.triangles), axis=1)
+        edges, number = np.unique(ends, axis=0, return_inverse=True)
         region = np.tile(surface.region, 3)
         low = np.full(len(edges), 2)
         high = np.full(len(edges), -1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.triangles import area_vectors, areas
 
 __all__ = [
     "BandGrid",
@@ -115,8 +116,7 @@ def band_grid(columns: int, rows: int) -> BandGrid:
 
 def vertex_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Area-weighted unit normals ``(n, 3)`` of a triangulated surface."""
-    corner = vertices[triangles]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    face = area_vectors(vertices, triangles)
     normal = np.zeros_like(vertices)
     for k in range(3):
         np.add.at(normal, triangles[:, k], face)
@@ -125,11 +125,8 @@ def vertex_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 
 def lumped_areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Area ``(n,)`` in mm^2 that belongs to each vertex: a third of each adjacent triangle."""
-    corner = vertices[triangles]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
-    )
-    total = np.bincount(triangles.ravel(), np.repeat(area / 3, 3), minlength=len(vertices))
+    share = np.repeat(areas(vertices, triangles) / 3, 3)
+    total = np.bincount(triangles.ravel(), share, minlength=len(vertices))
     return np.asarray(total, dtype=np.float64)
 
 

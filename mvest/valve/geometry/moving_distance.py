@@ -11,6 +11,7 @@ import numpy as np
 
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.triangles import area_vectors
 
 __all__ = ["across_curve", "closest_on_loop", "curve_offsets", "signed_distances"]
 
@@ -64,7 +65,7 @@ def _normals(
     corner = vertices[triangles]
     ahead = _unit(np.roll(corner, -1, axis=1) - corner)
     behind = _unit(np.roll(corner, 1, axis=1) - corner)
-    face = _unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
+    face = _unit(area_vectors(vertices, triangles))
     angle = np.arccos(np.clip(np.einsum("mck,mck->mc", ahead, behind), -1.0, 1.0))
     of_vertex = np.zeros_like(vertices)
     np.add.at(of_vertex, triangles, angle[..., None] * face[:, None])

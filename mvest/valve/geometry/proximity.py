@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.triangles import surface_edges
 
 
 @njit(cache=True)
@@ -194,12 +195,6 @@ def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray
             distance[part], triangle[part], barycentric[part],
         )  # fmt: skip
     return ClosestPoints(distance, triangle, barycentric)
-
-
-def surface_edges(triangles: IntArray) -> IntArray:
-    """Undirected edges ``(n_edges, 2)`` of a triangulation, each once, lower number first."""
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    return np.unique(np.sort(edges, axis=1), axis=0)
 
 
 def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:

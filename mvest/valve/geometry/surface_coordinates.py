@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
+from mvest.valve.geometry.triangles import directed_edges, unit_rows
 
 __all__ = [
     "SurfaceCoordinates",
@@ -113,7 +114,7 @@ def boundary_loops(triangles: IntArray) -> list[IntArray]:
         vertex has more than two boundary edges.
     """
     triangles = np.asarray(triangles)
-    directed = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    directed = directed_edges(triangles)
     undirected = np.sort(directed, axis=1)
     _, inverse, count = np.unique(undirected, axis=0, return_inverse=True, return_counts=True)
     inverse = inverse.ravel()
@@ -337,7 +338,7 @@ def _perpendicular_to_gradient(
         np.add.at(direction, triangles[:, i], along)
     n = vertex_normals(vertices, triangles)
     direction -= n * np.einsum("ij,ij->i", direction, n)[:, None]
-    return _unit(direction)
+    return unit_rows(direction)
 
 
 def _locate_in_plane(
@@ -387,7 +388,3 @@ def _signed_area(corner: FloatArray) -> FloatArray:
 
 def _wrap(angle: FloatArray) -> FloatArray:
     return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

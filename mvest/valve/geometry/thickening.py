@@ -10,13 +10,13 @@ import scipy.sparse as sp
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
-from mvest.valve.geometry.proximity import surface_edges
 from mvest.valve.geometry.surface_checks import (
     check_surface,
     edge_table,
     enclosed_volume,
     listed,
 )
+from mvest.valve.geometry.triangles import surface_edges
 
 __all__ = ["FACE_KINDS", "ClosedSurface", "smooth_vertex_normals", "thicken"]
 

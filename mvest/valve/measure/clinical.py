@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -159,52 +159,32 @@ def clinical_measurements(
         plane = annulus_plane(annulus, tips.mean(axis=0), near.mean(axis=0))
     except MvestError:
         return {}
-    numbers: Numbers = {}
-    shape = (vertices, surface, annulus, plane)
-    for measure in (_annulus, _annulus_in_space, _tenting, _prolapse):
-        numbers |= _tried(measure, *shape)
-    pair = len(surface.region_names) == 2
-    if pair:
-        numbers |= _tried(_closure(contact_distance), *shape)
-        numbers |= _tried(_ball, *shape) if passing_ball else {}
-    for number, name in enumerate(surface.region_names):
-        triangles = surface.triangles[surface.region == number]
-        numbers[f"{name}_area_mm2"] = surface_area(vertices, triangles)
-        if pair:
-            numbers[f"{name}_length_mm"] = leaflet_length(vertices, triangles, plane)
+    triangles, region = surface.triangles, np.asarray(surface.region)
+    pair = [triangles[region == number] for number in range(len(surface.region_names))]
+    seen = vertices, triangles, annulus, plane
+    numbers = _tried(_annulus, annulus, plane)
+    numbers |= _tried(_annulus_in_space, annulus, plane)
+    numbers |= _tried(_tenting, *seen)
+    numbers |= _tried(_prolapse, *seen)
+    if len(pair) == 2:
+        numbers |= _tried(_closure, *seen, pair, contact_distance)
+        numbers |= _tried(_ball, *seen, surface.thickness) if passing_ball else {}
+    for name, own in zip(surface.region_names, pair, strict=True):
+        numbers[f"{name}_area_mm2"] = surface_area(vertices, own)
+        if len(pair) == 2:
+            numbers[f"{name}_length_mm"] = leaflet_length(vertices, own, plane)
     return numbers | _tips(tips, annulus, plane, tip_names)
 
 
-class Measure(Protocol):
-    """Measures a shape, or raises an `MvestError` where it defies that."""
-
-    def __call__(
-        self,
-        vertices: FloatArray,
-        surface: MeasuredLeaflets,
-        annulus: FloatArray,
-        plane: AnnulusPlane,
-        /,
-    ) -> Numbers: ...
-
-
-def _tried(
-    measure: Measure,
-    vertices: FloatArray,
-    surface: MeasuredLeaflets,
-    annulus: FloatArray,
-    plane: AnnulusPlane,
-) -> Numbers:
+def _tried(measure: Callable[..., Numbers], *shape: Any) -> Numbers:
     """Measurements, or none where the shape defies them."""
     try:
-        return measure(vertices, surface, annulus, plane)
+        return measure(*shape)
     except MvestError:
         return {}
 
 
-def _annulus(
-    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Numbers:
+def _annulus(annulus: FloatArray, plane: AnnulusPlane) -> Numbers:
     size = measure_annulus(annulus, plane)
     return {
         "ap_diameter_mm": size.anteroposterior_diameter,
@@ -217,25 +197,22 @@ def _annulus(
     }
 
 
-def _annulus_in_space(
-    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-) -> Numbers:
+def _annulus_in_space(annulus: FloatArray, plane: AnnulusPlane) -> Numbers:
     return {"annulus_area_3d_mm2": spanning_surface(annulus, plane).area}
 
 
 def _tenting(
-    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
+    vertices: FloatArray, triangles: IntArray, annulus: FloatArray, plane: AnnulusPlane
 ) -> Numbers:
-    tenting = measure_tenting(vertices, surface.triangles, annulus, plane)
+    tenting = measure_tenting(vertices, triangles, annulus, plane)
     return {"tenting_height_mm": tenting.height, "tenting_volume_mm3": tenting.volume}
 
 
 def _prolapse(
-    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
+    vertices: FloatArray, triangles: IntArray, annulus: FloatArray, plane: AnnulusPlane
 ) -> Numbers:
-    above = measure_prolapse(
-        vertices, surface.triangles, annulus, plane, spanning_surface(annulus, plane)
-    )
+    film = spanning_surface(annulus, plane)
+    above = measure_prolapse(vertices, triangles, annulus, plane, film)
     return {
         "prolapse_height_mm": above.height,
         "prolapse_volume_mm3": above.volume,
@@ -244,29 +221,30 @@ def _prolapse(
     }
 
 
-def _closure(contact_distance: float) -> Measure:
-    def measure(
-        vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
-    ) -> Numbers:
-        triangles, region = surface.triangles, np.asarray(surface.region)
-        pair = triangles[region == 0], triangles[region == 1]
-        return {
-            "orifice_mm2": orifice_area(vertices, triangles, annulus, plane),
-            "coaptation_length_mm": coaptation_length(
-                vertices, *pair, plane, contact_distance
-            ).length,
-            "coaptation_area_mm2": coaptation_area(vertices, *pair, contact_distance),
-        }
-
-    return measure
+def _closure(
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    pair: Sequence[IntArray],
+    reach: float,
+) -> Numbers:
+    first, second = pair
+    return {
+        "orifice_mm2": orifice_area(vertices, triangles, annulus, plane),
+        "coaptation_length_mm": coaptation_length(vertices, first, second, plane, reach).length,
+        "coaptation_area_mm2": coaptation_area(vertices, first, second, reach),
+    }
 
 
 def _ball(
-    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, plane: AnnulusPlane
+    vertices: FloatArray,
+    triangles: IntArray,
+    annulus: FloatArray,
+    plane: AnnulusPlane,
+    thickness: FloatArray,
 ) -> Numbers:
-    ball = largest_passing_ball(
-        vertices, surface.triangles, annulus, plane, thickness=surface.thickness
-    )
+    ball = largest_passing_ball(vertices, triangles, annulus, plane, thickness=thickness)
     return {"passing_ball_mm": ball.diameter}
 
 

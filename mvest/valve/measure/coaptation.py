@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points, plane_section
+from mvest.valve.geometry.triangles import areas, unit_normals
 from mvest.valve.measure.annulus import AnnulusPlane
 
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -153,12 +154,6 @@ def orifice_area(
     return float((image.inside & np.isinf(image.depth)).sum() * resolution**2)
 
 
-def _normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
-    corners = vertices[triangles]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
-
-
 def _contact_fraction(
     points: FloatArray,
     normals: FloatArray,
@@ -175,7 +170,7 @@ def _contact_fraction(
     near = np.asarray(np.isfinite(gap))
     candidate = np.flatnonzero(near)
     closest = closest_points(points[candidate], vertices, opposing)
-    other = _normals(vertices, opposing)[closest.triangle]
+    other = unit_normals(vertices, opposing)[closest.triangle]
     facing = (normals[candidate] * other).sum(axis=1) < 0
     near[candidate] = (closest.distance <= contact_distance) & facing
     return near
@@ -240,7 +235,11 @@ def coaptation_length(
         fraction = ((position + 0.5) / pieces[owner])[:, None]
         points = segments[owner, 0] * (1 - fraction) + segments[owner, 1] * fraction
         near = _contact_fraction(
-            points, _normals(vertices, own)[triangle[owner]], vertices, other, contact_distance
+            points,
+            unit_normals(vertices, own)[triangle[owner]],
+            vertices,
+            other,
+            contact_distance,
         )
         lengths.append(float((size / pieces)[owner][near].sum()))
     return CoaptationLength(lengths[0], lengths[1])
@@ -261,19 +260,18 @@ def coaptation_area(
     if not (np.isfinite(contact_distance) and contact_distance > 0):
         raise GeometryError(f"contact_distance = {contact_distance} mm; it must be positive")
     weights = _part_centroids(subdivisions)
-    areas = []
+    touching = []
     for own, other in ((first, second), (second, first)):
         if len(own) == 0 or len(other) == 0:
-            areas.append(0.0)
+            touching.append(0.0)
             continue
         corners = vertices[own]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         points = np.einsum("qk,mkd->mqd", weights, corners).reshape(-1, 3)
-        normals = np.repeat(_normals(vertices, own), len(weights), axis=0)
+        normals = np.repeat(unit_normals(vertices, own), len(weights), axis=0)
         near = _contact_fraction(points, normals, vertices, other, contact_distance)
-        part = np.repeat(0.5 * np.linalg.norm(cross, axis=1) / len(weights), len(weights))
-        areas.append(float(part[near].sum()))
-    return 0.5 * (areas[0] + areas[1])
+        part = np.repeat(areas(vertices, own) / len(weights), len(weights))
+        touching.append(float(part[near].sum()))
+    return 0.5 * (touching[0] + touching[1])
 
 
 def _part_centroids(n: int) -> FloatArray:

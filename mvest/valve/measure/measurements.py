@@ -14,6 +14,7 @@ import numpy as np
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import intersecting_triangles, plane_section
 from mvest.valve.geometry.spanning_surface import SpanningSurface
+from mvest.valve.geometry.triangles import areas
 from mvest.valve.measure.annulus import AnnulusPlane, checked_loop, unit_vector
 from mvest.valve.measure.coaptation import (
     coaptation_area,
@@ -227,9 +228,7 @@ def leaflet_length(
 
 def surface_area(vertices: FloatArray, triangles: IntArray) -> float:
     """Area (mm²) of a triangulated surface."""
-    corners = np.asarray(vertices)[triangles]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return float(0.5 * np.linalg.norm(cross, axis=1).sum())
+    return float(areas(vertices, triangles).sum())
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import boundary_loops
+from mvest.valve.geometry.triangles import directed_edges, unit_rows
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 
 __all__ = ["LayeredMesh", "layered_wedges"]
@@ -122,9 +123,9 @@ def layered_wedges(
 
     average = _neighbour_average(small, len(points))
     for _ in range(smoothing):
-        normals = _unit(average @ normals)
+        normals = unit_rows(average @ normals)
         thickness = average @ thickness
-    fibre = _unit(fibre - normals * np.einsum("ij,ij->i", fibre, normals)[:, None])
+    fibre = unit_rows(fibre - normals * np.einsum("ij,ij->i", fibre, normals)[:, None])
 
     per_layer = LEVELS_PER_LAYER[element_type]
     levels = layers * per_layer + 1
@@ -159,9 +160,8 @@ def layered_wedges(
 
 def _quadratic_sheet(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Six-node triangles, the edges ``(e, 2)`` whose middles are the new points, boundary flags."""
-    directed = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges, number, count = np.unique(
-        np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True
+        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True, return_counts=True
     )
     middle = int(triangles.max()) + 1 + number.reshape(3, -1).T
     return np.hstack([triangles, middle]), edges, count == 1
@@ -198,7 +198,7 @@ def _pull_back(
         points = np.vstack([vertices, middles])
         tangent = np.einsum("mai,qaj->mqij", points[sheet], gradient)
         normal = np.cross(tangent[..., 0], tangent[..., 1])
-        mean = _unit(normal.mean(axis=1))
+        mean = unit_rows(normal.mean(axis=1))
         area = np.einsum("mqi,mi->mq", normal, mean)
         bad = area.min(axis=1) < MIN_AREA_RATIO * area.max(axis=1)
         edges = np.unique(sheet[bad, 3:] - len(vertices))
@@ -231,7 +231,3 @@ def _reject_inverted(nodes: FloatArray, elements: IntArray, element_type: str) -
             "surface bends within its thickness; smooth it, or use smaller triangles or less "
             "thickness"
         )
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

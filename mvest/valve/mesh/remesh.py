@@ -20,6 +20,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.geometry.triangles import areas, directed_edges
 
 __all__ = ["Remeshed", "remesh", "triangle_quality"]
 
@@ -52,11 +53,8 @@ class Remeshed:
 def triangle_quality(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Shape ``(m,)`` of triangles: ``4 sqrt(3) area / sum of squared edges``, 1 if equilateral."""
     corner = vertices[triangles]
-    area = 0.5 * np.linalg.norm(
-        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
-    )
     squared = ((corner - np.roll(corner, 1, axis=1)) ** 2).sum(axis=(1, 2))
-    return 4 * np.sqrt(3) * area / squared
+    return 4 * np.sqrt(3) * areas(vertices, triangles) / squared
 
 
 def remesh(
@@ -192,7 +190,7 @@ def _sample_feature_lines(
 def _region_lines(surface: LeafletSurface) -> list[list[int]]:
     """Chains of edges between two leaflets, each from end to end (closed chains are left out)."""
     t = surface.triangles
-    edges = np.sort(np.vstack([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]]), axis=1)
+    edges = np.sort(directed_edges(t), axis=1)
     owner = np.tile(np.arange(len(t)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
     edges, owner = edges[order], owner[order]
@@ -243,10 +241,7 @@ def _spread_interior(
     local = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6
     corner = surface.vertices[surface.triangles]
     samples = np.einsum("ql,mlk->mqk", local, corner).reshape(-1, 3)
-    area = np.repeat(
-        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1),
-        4,
-    )
+    area = np.repeat(areas(surface.vertices, surface.triangles), 4)
     nearest = cKDTree(fixed).query(samples)[0]
     chosen = np.zeros(count, dtype=np.int64)
     for k in range(count):
@@ -377,8 +372,7 @@ def _labels(
 
 def _check_band(triangles: IntArray, rings: list[IntArray]) -> None:
     """Raise unless the boundary is exactly the two rings."""
-    directed = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    edges, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+    edges, count = np.unique(np.sort(directed_edges(triangles), axis=1), axis=0, return_counts=True)
     boundary = {tuple(e) for e in edges[count == 1].tolist()}
     wanted = {
         (min(e), max(e))

@@ -26,7 +26,7 @@ def measured(parameters=None, change=None, columns=80, rows=15, turn=AS_IT_LIES)
 @pytest.fixture
 def quick(monkeypatch):
     """Without the closure and the passing ball, which takes a second."""
-    monkeypatch.setattr(clinical, "_closure", lambda distance: lambda *arguments: {})
+    monkeypatch.setattr(clinical, "_closure", lambda *arguments: {})
     monkeypatch.setattr(clinical, "_ball", lambda *arguments: {})
 
 

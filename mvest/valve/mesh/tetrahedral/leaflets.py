@@ -15,6 +15,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
+from mvest.valve.geometry.triangles import area_vectors, areas
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.tetrahedral.cells import outer_faces, promote_to_tet10, tri6_faces
 from mvest.valve.mesh.tetrahedral.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
@@ -93,18 +94,12 @@ def label_tetrahedra(
     )
 
 
-def _face_normals(nodes: FloatArray, faces: IntArray) -> FloatArray:
-    """Area-weighted normals ``(f, 3)`` mm²."""
-    corners = nodes[faces]
-    return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
 def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> IntArray:
     """Outer faces whose nearest facing part of the closed surface is ventricular."""
     centroids = nodes[faces].mean(axis=1)
-    normals = _face_normals(nodes, faces)
+    normals = area_vectors(nodes, faces)
     distance = np.full((len(faces), len(FACE_KINDS)), np.inf)
-    closed_normals = _face_normals(closed.vertices, closed.triangles)
+    closed_normals = area_vectors(closed.vertices, closed.triangles)
     for kind in range(len(FACE_KINDS)):
         numbers = np.flatnonzero(closed.kind == kind)
         if len(numbers) == 0:
@@ -118,8 +113,8 @@ def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> I
 
 def _check_pressure_area(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> None:
     ventricular = closed.triangles[closed.kind == FACE_KINDS.index("ventricular")]
-    wanted = np.linalg.norm(_face_normals(closed.vertices, ventricular), axis=1).sum()
-    area = np.linalg.norm(_face_normals(nodes, faces), axis=1).sum()
+    wanted = areas(closed.vertices, ventricular).sum()
+    area = areas(nodes, faces).sum()
     if abs(area - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
         raise MeshingError(
             f"pressure faces cover {area:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
@@ -137,7 +132,7 @@ def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
     vectors = surface.fibre[corners]
     sign = np.where(np.einsum("ncj,nj->nc", vectors, lead) < 0, -1.0, 1.0)
     mixed = np.einsum("nc,ncj->nj", nearest.barycentric * sign, vectors)
-    normal = _face_normals(surface.vertices, surface.triangles)[nearest.triangle]
+    normal = area_vectors(surface.vertices, surface.triangles)[nearest.triangle]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     tangent = mixed - (mixed * normal).sum(axis=1, keepdims=True) * normal
     length = np.linalg.norm(tangent, axis=1, keepdims=True)
