@@ -1,54 +1,82 @@
-"""Progress bars over forward solves and over sweeps, with the time that is left."""
+"""What a single run says while it works: each forward solve, each step of a filter, what is left.
+
+On a terminal a bar moves besides. Lines go to standard error, which in a sweep is the job's log.
+"""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
+from collections.abc import Sequence
 from functools import cache
 from types import TracebackType
 
 from tqdm import tqdm
 
 from mvest.mechanics.solid import kernels_are_compiled
+from mvest.typing import FloatArray
 
-__all__ = ["PartBar", "SolveBar", "announce_compilation"]
+__all__ = ["TYPICAL_SOLVES", "PartBar", "SolveBar", "announce_compilation", "duration"]
+
+SAY = 30.0
+"""Seconds between two lines about the pieces of a part where no terminal shows its bar."""
+
+TYPICAL_SOLVES = 6
+"""Forward solves that a filter usually needs; only the first guess of what is left."""
+
+QUICK = 1.0
+"""Seconds since the last line within which a forward solve that ended is not told."""
 
 
 @cache
 def announce_compilation(following: str = "the computation") -> None:
     """Say once that the first run after an installation takes longer, why, and what follows."""
     if not kernels_are_compiled():
-        print(
-            f"compiling on first use; this takes about a minute once, then {following} goes on",
-            file=sys.stderr,
-        )
+        _say(f"compiling on first use; this takes about a minute once, then {following} goes on")
+
+
+def duration(seconds: float) -> str:
+    """Seconds, minutes and hours as a clock shows them."""
+    return str(tqdm.format_interval(max(0.0, seconds)))
 
 
 class SolveBar:
-    """A bar that moves with the time steps of forward solves.
+    """Tells the forward solves and the steps of a filter; a bar moves with their time steps.
 
-    How many solves a filter will need is not known beforehand: the bar starts from a typical number
-    and grows with each solve beyond it. Nothing is drawn where no one is looking at a terminal.
+    How many solves a filter will need is not known beforehand: a typical number is expected, and
+    after that one more at a time.
 
     Parameters
     ----------
     title : str
     steps : int
-        Time steps of one solve.
+        Time steps of one solve; 0 where a model tells of none, and no bar is drawn.
     solves : int
         Expected number of solves.
+    names : sequence of str, optional
+        Of the parameters, in the order in which :meth:`iterate` is given them.
     """
 
-    def __init__(self, title: str, steps: int, solves: int) -> None:
-        self._title = title
-        self._steps = steps
+    def __init__(self, title: str, steps: int, solves: int, names: Sequence[str] = ()) -> None:
+        self._title, self._steps, self._names = title, steps, tuple(names)
+        self._expected = solves
+        self._solve = self._steps_made = 0
         self._last = math.inf
-        self._solve = 0
-        self._bar = tqdm(total=steps * solves, desc=title, unit="step", disable=None, leave=False)
+        self._before: tuple[FloatArray, float] | None = None
+        self._began = self._solve_began = self._now = self._said = time.monotonic()
+        self._solving = 0.0
+        self._compiling = not kernels_are_compiled()
+        self._bar = tqdm(
+            total=steps * solves,
+            desc=title,
+            unit="step",
+            disable=None if steps else True,
+            leave=False,
+        )
 
     def __enter__(self) -> SolveBar:
-        announce_compilation()
+        announce_compilation(f"the {self._title}")
         return self
 
     def __exit__(
@@ -57,23 +85,75 @@ class SolveBar:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        if kind is None:
+            self._end_solve()
         self._bar.close()
 
-    def step(self, time: float, newton_iterations: int) -> None:
-        """One more time step, reached at ``time`` s; the time falls when a new solve begins."""
-        if time <= self._last:
+    def step(self, time_s: float, newton_iterations: int) -> None:
+        """One more time step, reached at ``time_s``; the time falls when a new solve begins."""
+        if time_s <= self._last:
+            self._end_solve()
             self._solve += 1
             # A solve that stopped early has skipped the steps it did not make.
             self._bar.update((self._solve - 1) * self._steps - self._bar.n)
-        self._last = time
+        self._last, self._now = time_s, time.monotonic()
+        self._steps_made += 1
+        if self._compiling:
+            self._compiling = False
+            spent = duration(self._now - self._began)
+            _say(f"compiled after {spent}; {self._title}, forward solve 1 is under way")
         if self._bar.total is not None and self._bar.n >= self._bar.total:
             self._bar.total += self._steps
         self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
         self._bar.update(1)
 
+    def iterate(self, number: int, m: FloatArray, objective: float) -> None:
+        """One more iterate of a filter: its number, the parameters (p,) and the objective."""
+        self._end_solve()
+        self._solve_began = self._said = time.monotonic()
+        before = self._before if number else None
+        self._before = m, objective
+        change = "" if before is None else f" ({objective - before[1]:+.2g})"
+        values = []
+        for k, value in enumerate(m):
+            # A part of an estimation may be of some of the parameters only.
+            name = self._names[k] if len(self._names) == len(m) else f"m[{k}]"
+            moved = "" if before is None else f" ({value - before[0][k]:+.2g})"
+            values.append(f"{name} {value:.4g}{moved}")
+        _say(
+            f"{self._title}, step {number} of the filter: objective {objective:.4g}{change}; "
+            f"{', '.join(values)}; {self._left()}"
+        )
+
+    def _end_solve(self) -> None:
+        """Tell the forward solve that has ended, if there is one that was not told."""
+        if not self._steps_made:
+            return
+        spent = self._now - self._solve_began
+        self._solving += spent
+        if self._now - self._said >= QUICK:
+            self._said = self._now
+            _say(
+                f"{self._title}, forward solve {self._solve}: {self._steps_made} time steps in "
+                f"{spent:.1f} s; {self._left()}"
+            )
+        self._solve_began, self._steps_made, self._last = self._now, 0, math.inf
+
+    def _left(self) -> str:
+        """What has passed, and what is still to be expected."""
+        text = f"{duration(time.monotonic() - self._began)} elapsed"
+        if not self._solve:
+            return text
+        each, more = self._solving / self._solve, self._expected - self._solve
+        if more > 0:
+            return f"{text}, about {duration(each * more)} left if {self._expected} solves do"
+        return f"{text}, about {duration(each)} for each further solve"
+
 
 class PartBar:
     """A bar over the equal pieces of one part of a study, and a line when the part is done.
+
+    Where no terminal shows the bar, a line is printed now and then.
 
     Parameters
     ----------
@@ -84,8 +164,9 @@ class PartBar:
     """
 
     def __init__(self, title: str, total: int, unit: str) -> None:
-        self._title = title
-        self._began = time.monotonic()
+        self._title, self._total, self._unit = title, total, unit
+        self._done = 0
+        self._began = self._said = time.monotonic()
         self._bar = tqdm(total=total, desc=title, unit=unit, disable=None, leave=False)
 
     def __enter__(self) -> PartBar:
@@ -99,9 +180,23 @@ class PartBar:
     ) -> None:
         self._bar.close()
         if kind is None:
-            spent = tqdm.format_interval(time.monotonic() - self._began)
-            print(f"{self._title}: done in {spent}", file=sys.stderr, flush=True)
+            _say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
 
     def step(self) -> None:
         """One more piece is done."""
+        self._done += 1
         self._bar.update(1)
+        now = time.monotonic()
+        if self._bar.disable and now - self._said > SAY:
+            self._said = now
+            spent = now - self._began
+            left = duration(spent / self._done * (self._total - self._done))
+            _say(
+                f"{self._title}: {self._done} of {self._total} {self._unit}s, "
+                f"{duration(spent)} elapsed, about {left} left"
+            )
+
+
+def _say(text: str) -> None:
+    tqdm.write(text, file=sys.stderr)
+    sys.stderr.flush()

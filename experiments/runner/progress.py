@@ -9,6 +9,7 @@ from types import TracebackType
 
 from tqdm import tqdm
 
+from experiments.common.progress import duration
 from experiments.runner.folder import last_record, result_time
 from experiments.runner.plan import Plan, PlannedJob
 
@@ -39,13 +40,21 @@ class SweepBar:
         self._total = len(self._waiting)
         self._done = 0
         self._failed = 0
-        self._began = self._said = time.monotonic()
+        self._workers = plan.workers
+        self._began = self._last = time.monotonic()
+        self._said: float | None = None
         self._ended = threading.Event()
         self._watching = threading.Thread(target=self._watch, daemon=True)
-        self._bar = tqdm(total=self._total, desc=plan.name, unit="job", disable=None)
+        self._bar = tqdm(
+            total=self._total,
+            desc=plan.name,
+            disable=None,
+            # A bar knows no workers: the first job of eight would be an eighth of the pace.
+            bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]",
+        )
 
     def __enter__(self) -> SweepBar:
-        self._bar.set_postfix_str(self._counts())
+        self._bar.set_postfix_str(self.said())
         self._watching.start()
         return self
 
@@ -74,7 +83,8 @@ class SweepBar:
             else:
                 self._failed += 1
                 self._tell(job, record["reason"])
-            self._bar.set_postfix_str(self._counts(), refresh=False)
+            self._last = time.monotonic()
+            self._bar.set_postfix_str(self.said(), refresh=False)
             self._bar.update(1)
 
     def _watch(self) -> None:
@@ -82,23 +92,25 @@ class SweepBar:
         while not self._ended.wait(pause):
             looked = time.monotonic()
             self.look()
-            self._bar.refresh()
+            self._bar.set_postfix_str(self.said())
             # Many folders on a slow disk are looked at less often.
             pause = max(LOOK, 10.0 * (time.monotonic() - looked))
-            if self._bar.disable and looked - self._said > SAY:
+            ended = self._done + self._failed
+            if self._bar.disable and ended and looked - (self._said or -SAY) > SAY:
                 self._said = looked
-                print(f"{self._name}: {self._counts()}, {self._left()}", file=sys.stderr)
+                print(f"{self._name}: {self.said()}", file=sys.stderr)
+
+    def said(self) -> str:
+        """How many jobs have ended, and from the first one on how long the others will take."""
+        counts = f"{self._done} done, {self._failed} failed, {self._skipped} skipped"
+        ended = self._done + self._failed
+        if not ended:
+            return f"{counts}, {self._total} to go"
+        # Those under way are half done, the worker aside that has just ended one.
+        under_way = 0.5 * (min(self._workers, self._total - ended + 1) - 1)
+        each = (self._last - self._began) / (ended + under_way)
+        left = each * (self._total - ended - under_way) - (time.monotonic() - self._last)
+        return f"{counts}, about {duration(left)} left"
 
     def _tell(self, job: PlannedJob, reason: str) -> None:
         tqdm.write(f"failed: {job.label}: {reason} ({job.folder})", file=sys.stderr)
-
-    def _counts(self) -> str:
-        return f"{self._done} done, {self._failed} failed, {self._skipped} skipped"
-
-    def _left(self) -> str:
-        """The time left, as a bar would show it."""
-        ended = self._done + self._failed
-        if not ended:
-            return f"{self._total} to go"
-        spent = time.monotonic() - self._began
-        return f"{tqdm.format_interval(spent / ended * (self._total - ended))} left"

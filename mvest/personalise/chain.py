@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.errors import GeometryError
-from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
@@ -66,6 +66,7 @@ def personalise_case(
     *,
     store: Path | None = None,
     on_step: OnStep | None = None,
+    on_iterate: OnIterate | None = None,
 ) -> Personalised:
     """Estimate the unknowns of a case.
 
@@ -80,8 +81,10 @@ def personalise_case(
         Where an unstructured mesh is kept.
     on_step : callable, optional
         Progress, see :class:`mvest.closure.model.ClosureModel`.
+    on_iterate : callable, optional
+        Called after each iterate of every filter.
     """
-    chain = _Chain(case, settings, store, on_step)
+    chain = _Chain(case, settings, store, on_step, on_iterate)
     started = time.perf_counter()
     # Not the prior's mean, which may differ from where filters start by its last bit.
     start = chain.shared.start
@@ -176,11 +179,13 @@ class _Chain:
         settings: PersonaliseSettings,
         store: Path | None,
         on_step: OnStep | None,
+        on_iterate: OnIterate | None = None,
     ) -> None:
         self.case, self.settings = case, settings
         self.closed = case.frame(Role.CLOSED)
         self.model = build_model(case, settings, store)
         self.model.on_step = on_step
+        self.on_iterate = on_iterate
         free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
         # Those of the closure first, in its order; then the displacement.
         own = [u for u in free if u.name not in REGISTRATION]
@@ -269,7 +274,8 @@ class _Chain:
 
     def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
         """All unknowns."""
-        return self._widened(estimate(self.problem(filter_), observation), observation)
+        result = estimate(self.problem(filter_), observation, on_iterate=self.on_iterate)
+        return self._widened(result, observation)
 
     def problem(self, filter_: Filter) -> Problem:
         """The estimation of all unknowns, without its observation."""
@@ -328,7 +334,8 @@ class _Chain:
             Log() if log else Log((False,) * len(moduli)),
             self.settings.mechanics.tissue,
         )
-        return self._widened(estimate(problem, observation), observation)
+        result = estimate(problem, observation, on_iterate=self.on_iterate)
+        return self._widened(result, observation)
 
     def estimate_as_paper(self, paper: PaperSettings) -> StudyResult:
         """The moduli alone, with the paper's filter and its independent R."""

@@ -26,6 +26,7 @@ from mvest.personalise.settings import (
     Treatment,
     Unknown,
 )
+from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.fields import turn_of
 from mvest.reporting.case.frames import frame_fields, frames_figure
 from mvest.reporting.case.report import write_case_report
@@ -163,8 +164,13 @@ def run_case(
     settings = settings_of(config)
     steps = len(settings.mechanics.protocol.steps())
     store = Path(config["paths"]["outputs"]) / "meshes"
-    with SolveBar(case.name, steps, TYPICAL_SOLVES) as bar:
-        found = personalise_case(case, settings, store=store, on_step=bar.step)
+    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    # As they are estimated: those of the closure first.
+    names = sorted(free, key=lambda name: name in REGISTRATION)
+    with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
+        found = personalise_case(
+            case, settings, store=store, on_step=bar.step, on_iterate=bar.iterate
+        )
     record = {**case_record(config, found, config_hash, started), **(about or {})}
     files: list[Path] = []
     if found.distances:

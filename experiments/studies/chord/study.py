@@ -14,6 +14,7 @@ from experiments.common.build import build_filter
 from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import bound_entry, closed_frame, cycle_model
 from experiments.studies.chord.report import chord_text, write_chord
@@ -65,14 +66,17 @@ def run_chord_study(
             max_iterations=config["filter"]["max_iterations"],
             start=tuple(map(float, start)),
         )
-        found = filter_(
-            observation.of(whole),
-            prior,
-            observation.y,
-            observation.R,
-            names=parameters,
-            transform=transform,
-        )
+        with SolveBar(label, len(maker.protocol.steps()), TYPICAL_SOLVES, parameters) as bar:
+            model.closure.on_step = bar.step
+            found = filter_(
+                observation.of(whole),
+                prior,
+                observation.y,
+                observation.R,
+                names=parameters,
+                transform=transform,
+                on_iterate=bar.iterate,
+            )
         errors = ", ".join(f"{100 * e:+.1f} %" for e in found.mean / truth - 1)
         print(f"{label}: {errors} ({found.reason.value})", file=sys.stderr, flush=True)
         return found

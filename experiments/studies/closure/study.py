@@ -12,6 +12,7 @@ import numpy as np
 from experiments.common.build import closure_model, template_of
 from experiments.common.forward import forward_record, without_nan
 from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.progress import SolveBar
 from experiments.common.study import Section, Study
 from experiments.studies.closure.report import closure_text, write_closure
 from experiments.studies.closure.settings import Settings
@@ -30,7 +31,9 @@ def run_closure_study(config: Values, config_hash: str, folder: Path, started: f
     """Close the valve once and measure every stored step."""
     values = np.array(config["truth"]["values"], dtype=float)
     model = closure_model(config)
-    result = model.close(values, sensitivities=False, every_frame=True)
+    with SolveBar("closure", len(model.settings.protocol.steps()), 1) as bar:
+        model.on_step = bar.step
+        result = model.close(values, sensitivities=False, every_frame=True)
     thickness = float(model.valve.surface.thickness.mean())
     distance = (
         0.5

@@ -15,6 +15,7 @@ from experiments.common.build import build_filter
 from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import (
     bound_entry,
@@ -55,7 +56,9 @@ def run_cycle_study(
     settings = config["cycle"]
     truth = np.array(config["truth"]["values"], dtype=float)
     model = cycle_model(config)
-    prediction = stored_cycle(config, model)(truth)
+    with SolveBar("cycle", len(model.protocol.steps()), 1) as bar:
+        model.closure.on_step = bar.step
+        prediction = stored_cycle(config, model)(truth)
     if not prediction.converged:
         raise ConfigurationError(f"the truth has no cycle: {prediction.reason}")
     protocol = model.protocol
@@ -140,7 +143,10 @@ def _time_steps(config: Values, truth: FloatArray) -> dict[str, Any]:
     path[:, 0] *= np.linspace(1.0, 1.0 + config["cycle"]["drift"], len(path))
     found, along = [], []
     for dt in dts:
-        frames, reason = _followed(config, cycle_model(config, dt=dt), path)
+        model = cycle_model(config, dt=dt)
+        with SolveBar(f"time step {dt:g} s", len(model.protocol.steps()), len(path)) as bar:
+            model.closure.on_step = bar.step
+            frames, reason = _followed(config, model, path)
         found.append(frames[0] if frames else None)
         changes = [_rms(b - a) for a, b in pairwise(frames)]
         along.append({"rms_mm": changes, "reason": reason})
@@ -198,7 +204,9 @@ def _drift(config: Values, truth: FloatArray) -> dict[str, Any]:
         tuple(sum(o.sizes) for o in seen), settings["drift_std"] ** 2, tolerance=0.1
     )
     y, R = (np.concatenate([getattr(o, name) for o in seen]) for name in ("y", "R"))
-    found = smoother(Beats(stored_cycle(changed, model)), initial, y, R, transform=Log())
+    with SolveBar("drift", len(model.protocol.steps()), beats * TYPICAL_SOLVES) as bar:
+        model.closure.on_step = bar.step
+        found = smoother(Beats(stored_cycle(changed, model)), initial, y, R, transform=Log())
     print(f"drift: {found.reason.value}, {found.forward_solves} runs", file=sys.stderr, flush=True)
     if found.smoothed is None:
         return {"status": "failed", "reason": found.detail, "runs": found.forward_solves}

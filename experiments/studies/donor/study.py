@@ -257,7 +257,8 @@ def _fit(study: DonorStudy) -> Fits:
     """Close the open valve with the generic moduli, and fit it from there from every start."""
     steps = len(study.settings.protocol.steps())
     results, models = [], []
-    with SolveBar("donor", steps, TYPICAL_SOLVES * len(study.starts)) as bar:
+    solves = TYPICAL_SOLVES * len(study.starts)
+    with SolveBar("donor", steps, solves, study.parameters) as bar:
         started = time.perf_counter()
         first = study.model()
         first.on_step = bar.step
@@ -278,7 +279,7 @@ def _fit(study: DonorStudy) -> Fits:
                 study.transform,
                 study.settings.tissue,
             )
-            results.append(estimate(case, study.observation))
+            results.append(estimate(case, study.observation, on_iterate=bar.iterate))
     return Fits(generic, seconds, tuple(results), tuple(model.closures for model in models))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from experiments.common.build import build_filter
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Study
 from experiments.studies.external.report import external_text, write_external_tables
 from experiments.studies.external.settings import Settings
@@ -167,14 +167,17 @@ def run_external(config: Values, config_hash: str, folder: Path, started: float)
     filter_, transform, prior, variance = estimator_of(config)
     model = model_of(config, len(y), folder)
 
-    def tell(number: int, m: FloatArray, objective: float) -> None:
-        values = ", ".join(f"{n} = {v:.4g}" for n, v in zip(model.names, m, strict=True))
-        print(f"iterate {number}: {values}; objective {objective:.4g}", file=sys.stderr, flush=True)
-
     began = time.perf_counter()
-    found = filter_(
-        model, prior, y.ravel(), variance, names=model.names, transform=transform, on_iterate=tell
-    )
+    with SolveBar(config["name"], 0, TYPICAL_SOLVES, model.names) as bar:
+        found = filter_(
+            model,
+            prior,
+            y.ravel(),
+            variance,
+            names=model.names,
+            transform=transform,
+            on_iterate=bar.iterate,
+        )
     record = _record(config, config_hash, found, model, started)
     record["seconds"] = time.perf_counter() - began
     if found.prediction is None:

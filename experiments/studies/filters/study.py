@@ -16,6 +16,7 @@ from scipy.stats import skew
 
 from experiments.common.build import MADE_BY, filter_of
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import SolveBar
 from experiments.common.schema import build
 from experiments.common.store import Store
 from experiments.common.study import Section, Study
@@ -153,6 +154,7 @@ def _estimate(problem: FilterProblem, filter_: Filter, seed: int) -> dict[str, A
         problem.noise**2,
         names=problem.parameters,
         transform=TRANSFORM,
+        on_iterate=SolveBar(problem.name, 0, 0, problem.parameters).iterate,
     )
     seconds = time.process_time() - began
     low, high = found.interval()

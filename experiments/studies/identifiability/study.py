@@ -15,6 +15,7 @@ import numpy as np
 from experiments.common.build import closure_model
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import SolveBar
 from experiments.common.study import Section, Study
 from experiments.studies.identifiability.figures import write_identifiability_figures
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
@@ -116,7 +117,10 @@ def _closed(
     """Jacobian of the closed frame at each pressure, or why there is none."""
     found = {}
     for pressure, model in closures.items():
-        prediction = model(values)
+        steps = len(model.settings.protocol.steps())
+        with SolveBar(f"closed at {pressure:g} mmHg", steps, 1) as bar:
+            model.on_step = bar.step
+            prediction = model(values)
         if not prediction.converged:
             return {}, f"closed at {pressure:g} mmHg: {prediction.reason}"
         found[pressure] = prediction.jacobian[len(prediction.y) // 2 :]

@@ -14,6 +14,7 @@ from experiments.common.build import build_filter
 from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import (
     bound_entry,
@@ -25,6 +26,7 @@ from experiments.common.whole_cycle import (
 )
 from experiments.studies.joint.report import joint_text, write_joint
 from experiments.studies.joint.settings import Settings
+from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
@@ -59,7 +61,7 @@ def run_joint_study(
     noise, told = settings["noise_mm"], settings["exact_told_mm"]
     seen = CycleObservation(frames, noise).of(stored_cycle(config, model))
     tolerance = settings["objective_tolerance"]
-    study = _Study(parameters, transform, prior, seen, truth, tolerance)
+    study = _Study(model, parameters, transform, prior, seen, truth, tolerance)
 
     def rows_of(wanted: list[int]) -> FloatArray:
         return at_truth.jacobian.reshape(*frames.shape, -1)[wanted].reshape(-1, len(truth))
@@ -140,6 +142,7 @@ class _Study:
 
     def __init__(
         self,
+        model: CycleModel,
         parameters: tuple[str, ...],
         transform: Transform,
         prior: Gaussian,
@@ -147,32 +150,43 @@ class _Study:
         truth: FloatArray,
         tolerance: float,
     ) -> None:
+        self.model = model
         self.parameters, self.transform, self.prior = parameters, transform, prior
         self.seen = seen
         self.truth, self.tolerance = truth, tolerance
 
     def sequential(self, observation: CycleObservation) -> SequentialEstimate:
-        return SequentialFilter(observation.sizes, relinearise=0.1).run(
-            self.seen,
-            self.prior,
-            observation.y,
-            observation.R,
-            names=self.parameters,
-            transform=self.transform,
-        )
+        with self._bar("frame by frame") as bar:
+            return SequentialFilter(observation.sizes, relinearise=0.1).run(
+                self.seen,
+                self.prior,
+                observation.y,
+                observation.R,
+                names=self.parameters,
+                transform=self.transform,
+                on_iterate=bar.iterate,
+            )
 
     def batch(self, observation: CycleObservation, start: FloatArray) -> Estimate:
         filter_ = IteratedFilter(
             tolerance=1e-3, objective_tolerance=self.tolerance, start=tuple(map(float, start))
         )
-        return filter_(
-            self.seen,
-            self.prior,
-            observation.y,
-            observation.R,
-            names=self.parameters,
-            transform=self.transform,
-        )
+        with self._bar("all frames at once") as bar:
+            return filter_(
+                self.seen,
+                self.prior,
+                observation.y,
+                observation.R,
+                names=self.parameters,
+                transform=self.transform,
+                on_iterate=bar.iterate,
+            )
+
+    def _bar(self, title: str) -> SolveBar:
+        steps = len(self.model.protocol.steps())
+        bar = SolveBar(title, steps, TYPICAL_SOLVES, self.parameters)
+        self.model.closure.on_step = bar.step
+        return bar
 
     def path(self, found: SequentialEstimate) -> list[dict[str, Any]]:
         """Relative error and relative standard deviation after each frame of the first pass."""

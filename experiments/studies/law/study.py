@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 
 from experiments.common.build import Twin, build_twin
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.studies.law.report import law_text, write_law_tables
 from experiments.studies.law.settings import Settings
@@ -62,8 +62,11 @@ def run_law_study(config: Values, config_hash: str, folder: Path, started: float
     ]
     fits = {}
     for name, problem in (("exponential", twin.problem), ("linear", linear.problem)):
-        print(f"fitting the {name} law", file=sys.stderr, flush=True)
-        fits[name] = estimate(problem, data.observation)
+        model = twin.model if name == "exponential" else linear.model
+        steps = len(model.settings.protocol.steps())
+        with SolveBar(f"{name} law", steps, TYPICAL_SOLVES, problem.parameters) as bar:
+            model.on_step = bar.step
+            fits[name] = estimate(problem, data.observation, on_iterate=bar.iterate)
         own = fits[name].against(data.truth) if name == "exponential" else fits[name]
         record["fits"].append(_fit(name, own, problem.prior.mean, data.observation, data.truth))
     if all(result.estimate is not None for result in fits.values()):
@@ -170,22 +173,26 @@ def _repeats(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> list[dict[
     """Estimates with the exponential law from observations with other errors."""
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
     entries = []
-    for seed in seeds:
-        data = _observed(twin, closed, seed)
-        assert data.observation is not None
-        filtered = estimate(problem, data.observation).filtered
-        assert filtered is not None
-        low, high = filtered.interval()
-        entries.append(
-            {
-                "seed": seed,
-                "estimate": filtered.mean.tolist(),
-                "low": low.tolist(),
-                "high": high.tolist(),
-                "converged": filtered.converged,
-                "forward_solves": filtered.forward_solves,
-            }
-        )
+    steps = len(twin.model.settings.protocol.steps())
+    solves = TYPICAL_SOLVES * len(seeds)
+    with SolveBar("other errors", steps, solves, problem.parameters) as bar:
+        twin.model.on_step = bar.step
+        for seed in seeds:
+            data = _observed(twin, closed, seed)
+            assert data.observation is not None
+            filtered = estimate(problem, data.observation, on_iterate=bar.iterate).filtered
+            assert filtered is not None
+            low, high = filtered.interval()
+            entries.append(
+                {
+                    "seed": seed,
+                    "estimate": filtered.mean.tolist(),
+                    "low": low.tolist(),
+                    "high": high.tolist(),
+                    "converged": filtered.converged,
+                    "forward_solves": filtered.forward_solves,
+                }
+            )
     return entries
 
 

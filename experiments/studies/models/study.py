@@ -15,6 +15,7 @@ import numpy as np
 import mvest
 from experiments.common.build import build_filter
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.schema import build
 from experiments.common.study import Section, Study
 from experiments.studies.models.report import models_text, write_models_tables
@@ -146,9 +147,16 @@ def _estimate(
     print(f"{name} from data of {data}", file=sys.stderr, flush=True)
     runs = model.runs if isinstance(model, ProcessModel) else None
     began = time.perf_counter()
-    found = problem.filter(
-        model, problem.prior, y, problem.variance, names=PARAMETERS, transform=problem.transform
-    )
+    with SolveBar(name, 0, TYPICAL_SOLVES, PARAMETERS) as bar:
+        found = problem.filter(
+            model,
+            problem.prior,
+            y,
+            problem.variance,
+            names=PARAMETERS,
+            transform=problem.transform,
+            on_iterate=bar.iterate,
+        )
     row: dict[str, Any] = {
         "data": data,
         "model": name,

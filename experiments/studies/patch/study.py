@@ -20,6 +20,7 @@ from experiments.common.build import build_filter, mechanics_of, template_of
 from experiments.common.expectation import foresee_cycle
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.common.whole_cycle import cycle_model, shift_by_check_mesh, stored_cycle
 from experiments.studies.patch.report import patch_text, write_patch
@@ -63,9 +64,17 @@ def run_patch_study(
             max_iterations=config["filter"]["max_iterations"],
             start=tuple(map(float, start)),
         )
-        found = filter_(
-            seen, prior, observation.y, observation.R, names=parameters, transform=transform
-        )
+        with SolveBar(label, len(model.protocol.steps()), TYPICAL_SOLVES, parameters) as bar:
+            model.closure.on_step = bar.step
+            found = filter_(
+                seen,
+                prior,
+                observation.y,
+                observation.R,
+                names=parameters,
+                transform=transform,
+                on_iterate=bar.iterate,
+            )
         print(f"{label}: {found.reason.value}, {found.detail}", file=sys.stderr, flush=True)
         told = shift_by_check_mesh(config, found, seen, prior, observation)
         shift = None if isinstance(told, str) else told.shift

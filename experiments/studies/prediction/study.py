@@ -18,7 +18,7 @@ import numpy as np
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
 from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, flat, plain_run
-from experiments.common.progress import PartBar
+from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.schema import build
 from experiments.common.study import Section, Study
 from experiments.studies.prediction.report import prediction_text, write_prediction
@@ -170,7 +170,11 @@ def _predicted(
         return _Patient(seed, truth, StudyResult.failed(twin.problem, data.reason, 0.0), {}, {})
     # From the open valve, so that no patient depends on the one before.
     twin.model.restart(None)
-    result = estimate(twin.problem, data.observation)
+    steps = len(twin.model.settings.protocol.steps())
+    with SolveBar(f"patient {seed}", steps, TYPICAL_SOLVES, twin.problem.parameters) as bar:
+        twin.model.on_step = bar.step
+        result = estimate(twin.problem, data.observation, on_iterate=bar.iterate)
+    twin.model.on_step = None
     if result.filtered is None or not result.converged:
         return _Patient(seed, truth, result, {}, {})
     samples = posterior_samples(result.filtered, count, seed)

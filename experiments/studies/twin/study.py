@@ -20,7 +20,7 @@ from experiments.common.estimate_record import (
 )
 from experiments.common.expectation import TwinForesight
 from experiments.common.plain import Plain, flat, plain_run
-from experiments.common.progress import SolveBar
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
 from experiments.studies.twin.publish import require_twin, text_table_of, write_twin, write_twin_run
 from experiments.studies.twin.settings import Settings
@@ -32,9 +32,6 @@ from mvest.problem.synthetic import simulate_observation
 from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 
 __all__ = ["STUDY", "run_twin"]
-
-TYPICAL_SOLVES = 6
-"""Forward solves that a filter usually needs; only the progress bar's first guess."""
 
 LOCKING = (
     "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
@@ -100,7 +97,8 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
         truth = twin.source(twin.truth_values)
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
     results = []
-    with SolveBar("estimation", len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)) as bar:
+    steps, solves = len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)
+    with SolveBar("estimation", steps, solves, problem.parameters) as bar:
         twin.model.on_step = bar.step
         for seed in seeds:
             data = simulate_observation(
@@ -115,7 +113,8 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
             )
             if data.observation is None:
                 return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
-            results.append(estimate(problem, data.observation).against(data.truth))
+            result = estimate(problem, data.observation, on_iterate=bar.iterate)
+            results.append(result.against(data.truth))
     return results
 
 

@@ -1,9 +1,10 @@
 import io
 
+import numpy as np
 import pytest
 
 from experiments.common import progress
-from experiments.common.progress import SolveBar
+from experiments.common.progress import PartBar, SolveBar
 
 
 @pytest.fixture
@@ -14,6 +15,7 @@ def bar(monkeypatch):
         return tqdm(**{**settings, "disable": False, "file": io.StringIO()})
 
     tqdm = progress.tqdm
+    visible.write, visible.format_interval = tqdm.write, tqdm.format_interval
     monkeypatch.setattr(progress, "tqdm", visible)
     with SolveBar("estimation", 3, 2) as found:
         yield found
@@ -41,3 +43,79 @@ def test_the_bar_grows_with_solves_beyond_the_expected(bar) -> None:
         for time in (0.1, 0.2, 0.3):
             bar.step(time, 1)
     assert count(bar) == (9, 9)
+
+
+@pytest.fixture
+def clock(monkeypatch) -> list[float]:
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def lines(capsys) -> list[str]:
+    return capsys.readouterr().err.splitlines()
+
+
+def test_each_solve_and_each_step_of_the_filter_is_told(clock, capsys) -> None:
+    with SolveBar("estimation", 2, 4, ("E_f.anterior", "E_f.posterior")) as bar:
+
+        def solve() -> None:
+            for reached in (0.1, 0.2):
+                clock[0] += 10.0
+                bar.step(reached, 3)
+
+        solve()
+        assert lines(capsys) == [], "not before it is known to have ended"
+        bar.iterate(0, np.array([5.0, 3.0]), 12.5)
+        assert lines(capsys) == [
+            "estimation, forward solve 1: 2 time steps in 20.0 s; 00:20 elapsed, about 01:00 left "
+            "if 4 solves do",
+            "estimation, step 0 of the filter: objective 12.5; E_f.anterior 5, E_f.posterior 3; "
+            "00:20 elapsed, about 01:00 left if 4 solves do",
+        ]
+        solve()
+        bar.iterate(1, np.array([6.0, 2.5]), 2.5)
+        assert lines(capsys)[-1] == (
+            "estimation, step 1 of the filter: objective 2.5 (-10); E_f.anterior 6 (+1), "
+            "E_f.posterior 2.5 (-0.5); 00:40 elapsed, about 00:40 left if 4 solves do"
+        )
+        # Another estimate begins anew, and more solves than expected are told one by one.
+        for time in (0.1, 0.2) * 3:
+            bar.step(time, 1)
+        bar.iterate(0, np.array([5.0, 3.0]), 12.5)
+        assert "objective 12.5; E_f.anterior 5," in (told := lines(capsys)[-1])
+        assert told.endswith("about 00:08 for each further solve")
+
+
+def test_solves_that_take_no_time_are_left_to_the_bar(clock, capsys) -> None:
+    with SolveBar("estimation", 2, 4) as bar:
+        for time in (0.1, 0.2) * 3:
+            clock[0] += 0.01
+            bar.step(time, 1)
+    assert lines(capsys) == []
+
+
+def test_compiling_is_followed_by_what_happens_next(clock, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(progress, "kernels_are_compiled", lambda: False)
+    progress.announce_compilation.cache_clear()
+    with SolveBar("observation", 2, 1) as bar:
+        (said,) = lines(capsys)
+        assert said.startswith("compiling on first use")
+        assert said.endswith("then the observation goes on")
+        clock[0] += 50.0
+        bar.step(0.1, 1)
+        bar.step(0.2, 1)
+    assert lines(capsys)[0] == "compiled after 00:50; observation, forward solve 1 is under way"
+    progress.announce_compilation.cache_clear()
+
+
+def test_pieces_are_told_now_and_then_where_no_terminal_is_there(clock, capsys) -> None:
+    with PartBar("prediction", 10, "closure") as bar:
+        for _ in range(4):
+            clock[0] += 20.0
+            bar.step()
+    assert lines(capsys) == [
+        "prediction: 2 of 10 closures, 00:40 elapsed, about 02:40 left",
+        "prediction: 4 of 10 closures, 01:20 elapsed, about 02:00 left",
+        "prediction: done in 01:20",
+    ]

@@ -349,6 +349,37 @@ def test_the_bar_counts_and_names_failures(tmp_path, monkeypatch, capsys):
     assert "1 done, 1 failed, 0 skipped" in shown.getvalue()
 
 
+def test_the_time_left_is_told_from_the_first_job_on(tmp_path, monkeypatch, capsys):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    jobs = [planned(tmp_path, seed) for seed in range(1, 9)]
+    bars = {w: SweepBar(Plan("trial", tmp_path, {}, tuple(jobs), w)) for w in (1, 2)}
+    assert all(bar.said() == "0 done, 0 failed, 0 skipped, 8 to go" for bar in bars.values())
+    now[0] += 60.0
+    end(jobs[0], "failed", "it buckled")
+    for bar in bars.values():
+        bar.look()
+    # One worker: 7 jobs of a minute. Two: 1.5 jobs in the first minute, 6.5 left at that pace.
+    assert bars[1].said().endswith("about 07:00 left")
+    assert bars[2].said().endswith("about 04:20 left")
+    now[0] += 60.0
+    assert bars[1].said().endswith("about 06:00 left")
+    capsys.readouterr()
+
+    # Where no terminal is there, it is said at once.
+    monkeypatch.undo()
+    monkeypatch.setattr(progress, "LOOK", 0.01)
+    with SweepBar(Plan("trial", tmp_path, {}, tuple(jobs), 1)) as bar:
+        end(jobs[1], "failed", "it buckled")
+        until = time.monotonic() + 30.0
+        said = ""
+        while "left" not in said and time.monotonic() < until:
+            time.sleep(0.01)
+            said += capsys.readouterr().err
+        assert bar._bar.disable
+    assert "trial: 0 done, 1 failed, 0 skipped, about " in said
+
+
 def sweep_process(folder: Path, *more: str) -> subprocess.Popen:
     return subprocess.Popen(
         [
