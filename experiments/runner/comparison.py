@@ -143,7 +143,7 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
         observation's digest is that of the recording where there is one, and otherwise of the
         settings that it is simulated from: valve, mechanics, truth, frames, noise and seed.
     """
-    mesh, model = record["mesh"], record.get("model")
+    mesh, model = record["mesh"] or {}, record.get("model")
     found = []
     if "sha256" in mesh and model is not None:
         cells = " x ".join(str(count) for count in model["cells"])
@@ -158,7 +158,7 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
             }
         )
     frames = config["observation"]["frames"]
-    if "data" in record:
+    if record.get("data"):
         found.append(
             {
                 "context": "observation",

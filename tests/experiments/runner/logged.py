@@ -3,12 +3,13 @@
 import json
 from pathlib import Path
 
+from experiments.common.plain import flat
 from experiments.runner import comparison
 
 
 def logged(folder: Path) -> dict[str, float]:
     """The metrics of a run at its last step; its settings and inputs must be there, too."""
-    record = json.loads((folder / "result.json").read_text())
+    record = flat(json.loads((folder / "result.json").read_text()))
     config = json.loads((folder / "config.json").read_text())
     assert comparison.parameters(config, record)
     json.dumps(comparison.inputs(config, record))
