@@ -14,7 +14,7 @@ from typing import Any
 
 from filelock import FileLock
 
-from experiments.common.record import Outcome, read_data, stamp, write_record
+from experiments.common.record import SCHEMA, Outcome, read_data, stamp, write_record
 from experiments.runner.request import Request
 from mvest.errors import InputError
 from mvest.files import remove_parts
@@ -60,13 +60,14 @@ def lock(folder: Path) -> FileLock:
 
 
 def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
-    """The record in a folder if it is there and belongs to the configuration."""
+    """The record in a folder if it is there, of this version, and of the configuration."""
     try:
         record = json.loads((folder / RESULT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    belongs = isinstance(record, dict) and record["provenance"]["config_hash"] == config_hash
-    return record if belongs else None
+    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
+        return None
+    return record if record["provenance"]["config_hash"] == config_hash else None
 
 
 def is_done(folder: Path) -> bool:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from experiments.common.plain import flat
+from experiments.common.record import SCHEMA
 from experiments.runner.comparison import inputs, metrics, parameters
 from experiments.runner.folder import is_done
 from mvest.errors import ConfigurationError, InputError, MvestError
@@ -235,7 +236,10 @@ def upload(
     InputError
         If a file of the job cannot be read.
     """
-    record, config = flat(read_json(folder / "result.json")), read_json(folder / "config.json")
+    record, config = read_json(folder / "result.json"), read_json(folder / "config.json")
+    if record.get("schema") != SCHEMA:
+        raise InputError(f"{folder / 'result.json'} was written by another version")
+    record = flat(record)
     result_hash = _digest(folder / "result.json")
     receipt = read_json(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
     config_hash = str(record["provenance"]["config_hash"])

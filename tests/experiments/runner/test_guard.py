@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import experiments.runner.worker as worker_module
+from experiments.common.record import SCHEMA
 from experiments.runner.folder import is_done, last_record, lock, mark_done
 from experiments.runner.guard import WorkerProcess, run_apart
 from experiments.runner.job import FailedRunError
@@ -120,7 +121,12 @@ def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypa
 
 def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     asked = request(tmp_path, signal=9)
-    done = {"status": "converged", "reason": "", "provenance": {"config_hash": "0" * 64}}
+    done = {
+        "schema": SCHEMA,
+        "status": "converged",
+        "reason": "",
+        "provenance": {"config_hash": "0" * 64},
+    }
     write_json(tmp_path / "result.json", done)
     mark_done(tmp_path)
     assert run_apart(asked, worker) == done
@@ -130,18 +136,20 @@ def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
 
 
 def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
-    other = {"status": "converged", "provenance": {"config_hash": "1" * 64}}
+    other = {"schema": SCHEMA, "status": "converged", "provenance": {"config_hash": "1" * 64}}
     write_json(tmp_path / "result.json", other)
     mark_done(tmp_path)
     assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
 
 
 def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
-    record = {"status": "converged", "provenance": {"config_hash": "0" * 64}}
+    record = {"schema": SCHEMA, "status": "converged", "provenance": {"config_hash": "0" * 64}}
     write_json(tmp_path / "result.json", record)
     assert last_record(tmp_path, "0" * 64) is None
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) == record
+    write_json(tmp_path / "result.json", record | {"schema": SCHEMA - 1})
+    assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
 
 
 def test_a_second_process_waits_for_the_folder(tmp_path):

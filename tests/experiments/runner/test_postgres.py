@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.common.plain import flat
 from experiments.runner import comparison
 from tests.experiments.runner.test_tracking import make_config, make_job
 from tests.places import ROOT
@@ -115,6 +116,7 @@ def test_eight_processes_lose_nothing(server, tmp_path) -> None:
         config, record = (
             json.loads((jobs[0] / name).read_text()) for name in ("config.json", "result.json")
         )
+        record = flat(record)
         for table, column, expected in (
             ("params", "run_uuid", comparison.parameters(config, record)),
             ("metrics", "run_uuid", comparison.metrics(record)),

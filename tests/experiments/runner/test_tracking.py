@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from experiments.common.record import SCHEMA
 from experiments.runner import comparison, sync, tracking
 from experiments.runner.dashboard import last_comparison
 from experiments.runner.plan import PLAN, Plan, PlannedJob
@@ -88,12 +89,22 @@ def make_record(config_hash: str = "c" * 64, **changes) -> dict:
     return record | changes
 
 
+HEADER = {"experiment", "row", "status", "reason", "mesh", "model", "provenance"}
+
+
+def written(record: dict) -> str:
+    """A record as a job writes it: what the study found apart from what the runner stamps."""
+    header = {key: value for key, value in record.items() if key in HEADER}
+    findings = {key: value for key, value in record.items() if key not in HEADER}
+    return json.dumps({"schema": SCHEMA, **header, "findings": findings})
+
+
 def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
     folder = outputs / "debug" / name
     folder.mkdir(parents=True)
     record = make_record((name * 64)[:64], **changes)
     (folder / "config.json").write_text(json.dumps(config or make_config(outputs)))
-    (folder / "result.json").write_text(json.dumps(record))
+    (folder / "result.json").write_text(written(record))
     (folder / "iterates.png").write_bytes(b"picture")
     if record["status"] == "converged":
         (folder / "done").touch()
@@ -190,7 +201,7 @@ def test_a_new_result_takes_the_place_of_the_old_one(tmp_path) -> None:
     upload(store, job, "sweep-1")
     assert tracking.is_tracked(job)
     changed = make_record(("job" * 64)[:64], estimate=[6.1, 2.1])
-    (job / "result.json").write_text(json.dumps(changed))
+    (job / "result.json").write_text(written(changed))
     assert not tracking.is_tracked(job)
     assert upload(store, job, None)
     (run,) = stored(tmp_path)
@@ -281,10 +292,13 @@ def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read
     (make_job(tmp_path, "b") / "done").unlink()  # killed before everything was on disk
     (make_job(tmp_path, "c") / "config.json").write_text("{")
     make_job(tmp_path, "d")
+    # Of a version before this one.
+    (make_job(tmp_path, "e") / "result.json").write_text(json.dumps(make_record()))
     assert sync.main([str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert [run.data.tags["folder"] for run in stored(tmp_path)] == ["d"]
-    assert captured.err.count("left out") == 1
+    assert captured.err.count("left out") == 2
+    assert "another version" in captured.err
     assert "config.json" in captured.err
     assert sync.main([str(tmp_path / "nowhere")]) == 2
 
