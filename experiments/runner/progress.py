@@ -96,7 +96,7 @@ class SweepBar:
             # Many folders on a slow disk are looked at less often.
             pause = max(LOOK, 10.0 * (time.monotonic() - looked))
             ended = self._done + self._failed
-            if self._bar.disable and ended and looked - (self._said or -SAY) > SAY:
+            if self._bar.disable and 0 < ended < self._total and looked - (self._said or -SAY) > SAY:
                 self._said = looked
                 print(f"{self._name}: {self.said()}", file=sys.stderr)
 
