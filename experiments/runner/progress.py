@@ -95,8 +95,8 @@ class SweepBar:
             self._bar.set_postfix_str(self.said())
             # Many folders on a slow disk are looked at less often.
             pause = max(LOOK, 10.0 * (time.monotonic() - looked))
-            ended = self._done + self._failed
-            if self._bar.disable and 0 < ended < self._total and looked - (self._said or -SAY) > SAY:
+            going_on = 0 < self._done + self._failed < self._total
+            if self._bar.disable and going_on and looked - (self._said or -SAY) > SAY:
                 self._said = looked
                 print(f"{self._name}: {self.said()}", file=sys.stderr)
 

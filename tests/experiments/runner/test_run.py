@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import tables
+from experiments.common.plain import flat
 from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
@@ -58,7 +59,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert finished.returncode == 0, finished.stderr
     assert "E_f.anterior [MPa]" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    record = json.loads((folder / "result.json").read_text())
+    record = flat(json.loads((folder / "result.json").read_text()))
     for key, kind in REQUIRED.items():
         assert isinstance(record[key], kind), key
     assert record["status"] == "converged"
@@ -196,7 +197,7 @@ def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) ->
     assert status == 1
     assert err.startswith("no estimate: no synthetic observation: Newton's method")
     assert "result.json" in err
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     assert record["status"] == "failed"
     assert record["estimate"] is None
     assert record["distance_mm"] is None
@@ -216,7 +217,7 @@ def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_clo
     status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.enabled=false")
     assert status == 1
     assert "it buckled" in err
-    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
     assert record["forward_solves"] == 1
     assert record["estimate"] is None
     assert record["iterates"] == [[5.0, 3.0]]

@@ -309,7 +309,7 @@ def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
 
 def planned(folder: Path, seed: int) -> PlannedJob:
     values = {
-        **{"name": "a", "title": "b", "row": "c", "table": "d", "paper": None, "seed": seed},
+        **{"study": "twin", "name": "a", "title": "b", "row": "c", "table": "d", "seed": seed},
         **{"parameters": ["x"], "factors": {"seed": seed}, "truth": {"values": [1.0]}},
         **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
         **{"mechanics": {"element": "hex18"}, "force": False},
