@@ -335,6 +335,27 @@ def test_a_name_from_a_face_is_seen(source: str, count: int) -> None:
     assert len(through_faces(source, "mvest.x", {"mvest.estimation": {"Gaussian"}})) == count
 
 
+# --- names --------------------------------------------------------------------------------------
+
+
+def public_classes(source: str) -> list[str]:
+    """Names of the classes of a module that others may use."""
+    names = [node.name for node in ast.parse(source).body if isinstance(node, ast.ClassDef)]
+    return [name for name in names if not name.startswith("_")]
+
+
+def test_a_public_class_of_the_library_has_a_name_of_its_own() -> None:
+    places: dict[str, list[str]] = {}
+    for module, path in modules("mvest"):
+        for name in public_classes(path.read_text(encoding="utf-8")):
+            places.setdefault(name, []).append(module)
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def test_public_classes_are_seen() -> None:
+    assert public_classes("class A:\n    class B: ...\nclass _C: ...\ndef D(): ...") == ["A"]
+
+
 # --- dependencies -------------------------------------------------------------------------------
 
 

@@ -227,11 +227,11 @@ class ValveCase:
 
     def __post_init__(self) -> None:
         for role in (Role.REFERENCE, Role.CLOSED):
-            found = [frame.name for frame in self.frames if frame.role is role]
-            if len(found) != 1:
+            members = [frame.name for frame in self.frames if frame.role is role]
+            if len(members) != 1:
                 raise InputError(
-                    f"case {self.name}: {len(found)} frames with the role {role.value} "
-                    f"({', '.join(found) or 'none'}), expected one"
+                    f"case {self.name}: {len(members)} frames with the role {role.value} "
+                    f"({', '.join(members) or 'none'}), expected one"
                 )
         names = [frame.name for frame in self.frames]
         if len(set(names)) != len(names):
@@ -263,13 +263,13 @@ class ValveCase:
                 f"case {self.name}: chordae that follow error samples need two regions, one of "
                 f"them anterior, and two papillary tips (here: {', '.join(names)}; {t} tips)"
             )
-        for name, found, wanted in (
+        for name, given, wanted in (
             ("vertices", samples.vertices.shape[1:3], (f, n)),
             ("tips", samples.tips.shape[1:3], (f, t)),
         ):
-            if found != wanted:
+            if given != wanted:
                 raise InputError(
-                    f"case {self.name}: error samples, {name} of {found[0]} frames of {found[1]} "
+                    f"case {self.name}: error samples, {name} of {given[0]} frames of {given[1]} "
                     f"points, expected {wanted[0]} of {wanted[1]}"
                 )
         strange = [frame.name for frame in self.frames if not frame.corresponds]

@@ -86,13 +86,13 @@ def check_frames(file: Path, document: CaseFile) -> None:
                 "put the frames in the order of time",
             )
     for role in ("reference", "closed"):
-        found = [frame.name for frame in frames if frame.role == role]
-        if len(found) != 1:
-            listed = ", ".join(found) or "none"
+        members = [frame.name for frame in frames if frame.role == role]
+        if len(members) != 1:
+            listed = ", ".join(members) or "none"
             raise wrong(
                 file,
                 "frames",
-                f"{len(found)} frames have the role {role} ({listed}), expected exactly one",
+                f"{len(members)} frames have the role {role} ({listed}), expected exactly one",
             )
     count = {len(frame.papillary_tips) for frame in frames}
     first = len(frames[0].papillary_tips)

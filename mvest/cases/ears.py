@@ -44,12 +44,12 @@ def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
     loop_of = np.full(int(triangles.max()) + 1, -1)
     for number, loop in enumerate(loops):
         loop_of[loop] = number
-    found = [tuple(triangle) for triangle in triangles.tolist()]
-    owner = {edge: t for t, triangle in enumerate(found) for edge in _edges(triangle)}
+    corners = [tuple(triangle) for triangle in triangles.tolist()]
+    owner = {edge: t for t, triangle in enumerate(corners) for edge in _edges(triangle)}
     cured = []
-    while turned := [t for t in _ears(found, loop_of) if _turn(found, owner, t, loop_of)]:
+    while turned := [t for t in _ears(corners, loop_of) if _turn(corners, owner, t, loop_of)]:
         cured += turned
-    return np.array(found, dtype=np.int64), np.unique(np.array(cured, dtype=np.int64))
+    return np.array(corners, dtype=np.int64), np.unique(np.array(cured, dtype=np.int64))
 
 
 def _edges(triangle: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -60,8 +60,8 @@ def _edges(triangle: tuple[int, ...]) -> list[tuple[int, int]]:
 def _ears(triangles: list[tuple[int, ...]], loop_of: IntArray) -> list[int]:
     on = loop_of[np.array(triangles)]
     same = (on[:, 0] >= 0) & (on[:, 0] == on[:, 1]) & (on[:, 0] == on[:, 2])
-    found: list[int] = np.flatnonzero(same).tolist()
-    return found
+    ears: list[int] = np.flatnonzero(same).tolist()
+    return ears
 
 
 def _turn(

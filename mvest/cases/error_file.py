@@ -14,7 +14,7 @@ from mvest.errors import InputError
 __all__ = ["ARRAYS", "read_error_samples", "write_error_samples"]
 
 ARRAYS = ("frames", "vertices", "tips")
-LARGEST_FILE = 2**29
+MAX_FILE_SIZE = 2**29
 """Bytes of all arrays."""
 
 
@@ -35,9 +35,9 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     try:
         with zipfile.ZipFile(file) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > LARGEST_FILE:
+        if size > MAX_FILE_SIZE:
             raise InputError(
-                f"{file.name}: {size} bytes of arrays, expected at most {LARGEST_FILE}"
+                f"{file.name}: {size} bytes of arrays, expected at most {MAX_FILE_SIZE}"
             )
         with np.load(file, allow_pickle=False) as stored:
             if sorted(stored.files) != sorted(ARRAYS):

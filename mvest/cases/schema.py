@@ -292,5 +292,5 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     """The model that a field holds, by itself, in a list, or as one of several alternatives."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    found = (_model_in(part) for part in get_args(annotation))
-    return next((model for model in found if model is not None), None)
+    models = (_model_in(part) for part in get_args(annotation))
+    return next((model for model in models if model is not None), None)

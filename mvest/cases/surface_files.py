@@ -73,9 +73,9 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
         A missing, damaged or empty file, unknown or missing labels, a region without triangles.
     """
     if isinstance(files, Path):
-        found = _read(files)
-        region = _labels(files, found, regions)
-        surface = RegionSurface(found.vertices, found.triangles, region, found.point_data)
+        whole = _read(files)
+        region = _labels(files, whole, regions)
+        surface = RegionSurface(whole.vertices, whole.triangles, region, whole.point_data)
         suffix = files.suffix.lower()
         if suffix == ".stl" or (suffix == ".obj" and _apart(surface)):
             surface = _merged(surface)
@@ -89,20 +89,20 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
 
 
 def _read(file: Path) -> SurfaceFile:
-    found = read_surface(file)
-    far = np.flatnonzero((np.abs(found.vertices) > MAX_NUMBER).any(axis=1))
+    surface = read_surface(file)
+    far = np.flatnonzero((np.abs(surface.vertices) > MAX_NUMBER).any(axis=1))
     if len(far):
         raise GeometryError(
             f"{file}: points {far[:5].tolist()} have coordinates beyond {MAX_NUMBER:g}"
         )
     for data, rows in (
-        (found.cell_data, len(found.triangles)),
-        (found.point_data, len(found.vertices)),
+        (surface.cell_data, len(surface.triangles)),
+        (surface.point_data, len(surface.vertices)),
     ):
         for name, values in data.items():
             if len(values) != rows:
                 raise InputError(f"{file}: data {name!r} has {len(values)} rows, expected {rows}")
-    return found
+    return surface
 
 
 def _apart(surface: RegionSurface) -> bool:
@@ -150,13 +150,13 @@ def _merged(surface: RegionSurface) -> RegionSurface:
     )
 
 
-def _labels(file: Path, found: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
-    if "region" in found.cell_data:
-        return _numbered(found.cell_data["region"], regions, "triangles", "cell data region")
-    if "region" in found.point_data:
-        at_corner = _numbered(found.point_data["region"], regions, "vertices", "point data region")[
-            found.triangles
-        ]
+def _labels(file: Path, surface: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
+    if "region" in surface.cell_data:
+        return _numbered(surface.cell_data["region"], regions, "triangles", "cell data region")
+    if "region" in surface.point_data:
+        at_corner = _numbered(
+            surface.point_data["region"], regions, "vertices", "point data region"
+        )[surface.triangles]
         ordered = np.sort(at_corner, axis=1)
         torn = np.flatnonzero((np.diff(ordered, axis=1) > 0).all(axis=1))
         if len(torn):
@@ -170,7 +170,7 @@ def _labels(file: Path, found: SurfaceFile, regions: Mapping[int, str]) -> IntAr
         groups = _groups(file)
         if len(set(groups)) > 1 or (groups and groups[0] in regions.values()):
             return _named(groups, list(regions.values()))
-    return np.zeros(len(found.triangles), dtype=np.int64) if len(regions) == 1 else None
+    return np.zeros(len(surface.triangles), dtype=np.int64) if len(regions) == 1 else None
 
 
 def _numbered(

@@ -1,6 +1,6 @@
 """Models made of models: of some of the parameters, of some of what is predicted, with a memory."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
@@ -9,7 +9,7 @@ import numpy as np
 from mvest.estimation.prediction import ObservationModel, Predicted, Prediction, predict
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["Remembered", "Restartable", "SharedStart", "of_some", "rows_of"]
+__all__ = ["Remembered", "Restartable", "SharedStart", "of_some", "rows_of", "stacked"]
 
 State = TypeVar("State")
 
@@ -53,6 +53,21 @@ def rows_of(model: ObservationModel, rows: BoolArray) -> Callable[[FloatArray], 
         return replace(prediction, y=prediction.y[rows], jacobian=prediction.jacobian[rows])
 
     return seen
+
+
+def stacked(models: Sequence[ObservationModel]) -> Callable[[FloatArray], Prediction]:
+    """Several models of the same parameters as one, which fails where one of them does."""
+
+    def whole(m: FloatArray) -> Prediction:
+        parts = []
+        for model in models:
+            parts.append(predict(model, m))
+            if not parts[-1].converged:
+                return parts[-1]
+        y, jacobian = zip(*((part.y, part.jacobian) for part in parts), strict=True)
+        return Prediction(np.concatenate(y), np.concatenate(jacobian))
+
+    return whole
 
 
 class Remembered:

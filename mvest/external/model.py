@@ -167,20 +167,20 @@ class ProcessModel:
         requests = [self._request(m, jacobian) for m in points]
         processes = 1 if self.differences is None else self.differences.processes
         if processes == 1 or len(requests) == 1:
-            found = [self._run(request, None) for request in requests]
+            runs = [self._run(request, None) for request in requests]
         else:
             stop = threading.Event()
             with ThreadPoolExecutor(processes) as pool:
                 try:
-                    found = list(pool.map(lambda request: self._run(request, stop), requests))
+                    runs = list(pool.map(lambda request: self._run(request, stop), requests))
                 except BaseException:
                     stop.set()
                     pool.shutdown(cancel_futures=True)
                     raise
-        self.runs += sum(run.started for run in found)
-        self.reused += sum(run.reused for run in found)
-        self.seconds += sum(run.seconds for run in found)
-        return [run.answer for run in found]
+        self.runs += sum(run.started for run in runs)
+        self.reused += sum(run.reused for run in runs)
+        self.seconds += sum(run.seconds for run in runs)
+        return [run.answer for run in runs]
 
     def _run(self, request: RunRequest, stop: threading.Event | None) -> _Run:
         """One run in its folder, unless it is finished there."""

@@ -87,25 +87,25 @@ def expectation_text(
     return "\n".join(lines)
 
 
-def confounded_words(found: Identifiability) -> list[str]:
+def confounded_words(data: Identifiability) -> list[str]:
     """One sentence for each group of parameters that the data hardly tell apart."""
-    return [alike_words(group) for group in confounded_record(found)]
+    return [alike_words(group) for group in confounded_record(data)]
 
 
-def confounded_record(found: Identifiability) -> list[dict[str, Any]]:
+def confounded_record(data: Identifiability) -> list[dict[str, Any]]:
     """The same as plain data, for a record: parameters and a change of each that hardly shows.
 
     Changes are in the parameters' own units, for a change of the first by a tenth of its scale.
     """
-    return [_plain(group, found) for group in found.confounded()]
+    return [_plain(group, data) for group in data.confounded()]
 
 
-def _plain(group: Confounded, found: Identifiability) -> dict[str, Any]:
-    at = [found.names.index(name) for name in group.names]
+def _plain(group: Confounded, data: Identifiability) -> dict[str, Any]:
+    at = [data.names.index(name) for name in group.names]
     return {
         "parameters": list(group.names),
         "changes": [
-            STEP * exchange * float(found.scale[k])
+            STEP * exchange * float(data.scale[k])
             for exchange, k in zip(group.exchange, at, strict=True)
         ],
         "relative": [STEP * exchange for exchange in group.exchange],

@@ -20,7 +20,7 @@ from mvest.estimation import (
     profile,
 )
 from mvest.estimation.prediction import as_prediction, predict
-from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of
+from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of, stacked
 from mvest.problem.expectation import expect_of_model
 
 H = np.random.default_rng(5).standard_normal((6, 2))
@@ -158,6 +158,25 @@ def test_wrappers_hand_on() -> None:
     failed = lambda m: Prediction.failed("does not close")  # noqa: E731
     assert of_some(failed, np.ones(2), np.array([1]))(m[1:]).reason == "does not close"
     assert rows_of(failed, rows)(m).reason == "does not close"
+
+
+def test_models_are_stacked_up_to_the_first_that_fails() -> None:
+    calls = []
+
+    def model(factor: float):
+        def predicted(m: np.ndarray) -> Prediction:
+            calls.append(factor)
+            return Prediction.failed("open") if m[0] < 0 else Prediction(factor * H @ m, factor * H)
+
+        return predicted
+
+    whole = stacked([model(1.0), model(2.0)])
+    m = np.array([1.0, 3.0])
+    np.testing.assert_array_equal(whole(m).y, np.concatenate([H @ m, 2.0 * H @ m]))
+    np.testing.assert_array_equal(whole(m).jacobian, np.concatenate([H, 2.0 * H]))
+    calls.clear()
+    assert whole(-m).reason == "open"
+    assert calls == [1.0]
 
 
 def test_a_known_value_is_met_to_the_last_bit() -> None:

@@ -26,7 +26,7 @@ from mvest.kept import Entry
 from mvest.observation.vertices import observed_frames
 from mvest.typing import FloatArray
 
-__all__ = ["FilterProblem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
+__all__ = ["ComparedProblem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
 
 Values = Mapping[str, Any]
 
@@ -38,7 +38,7 @@ SPARE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class FilterProblem:
+class ComparedProblem:
     """What is estimated from what, for every filter.
 
     Attributes
@@ -131,7 +131,7 @@ class SurrogateModel:
         return Prediction(self.surrogate(x[None])[0], jacobian)
 
 
-def build_problem(config: Values, name: str) -> FilterProblem:
+def build_problem(config: Values, name: str) -> ComparedProblem:
     """One of the configured problems.
 
     Raises
@@ -167,7 +167,7 @@ def build_problem(config: Values, name: str) -> FilterProblem:
     model = twin.model
     seen = np.zeros((1, len(twin.valve.surface.vertices)), dtype=np.bool_)
     seen[:, :: settings["every"]] = True
-    return FilterProblem(
+    return ComparedProblem(
         name,
         parameters,
         TimedModel(observed_frames(model, ("closed",), seen), lambda: model.restart(None)),
@@ -205,7 +205,7 @@ _Run = tuple[FloatArray, FloatArray]
 """Prediction and its derivatives by the logarithms' N(0, I); empty if it failed."""
 
 
-def fit_to_prior(problem: FilterProblem, settings: Values, store: Path) -> FittedSurrogate:
+def fit_to_prior(problem: ComparedProblem, settings: Values, store: Path) -> FittedSurrogate:
     """A polynomial over the prior out to ``reach`` standard deviations.
 
     Each run of the model is kept in the folder ``store`` and read from there if it is there.
@@ -237,7 +237,7 @@ def fit_to_prior(problem: FilterProblem, settings: Values, store: Path) -> Fitte
     )
 
 
-def _run_all(problem: FilterProblem, points: FloatArray, store: Path) -> list[_Run]:
+def _run_all(problem: ComparedProblem, points: FloatArray, store: Path) -> list[_Run]:
     """Runs of the model at points of the logarithms' prior, N(0, I); those of the store are read.
 
     They are run from neighbour to neighbour, since a closure goes on from the one before.

@@ -22,7 +22,7 @@ from experiments.common.store import Store
 from experiments.common.study import Section, Study
 from experiments.studies.filters.problem import (
     TRANSFORM,
-    FilterProblem,
+    ComparedProblem,
     FittedSurrogate,
     build_problem,
     fit_to_prior,
@@ -135,12 +135,12 @@ def _solve(config: Values, name: str) -> dict[str, Any]:
     }
 
 
-def _told(values: Values, problem: FilterProblem) -> dict[str, Any]:
+def _told(values: Values, problem: ComparedProblem) -> dict[str, Any]:
     """Settings of a filter, with the process noise of the paper: as large as the prior."""
     return {**values, "Q": np.diag(problem.prior.covariance)}
 
 
-def _estimate(problem: FilterProblem, filter_: Filter, seed: int) -> dict[str, Any]:
+def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> dict[str, Any]:
     """One estimate with the model itself, from the open valve on."""
     problem.model.restart()
     y = problem.exact
@@ -184,7 +184,7 @@ def _histogram(draws: FloatArray) -> dict[str, Any]:
 
 
 def _repeats(
-    problem: FilterProblem,
+    problem: ComparedProblem,
     fitted: FittedSurrogate,
     filters: Mapping[str, Filter],
     settings: Values,
@@ -241,7 +241,7 @@ def _interval(
 
 
 def _drawn(
-    problem: FilterProblem,
+    problem: ComparedProblem,
     fitted: FittedSurrogate,
     y: FloatArray,
     sampler: SamplerSettings,

@@ -30,8 +30,9 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.profile import Profile, profile
-from mvest.estimation.prediction import Prediction
+from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.transform import Log
+from mvest.estimation.wrappers import rows_of, stacked
 from mvest.observation.errors import SpatialCorrelation
 from mvest.reporting.expectation import confounded_record
 from mvest.typing import BoolArray, FloatArray
@@ -243,25 +244,6 @@ def _needed_pressure(told: Values, made: Made, names: Sequence[str]) -> dict[str
     }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Closures:
-    """Closed frames at several pressures as one observation of some vertices."""
-
-    models: tuple[ClosureModel, ...]
-    rows: BoolArray
-
-    def __call__(self, m: FloatArray, /) -> Prediction:
-        y, H = [], []
-        for model in self.models:
-            found = model(m)
-            if not found.converged:
-                return found
-            half = len(found.y) // 2
-            y.append(found.y[half:][self.rows])
-            H.append(found.jacobian[half:][self.rows])
-        return Prediction(np.concatenate(y), np.concatenate(H))
-
-
 def _profiles(
     told: Values,
     config: Values,
@@ -276,11 +258,12 @@ def _profiles(
     found = []
     for chosen in told["followed"]:
         rows = np.repeat(sets[chosen["vertices"]], 3)
+        closed_rows = np.concatenate([np.zeros_like(rows), rows])
         models = tuple(
             replace(_closure(config, own, pressure), fixed=held)
             for pressure in chosen["pressures_mmHg"]
         )
-        model = _Closures(models, rows)
+        model = stacked([rows_of(one, closed_rows) for one in models])
         first = model(values[free])
         closed = [m.closed for m in models]
         for k, name in enumerate(own):
@@ -299,7 +282,7 @@ def _profiles(
 
 def _followed(
     told: Values,
-    model: _Closures,
+    model: ObservationModel,
     first: Prediction,
     start: FloatArray,
     k: int,

@@ -107,8 +107,8 @@ def measure_sequence(
             "vertex_confidence_mean": _finite(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
-        found = _measured(sequence, t, thickness_mm, reach, passing_ball)
-        rows.append(row | {name: _finite(found.get(name)) for name in names})
+        measured = _measured(sequence, t, thickness_mm, reach, passing_ball)
+        rows.append(row | {name: _finite(measured.get(name)) for name in names})
     return rows
 
 
@@ -119,7 +119,7 @@ def _measured(
     if not (np.isfinite(x).all() and np.isfinite(tips).all() and sequence.frame_confidence[t] > 0):
         return {}
     layout = sequence.layout
-    found = clinical_measurements(
+    measures = clinical_measurements(
         x,
         _leaflets(layout, thickness_mm),
         x[layout.annulus],
@@ -128,10 +128,10 @@ def _measured(
         tip_names=TIPS,
         passing_ball=passing_ball,
     )
-    orifice, area = found.get("orifice_mm2"), found.get("annulus_area_mm2")
+    orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
     if orifice is None or area is None or orifice >= OPEN_SHARE * area:
-        return {name: v for name, v in found.items() if not name.startswith(CLOSED_ONLY)}
-    return found
+        return {name: v for name, v in measures.items() if not name.startswith(CLOSED_ONLY)}
+    return measures
 
 
 def _leaflets(layout: ValveLayout, thickness_mm: float) -> _Leaflets:

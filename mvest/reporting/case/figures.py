@@ -174,22 +174,22 @@ def distance_top(*distances: FloatArray) -> float:
     return float(step * np.ceil(top / step - 1e-9))
 
 
-def information_figure(fields: CaseFields, found: Sequence[Information]) -> Figure:
+def information_figure(fields: CaseFields, informations: Sequence[Information]) -> Figure:
     """Where on the closed valve each modulus shows: alone (top), and beyond nuisances (bottom).
 
     Parameters
     ----------
     fields : CaseFields
         With the fitted shape.
-    found : sequence of Information
+    informations : sequence of Information
         One for each modulus; the two maps of one share its colour scale.
     """
-    if not found:
+    if not informations:
         raise InputError("the run stored no sensitivities that fit its parameters")
     points = _closed_shape(fields)
-    figure = Figure(figsize=(max(3.1 * len(found), 4.6), 6.0), layout="constrained")
-    grid = figure.subplots(2, len(found), squeeze=False)
-    for column, information in enumerate(found):
+    figure = Figure(figsize=(max(3.1 * len(informations), 4.6), 6.0), layout="constrained")
+    grid = figure.subplots(2, len(informations), squeeze=False)
+    for column, information in enumerate(informations):
         top = max(float(np.nanmax(information.raw)), 1e-12)
         scale = ScalarMappable(PowerNorm(0.5, 0.0, top), INFORMATION_MAP)
         for row, field in enumerate((information.raw, information.beyond)):

@@ -85,14 +85,14 @@ def information(
     S = np.where(seen[:, None, None], fields.sensitivity, 0.0).reshape(3 * n, -1)
     S = S / (1.0 if std_mm is None else std_mm)
     nuisance = [k for k, p in enumerate(columns) if p["kind"] == NUISANCE]
-    found = []
+    informations = []
     for k, parameter in enumerate(columns):
         if parameter["kind"] != MODULUS or parameter.get("estimate") is None:
             continue
         own = S[:, k] * parameter["estimate"]
         rest = _beyond(own, S[:, nuisance], [columns[i] for i in nuisance], std_mm)
         raw = float(own @ own)
-        found.append(
+        informations.append(
             Information(
                 str(parameter["name"]),
                 str(parameter["label"]),
@@ -101,7 +101,7 @@ def information(
                 float(rest @ own) / raw if raw > 0 else 0.0,
             )
         )
-    return found
+    return informations
 
 
 def _beyond(

@@ -75,12 +75,12 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
     except OSError as error:
         raise cannot_write(folder, error) from error
     names = words.leaflet_names(record, int(shapes.region.max()) + 1)
-    found = information(shapes, record.get("parameters") or [], _observation_std(record))
+    informations = information(shapes, record.get("parameters") or [], _observation_std(record))
     note = words.provenance_note(record)
     written: list[Path] = []
     pictures: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
-    for name, make, caption in _figures(record, shapes, names, found):
+    for name, make, caption in _figures(record, shapes, names, informations):
         try:
             figure, text = make(), caption()
         except InputError as error:
@@ -109,13 +109,13 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         missing=missing,
         view=case_view(shapes, names),
         files=[path.name for path in written],
-        **_content(record, shapes, names, found),
+        **_content(record, shapes, names, informations),
     )
     return [write_atomically(folder / REPORT, page), *written]
 
 
 def _figures(
-    record: Record, shapes: CaseFields, names: Sequence[str], found: Sequence[Information]
+    record: Record, shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
 ) -> list[tuple[str, Callable[[], Figure], Callable[[], str]]]:
     """Name, drawing and caption of each picture; either raises where something is missing."""
     marked = " Simulated." if (record.get("case") or {}).get("simulated") else ""
@@ -146,7 +146,7 @@ def _figures(
         ("estimates", lambda: estimates_figure(record), said("estimates")),
         (
             "identifiability",
-            lambda: information_figure(shapes, found),
+            lambda: information_figure(shapes, informations),
             said("identifiability"),
         ),
         ("iterations", lambda: iterations_figure(record), said("iterations")),
@@ -166,7 +166,7 @@ def _figures(
 
 
 def _content(
-    record: Record, shapes: CaseFields, names: Sequence[str], found: Sequence[Information]
+    record: Record, shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
 ) -> dict[str, Any]:
     case = record.get("case") or {}
     narrow = record.get("narrow") or []
@@ -186,7 +186,7 @@ def _content(
         "has_without": bool((record.get("without_nuisances") or {}).get("parameters")),
         "has_truth": bool(case.get("simulated"))
         and any(m.get("truth") is not None for m in record.get("moduli") or []),
-        "where": _where(shapes, names, found),
+        "where": _where(shapes, names, informations),
         "identifiability": words.identifiability_words(record),
         "shares": words.share_rows(record),
         "innovation": words.innovation_words(record),
@@ -216,11 +216,11 @@ def _image_step(record: Record) -> dict[str, Any] | None:
 
 
 def _where(
-    shapes: CaseFields, names: Sequence[str], found: Sequence[Information]
+    shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
 ) -> list[dict[str, str]]:
     """A sentence for each modulus: which part of the valve informs it, and what remains of that."""
     rows = []
-    for one in found:
+    for one in informations:
         parts = where_words(shapes, one.raw, names)
         if not parts:
             text = "the closed valve does not depend on it at all."

@@ -87,16 +87,16 @@ def answer(record: Record) -> str:
 def badges(record: Record) -> list[str]:
     """Short warnings beside the title."""
     case = record.get("case") or {}
-    found = [str(text) for text in record.get("badges") or []]
+    labels = [str(text) for text in record.get("badges") or []]
     if case.get("simulated"):
-        found.append("SIMULATED")
+        labels.append("SIMULATED")
     stated = " ".join(str(case.get(key) or "") for key in ("name", "description", "source")).lower()
-    if "tricuspid" in stated and not any("TRICUSPID" in text.upper() for text in found):
-        found.append("DONOR TRICUSPID" if "donor" in stated else "TRICUSPID")
+    if "tricuspid" in stated and not any("TRICUSPID" in text.upper() for text in labels):
+        labels.append("DONOR TRICUSPID" if "donor" in stated else "TRICUSPID")
     status = record.get("status")
     if status and status != CONVERGED:
-        found.append(f"RUN {str(status).upper()}")
-    return [*found, "NOT FOR DIAGNOSIS"]
+        labels.append(f"RUN {str(status).upper()}")
+    return [*labels, "NOT FOR DIAGNOSIS"]
 
 
 def percent(share: float) -> str:
@@ -213,22 +213,22 @@ def distance_words(record: Record) -> str:
 
 def identifiability_words(record: Record) -> list[str]:
     """What the data alone could tell, in sentences."""
-    found = record.get("identifiability") or {}
+    data = record.get("identifiability") or {}
     moduli = {str(p["name"]): str(p["label"]) for p in record.get("parameters") or []}
     words = []
-    if found.get("condition_number") is not None:
+    if data.get("condition_number") is not None:
         words.append(
-            f"Condition number of the information matrix: {number(found['condition_number'])} "
+            f"Condition number of the information matrix: {number(data['condition_number'])} "
             "(1: all parameters are told apart equally well)."
         )
-    flat = [moduli.get(str(name), str(name)) for name in found.get("flat") or []]
+    flat = [moduli.get(str(name), str(name)) for name in data.get("flat") or []]
     if flat:
         words.append(
             "The data alone do not determine: " + ", ".join(flat) + ". What is said of them rests "
             "on what was believed beforehand."
         )
-    words += [alike_words(group, moduli) for group in found.get("confounded") or []]
-    bound = found.get("cramer_rao_std")
+    words += [alike_words(group, moduli) for group in data.get("confounded") or []]
+    bound = data.get("cramer_rao_std")
     columns = columns_of(record.get("parameters") or [], len(bound or []))
     if bound and columns:
         bounds = ", ".join(
@@ -264,19 +264,19 @@ def _over_expected(innovation: Mapping[str, Any]) -> str:
 
 def innovation_words(record: Record) -> list[str]:
     """What the innovation says, in sentences."""
-    found = record.get("innovation") or {}
+    innovation = record.get("innovation") or {}
     words = []
-    if found.get("rms") is not None:
+    if innovation.get("rms") is not None:
         words.append(
-            f"Root mean square of the {_large(found.get('size'))} innovations: "
-            f"{number(found['rms'])} mm; over what is expected of each where model and noise are "
-            f"as assumed: {_over_expected(found)}."
+            f"Root mean square of the {_large(innovation.get('size'))} innovations: "
+            f"{number(innovation['rms'])} mm; over what is expected of each where model and noise "
+            f"are as assumed: {_over_expected(innovation)}."
         )
-    band = found.get("nis_band")
-    if found.get("nis") is not None and band:
-        inside = band[0] <= found["nis"] <= band[1]
+    band = innovation.get("nis_band")
+    if innovation.get("nis") is not None and band:
+        inside = band[0] <= innovation["nis"] <= band[1]
         words.append(
-            f"Normalised innovation squared {_large(found['nis'])}, "
+            f"Normalised innovation squared {_large(innovation['nis'])}, "
             + ("inside" if inside else "OUTSIDE")
             + f" its 95 % band {_large(band[0])} to {_large(band[1])}."
         )

@@ -179,7 +179,7 @@ def _extents(
     valve: ValveSequence, planes: Mapping[int, Mapping[str, SlicePlane]]
 ) -> dict[str, Extent]:
     """For each column the smallest box around the valve in all rows, and a margin; mm."""
-    found: dict[str, Extent] = {}
+    extents: dict[str, Extent] = {}
     for name in COLUMNS:
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for frame, named in planes.items():
@@ -192,8 +192,8 @@ def _extents(
             low, high = np.full(2, -20.0), np.full(2, 20.0)
         low = np.floor((low - MARGIN_MM) / STEP_MM) * STEP_MM
         high = np.ceil((high + MARGIN_MM) / STEP_MM) * STEP_MM
-        found[name] = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    return found
+        extents[name] = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    return extents
 
 
 def _window(slices: list[FloatArray]) -> tuple[float, float]:

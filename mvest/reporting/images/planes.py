@@ -164,7 +164,7 @@ def resample(
 
 def leaflet_contours(valve: ValveSequence, frame: int, plane: SlicePlane) -> list[FloatArray]:
     """Segments ``(k, 2, 2)`` mm in which a plane cuts each leaflet, in the order of the regions."""
-    layout, found = valve.layout, []
+    layout, contours = valve.layout, []
     for number in range(len(layout.region_names)):
         segments, _ = plane_section(
             valve.vertices[frame],
@@ -172,8 +172,8 @@ def leaflet_contours(valve: ValveSequence, frame: int, plane: SlicePlane) -> lis
             plane.origin,
             plane.normal,
         )
-        found.append(plane.coordinates(segments)[..., :2])
-    return found
+        contours.append(plane.coordinates(segments)[..., :2])
+    return contours
 
 
 def near(plane: SlicePlane, points: FloatArray, reach: float) -> tuple[FloatArray, BoolArray]:

@@ -13,7 +13,7 @@ from experiments.common.config import plain, register
 from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.filters.problem import (
-    FilterProblem,
+    ComparedProblem,
     SurrogateModel,
     TimedModel,
     fit_to_prior,
@@ -69,9 +69,9 @@ def test_a_filter_that_does_not_exist_is_refused_with_those_that_do() -> None:
         build_filter({**filter_settings("iterated"), "mode": "particle"}, NAMES)
 
 
-def made_up(model) -> FilterProblem:
+def made_up(model) -> ComparedProblem:
     prior = Gaussian.from_variance(np.array([2.0, 3.0]), np.array([1.0, 0.81]))
-    return FilterProblem(
+    return ComparedProblem(
         "made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, 3, "none"
     )
 
