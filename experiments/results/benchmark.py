@@ -170,6 +170,13 @@ def main(arguments: Sequence[str] | None = None, results: Path = Path("results")
             "## Order of the time in the number of nodes",
             _readable(fitted_orders(table)),
         ]
+        starts = [row for c in contents for row in c.get("startup", [])]
+        if starts:
+            parts += [
+                "## Until something begins",
+                "Least CPU seconds of some processes, with warm caches.",
+                _readable(pd.DataFrame(starts)),
+            ]
         parts += [_profile(entry) for c in contents for entry in c.get("profile", [])]
         if peers:
             parts += ["## The same pressurised sheet elsewhere", _readable(pd.DataFrame(peers))]

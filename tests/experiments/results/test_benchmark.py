@@ -60,7 +60,10 @@ def test_orders_are_fitted_over_the_sizes():
 
 
 def test_the_report_is_written_with_the_peers(tmp_path):
-    run, peers, profile = (tmp_path / f"{name}.json" for name in ("run", "peers", "profile"))
+    run, peers, profile, startup = (
+        tmp_path / f"{name}.json" for name in ("run", "peers", "profile", "startup")
+    )
+    startup.write_text(json.dumps({"startup": [{"start": "mvest list", "seconds": 0.07}]}))
     run.write_text(json.dumps(report()))
     rows = [{"library": "other", "nodes": 3362, "seconds_per_iteration": 0.1}]
     peers.write_text(json.dumps({"rows": rows}))
@@ -68,9 +71,10 @@ def test_the_report_is_written_with_the_peers(tmp_path):
     parts = {"solves": 1.0, "factorisation": 3.0}
     entry = {"nodes": 9, "seconds": 4.0, "iterations on the finest mesh": 5, "parts": parts}
     profile.write_text(json.dumps({"profile": [entry | {"bounds": [bound]}]}))
-    assert main([str(run), str(peers), str(profile)], tmp_path) == 0
+    assert main([str(run), str(peers), str(profile), str(startup)], tmp_path) == 0
     text = (tmp_path / "benchmark.md").read_text()
     assert "closure" in text
+    assert "| mvest list | 0.07 |" in text
     assert "| other | 3362 | 0.1 |" in text
     # The largest part first, with its share.
     assert "| factorisation | 3 | 75 |\n| solves | 1 | 25 |" in text
