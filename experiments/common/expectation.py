@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_filter, build_twin
-from experiments.common.cases.own_case import read_configured, settings_of
 from experiments.common.progress import SolveBar
 from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.estimation.prediction import Prediction
@@ -97,6 +96,8 @@ def foresee_own(config: Values, _folder: Path | None = None) -> str:
     MvestError
         If the case is not in order.
     """
+    from experiments.common.cases.own_case import read_configured, settings_of
+
     case, settings = read_configured(config), settings_of(config)
     store = Path(config["paths"]["outputs"]) / "meshes"
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.special import ndtri
 
 from mvest.estimation.gaussian import Gaussian
@@ -48,6 +47,8 @@ def expectation_text(
     observed : str
         What is observed, and how well.
     """
+    import pandas as pd
+
     z = transform.forward(assumed)
     rows = []
     for k, name in enumerate(data.names):

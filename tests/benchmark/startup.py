@@ -1,7 +1,7 @@
 """What it takes until something can begin: help, the list of experiments, the imports of a job.
 
-``python -m tests.benchmark.startup OUT.json`` starts each in a process of its own, with warm caches,
-and keeps the least CPU seconds of some, children of the process included, and its heaviest imports.
+``python -m tests.benchmark.startup OUT.json`` starts each in a process of its own with warm caches,
+and keeps the least CPU seconds of some, its children included, and its heaviest imports.
 """
 
 from __future__ import annotations

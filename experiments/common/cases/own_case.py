@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.common.build import mechanics_of
 from experiments.common.cases.record import case_record, fields_of
@@ -28,9 +27,10 @@ from mvest.personalise.settings import (
 )
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.fields import turn_of
-from mvest.reporting.case.frames import frame_fields, frames_figure
-from mvest.reporting.case.report import write_case_report
-from mvest.reporting.figures import save_figure_with
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 __all__ = [
     "check_case",
@@ -96,6 +96,8 @@ def check_case(config: Values, folder: Path) -> str:
     MvestError
         If the case is not in order.
     """
+    from mvest.reporting.figures import save_figure_with
+
     case = read_configured(config)
     settings = settings_of(config)
     model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")
@@ -116,6 +118,8 @@ def check_case(config: Values, folder: Path) -> str:
 
 
 def _drawn(case: ValveCase) -> Figure:
+    from mvest.reporting.case.frames import frame_fields, frames_figure
+
     surface, chordae = case.surface, case.chordae
     tips = case.frame(Role.REFERENCE).papillary_tips
     middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
@@ -155,6 +159,8 @@ def run_case(
 
     ``about`` is added to the record, before the report is.
     """
+    from mvest.reporting.case.report import write_case_report
+
     fields = folder / "fields.npz"
     # Of an earlier run: there are none where nothing is found now.
     fields.unlink(missing_ok=True)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
-from experiments.common.cases.tables import (
-    Record,
-    interval_words,
-)
 from mvest.files import write_atomically
 from mvest.reporting.markup import number
+
+if TYPE_CHECKING:
+    from experiments.common.cases.tables import Record
+
 
 __all__ = ["case_text", "write_case_tables"]
 
 
 def case_text(record: Record) -> str:
     """What a finished case says on the terminal."""
+    from experiments.common.cases.tables import interval_words
+
     lines = [f"{record['case']['name']}: {record['reason']}"]
     for row in record["unknowns"]:
         lines.append(
@@ -40,6 +40,8 @@ def _truth(row: Mapping[str, Any]) -> str:
 
 def write_case_tables(folder: Path, record: Record) -> list[Path]:
     """``unknowns.csv`` of one case."""
+    import pandas as pd
+
     rows = [{key: row.get(key) for key in UNKNOWN_COLUMNS} for row in record["unknowns"]]
     return [write_atomically(folder / "unknowns.csv", pd.DataFrame(rows).to_csv(index=False))]
 

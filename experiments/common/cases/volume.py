@@ -36,9 +36,6 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
-from mvest.reporting.figures import save_figure_with
-from mvest.reporting.images.figures import measures_figure
-from mvest.reporting.images.montage import montage_figure
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["FoundValve", "check_volume", "find_valve", "run_volume", "write_image_step"]
@@ -180,6 +177,10 @@ def find_valve(config: Values) -> FoundValve:
 
 def write_image_step(found: FoundValve, folder: Path) -> dict[str, Any]:
     """Write pictures, measures, surfaces, landmarks and the case; what the record says of it."""
+    from mvest.reporting.figures import save_figure_with
+    from mvest.reporting.images.figures import measures_figure
+    from mvest.reporting.images.montage import montage_figure
+
     images, case = folder / IMAGES, folder / CASE
     for place in (images, case):
         # Of an earlier run.

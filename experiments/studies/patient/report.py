@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.cases.tables import PATIENTS, POPULATION, in_order, write_patient_tables
 from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
-from experiments.studies.patient.population import write_population_tables
 
 __all__ = ["arrays_of_patient", "kept_of_patient", "write_patients"]
 
@@ -27,6 +25,9 @@ def write_patients(
     folder: Path, records: Mapping[str, Record[Plain]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """Tables 2 and 3 and Figure 3, or the table of the population."""
+    from experiments.common.cases.tables import POPULATION, in_order, write_patient_tables
+    from experiments.studies.patient.population import write_population_tables
+
     kept = in_order({name: flat(record) for name, record in records.items()})
     if next(iter(records.values())).table == POPULATION:
         return write_population_tables(folder, list(kept.values()))
@@ -35,6 +36,8 @@ def write_patients(
 
 def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
     """What tables need of a record; the settings are in ``conf``."""
+    from experiments.common.cases.tables import POPULATION
+
     dropped = ("settings", "measurements") if record.table == POPULATION else ()
     findings = {key: value for key, value in record.findings.items() if key not in dropped}
     return replace(record, findings=findings)
@@ -42,6 +45,8 @@ def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
 
 def arrays_of_patient(record: Record[Plain], path: Path) -> dict[str, Any]:
     """Arrays that Figure 3 needs, in single precision."""
+    from experiments.common.cases.tables import PATIENTS
+
     if record.table != PATIENTS:
         return {}
     with np.load(path, allow_pickle=False) as stored:

@@ -25,7 +25,6 @@ from experiments.studies.patient.settings import Settings
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
-from mvest.reporting.case.report import write_case_report
 from mvest.simulation.virtual_patient import (
     Deviations,
     PatientSimulation,
@@ -66,6 +65,8 @@ def run_patient(
     config: Values, config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
     """Simulate, estimate apart, reveal: the record, and the files written to ``folder``."""
+    from mvest.reporting.case.report import write_case_report
+
     place = make_patient(config)
     record = estimate_blindly(config, config_hash, folder, place.case, place.hidden)
     fields = folder / "fields.npz"

@@ -14,7 +14,6 @@ from experiments.common.record import Record
 from experiments.studies.twin.tables import text_table, write_tables
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.noise import observation_noise
-from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 
 __all__ = ["require_twin", "text_table_of", "write_twin", "write_twin_run"]
 
@@ -28,6 +27,8 @@ def write_twin(
     folder: Path, records: Mapping[str, Record[Plain]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """The table of all records, and the figures of the one that the table is named after."""
+    from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+
     first, main = next(iter(records.items()))
     table = main.table
     written = write_tables(folder, table, [flat(record) for record in records.values()])

@@ -29,7 +29,6 @@ from mvest.estimation.wrappers import SharedStart
 from mvest.observation.vertices import observed_frames
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
-from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
 
 __all__ = ["STUDY", "run_twin"]
 
@@ -43,6 +42,8 @@ def run_twin(
     config: Mapping[str, Any], config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
     """A synthetic study: the record, and the figures written to ``folder``."""
+    from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+
     twin = build_twin(config)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)

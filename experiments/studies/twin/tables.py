@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from mvest.files import write_atomically
 from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 __all__ = ["frame", "readable", "text_table", "write_tables"]
 
@@ -29,6 +31,8 @@ def frame(records: Sequence[Record]) -> pd.DataFrame:
     records : sequence of mapping
         At least one; the first one's paper reference becomes the first row.
     """
+    import pandas as pd
+
     rows = [_paper_row(records[0])] if records[0]["paper"] else []
     return pd.DataFrame(rows + [_row(record) for record in records])
 
@@ -84,6 +88,8 @@ def _row(record: Record) -> dict[str, Any]:
 
 def readable(records: Sequence[Record]) -> pd.DataFrame:
     """The table of ``frame`` as a reader wants it: text, rounded, related numbers in one column."""
+    import pandas as pd
+
     table = frame(records)
     rows = []
     for _, row in table.iterrows():

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import SimpleITK
 
 from mvest.imaging.reading.data import beside, from_zlib, plainly, read_exactly
 from mvest.imaging.reading.plausible import check_size
@@ -143,6 +142,8 @@ def _voxel_type(header: Header) -> np.dtype[np.generic]:
 
 def _placed(path: Path, frames: np.ndarray) -> StatedVolume:
     """The frames with their place as SimpleITK reads it from the header."""
+    import SimpleITK
+
     reader: Any = SimpleITK.ImageFileReader()  # type: ignore[no-untyped-call]
     reader.SetImageIO("MetaImageIO")
     reader.SetFileName(str(path))

@@ -11,7 +11,6 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import nibabel
 import numpy as np
 
 from mvest.imaging.reading.data import from_gzip, plainly, read_exactly
@@ -61,6 +60,8 @@ def read_nifti(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     InputError
         A field that is missing, contradicts another or is not supported; truncated data.
     """
+    import nibabel
+
     begin = _begin(path)
     second = begin[4:7] in (b"n+2", b"ni2")
     kind: Any = nibabel.Nifti2Header if second else nibabel.Nifti1Header

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pydicom
 
 from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
@@ -113,6 +112,8 @@ def _read(path: Path) -> StatedVolume:
 
 def _dataset(path: Path) -> Any:
     """The fields, the pixels left in the file."""
+    import pydicom
+
     try:
         data = pydicom.dcmread(path, force=True, defer_size=LONG)
         data.get("SOPClassUID")  # parsed only now

@@ -4,14 +4,24 @@ Started by `mvest.valve.mesh.tetrahedral.tetwild` as ``_tetwild_worker.py INPUT.
 a temporary folder because fTetWild writes files of its own into the current one.
 """
 
+import importlib.util
 import sys
+import types
 
 import numpy as np
-from pytetwild.pytetwild import tetrahedralize
 
 
 def main(source: str, target: str) -> None:
     """Read surface and settings from `source` (npz), write nodes and tetrahedra to `target`."""
+    # From 0.4 on, importing the package asks for pyvista (with VTK, half a gigabyte) for something
+    # that is not needed here. So a package that does nothing stands for it.
+    spec = importlib.util.find_spec("pytetwild")
+    if spec is not None and spec.submodule_search_locations is not None:
+        package = types.ModuleType("pytetwild")
+        package.__path__ = list(spec.submodule_search_locations)
+        sys.modules["pytetwild"] = package
+    from pytetwild.pytetwild import tetrahedralize
+
     with np.load(source, allow_pickle=False) as data:
         nodes, tetrahedra = tetrahedralize(
             data["vertices"],
