@@ -4,12 +4,14 @@ The front door: what a user needs first, each loaded when it is asked for. What 
 and all the rest, is in the rooms.
 
 * A valve: `Template`, `TemplateParameters`, `Valve`; `structured_mesh` fills its leaflets.
-* A closed valve from moduli: `ClosureModel` with `MechanicsSettings` and `TissueSettings`;
-  `run_gate` asks whether it can be trusted.
-* Moduli from a closed valve: `simulate_observation`, `estimate`; a filter (`PaperFilter`,
-  `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`, `MonteCarloFilter`) from
-  a `Gaussian` prior, for any model that returns a `Prediction`; `identifiability`.
-* A patient: `read_case`, `write_case`, `ValveCase`; `personalise_case` with `PersonaliseSettings`.
+* A closed valve from moduli: `ClosureModel` with `MechanicsSettings`, `TissueSettings` and a
+  `ClosureProtocol`; `run_gate` asks whether it can be trusted.
+* Moduli from a closed valve: `simulate_observation`, `estimate` for a `Problem`; a filter
+  (`PaperFilter`, `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`,
+  `MonteCarloFilter`) from a `Gaussian` prior, in coordinates `Identity` or `Log`, for any model
+  that returns a `Prediction`; `identifiability`.
+* A patient: `read_case`, `write_case`, `ValveCase`; `personalise_case` with `PersonaliseSettings`
+  and every `Unknown`.
 * Images: `read_volume` with its `Modality`, `detect_valve` with the `default_model`.
 * Mechanics without a valve: `simulate_body`, `TransverselyIsotropic`.
 * `MvestError`, the family of all errors that a user can cause; `units`.

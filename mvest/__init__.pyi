@@ -16,6 +16,8 @@ from .estimation.filters.unscented import UnscentedFilter as UnscentedFilter
 from .estimation.gaussian import Gaussian as Gaussian
 from .estimation.information.identifiability import identifiability as identifiability
 from .estimation.prediction import Prediction as Prediction
+from .estimation.transform import Identity as Identity
+from .estimation.transform import Log as Log
 from .imaging.detection.tracking import detect_valve as detect_valve
 from .imaging.detection.trained_model import default_model as default_model
 from .imaging.reading.reader import read_volume as read_volume
@@ -29,6 +31,7 @@ from .personalise.chain import personalise_case as personalise_case
 from .personalise.settings import PersonaliseSettings as PersonaliseSettings
 from .personalise.settings import Unknown as Unknown
 from .problem.estimate import estimate as estimate
+from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation
 from .valve.anatomy.template import Template as Template
 from .valve.anatomy.template import TemplateParameters as TemplateParameters

@@ -49,13 +49,14 @@ def test_moduli_of_a_template_from_how_it_closes() -> None:
     )
     assert seen.observation is not None
     prior = mvest.Gaussian.from_variance([5.0, 3.0], 1.0)
-    found = mvest.IteratedFilter()(
-        seen.observation.of(model), prior, seen.observation.y, seen.observation.R, names=MODULI
-    )
+    problem = mvest.Problem(MODULI, model, prior, mvest.IteratedFilter(), mvest.Log(), TISSUE)
+    found = mvest.estimate(problem, seen.observation).against(seen.truth)
     assert found.converged
-    np.testing.assert_allclose(found.mean, [6.2, 2.1], rtol=1e-4)
-    assert found.prediction is not None
-    known = mvest.identifiability(found.prediction.jacobian, seen.observation.R, found.mean)
+    assert found.estimate is not None
+    np.testing.assert_allclose(found.estimate, [6.2, 2.1], rtol=1e-4)
+    assert found.filtered is not None
+    jacobian = found.filtered.prediction.jacobian
+    known = mvest.identifiability(jacobian, seen.observation.R, found.estimate)
     assert np.all(known.std > 0)
 
 

@@ -38,6 +38,14 @@ def test_mesh_fills_its_surface(shapes, store, name):
     assert np.array_equal(np.unique(mesh.tetrahedra), np.arange(len(mesh.nodes)))
 
 
+def test_the_mesher_needs_no_extra(shapes, store, tmp_path, monkeypatch):
+    # A package of this name that cannot be imported hides the one that may be installed.
+    (tmp_path / "pyvista.py").write_text("raise ModuleNotFoundError('pyvista')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    mesh = tetrahedralize(*shapes.box((2.0, 2.0, 1.0)), COARSE, store)
+    assert len(mesh.tetrahedra) > 0
+
+
 def test_a_stored_mesh_is_read_back_and_nothing_is_meshed_again(shapes, store, monkeypatch):
     vertices, triangles = shapes.box((4.0, 3.0, 2.0))
     first = tetrahedralize(vertices, triangles, COARSE, store)
