@@ -33,7 +33,7 @@ def plain_run(
     """A run that gives a whole record as a dictionary."""
 
     def outcome(job: Job[Any]) -> Outcome[Plain]:
-        record, _ = run(job.values, "none", job.folder, time.time())
+        record, _ = run(job.values, job.config_hash, job.folder, time.time())
         mesh = record.get("mesh") or {}
         return Outcome(
             findings={key: value for key, value in record.items() if key not in STAMPED},

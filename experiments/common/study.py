@@ -38,11 +38,14 @@ class Job(Generic[S]):
         The study's own part of it.
     folder : Path
         Output folder, which exists.
+    config_hash : str
+        For studies that leave files beside their record.
     """
 
     values: Mapping[str, Any]
     settings: S
     folder: Path
+    config_hash: str = "none"
 
 
 @dataclass(frozen=True, slots=True)

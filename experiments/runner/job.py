@@ -130,7 +130,12 @@ def require_checks(study: Study[Any, Any], values: Mapping[str, Any]) -> tuple[C
 
 
 def _job(study: Study[Any, Any], request: Request) -> Job[Any]:
-    return Job(request.values, build(study.settings, request.values), request.folder)
+    return Job(
+        request.values,
+        build(study.settings, request.values),
+        request.folder,
+        request.config_hash,
+    )
 
 
 def _publish(study: Study[Any, Any], request: Request, record: Record[Any]) -> None:
