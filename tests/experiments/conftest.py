@@ -1,10 +1,8 @@
 """What every test of the application needs."""
 
-import copy
-from pathlib import Path
-
 import pytest
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+
+from tests.experiments.composed_once import composed_once
 
 
 @pytest.fixture(autouse=True)
@@ -25,20 +23,7 @@ def coarse_pictures():
 
 
 @pytest.fixture(autouse=True, scope="session")
-def configuration_files_read_once():
-    """Parsing YAML takes a fifth of each of the many hundred configurations that are composed."""
-    read, kept = FileConfigSource.load_config, {}
-
-    def load_config(self, config_path):
-        place = Path(self.path) / self._normalize_file_name(config_path)
-        if not place.is_file():
-            return read(self, config_path)
-        about = place.stat()
-        key = (self.provider, self.path, config_path, about.st_mtime_ns, about.st_size)
-        if key not in kept:
-            kept[key] = read(self, config_path)
-        return copy.deepcopy(kept[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FileConfigSource, "load_config", load_config)
+def configurations_composed_once():
+    """Merging what the same choices of groups name takes longer than most that is tested here."""
+    with composed_once():
         yield

@@ -29,7 +29,14 @@ from mvest.imaging.detection.trained_model import STAGES, default_model, load_mo
 from mvest.imaging.simulator import SMALL
 from tests.places import CONF
 
-STUDY = ("experiment=imaging", "imaging=small", "tracking.enabled=false")
+STUDY = (
+    "experiment=imaging",
+    "imaging=small",
+    "tracking.enabled=false",
+    # Half the voxels in the same field of view.
+    "imaging.training.acquisition.voxel_mm=2.5",
+    "imaging.training.acquisition.shape=[40,32,40]",
+)
 
 
 @pytest.fixture(autouse=True)
