@@ -37,10 +37,10 @@ tables: $(INSTALLED) ## everything in results/
 	$(BIN)/python -m experiments.tables
 
 test: $(INSTALLED) ## the tests that finish in minutes
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) -m "not slow"
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile -m "not slow"
 
 test-all: $(INSTALLED) ## every test
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES)
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
 docs: $(INSTALLED) ## the documentation site, in docs/_build/html; warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

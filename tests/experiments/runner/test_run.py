@@ -143,7 +143,7 @@ ERRORS = [
     ("valve.leaflets.anterior.length=3", "leaflet at phi"),
     ("parameters=[E_f.middle,E_f.posterior]", "no tissue is given for the region 'middle'"),
     ("parameters=[E_f.anterior,luck]", "unknown parameter 'luck'"),
-    ("study=magic", "study = 'magic', expected one of twin"),
+    ("study=magic", "Could not find 'study/magic'; known: case, chord"),
     ("hydra.run.dir=file/below", "file/below: Not a directory"),
     ("paths.outputs=file", "file"),
     ("tracking.uri=postgresql://me:secret@localhost/mvest", "tracking.uri holds a password"),

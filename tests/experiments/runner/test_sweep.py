@@ -208,7 +208,7 @@ WRONG = [
     (("sweep=debug", "filter.initial=[5,3],[1,2,3]"), "filter.initial has 3 values"),
     (("sweep=debug", "observation.noise_mm=0,-1"), "observation.noise_mm = -1.0"),
     (("sweep=debug", "time_limit_s=0"), "time_limit_s = 0.0, expected > 0"),
-    (("sweep=debug", "study=magic"), "study = 'magic', expected one of twin"),
+    (("sweep=debug", "study=magic"), "Could not find 'study/magic'; known: case, chord"),
     (("sweep=debug", "seed=1,1"), "two jobs are one and the same: "),
     (("sweep=debug", "seed=interval(1,2)"), "does not support sweep type"),
     (("sweep=debug", "paths.outputs=file"), "file"),
