@@ -51,9 +51,11 @@ html_static_path = ["_static"]
 html_css_files = ["mvest.css"]
 html_extra_path = ["../results/report.html"]
 html_show_sourcelink = False
+html_sidebars = {"index": [], "start": []}
 html_copy_source = False
 html_theme_options = {
     "navigation_with_keys": False,
+    "header_links_before_dropdown": 7,
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
