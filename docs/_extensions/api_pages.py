@@ -68,7 +68,10 @@ def room(package: Path) -> str:
     for module, members in modules.items():
         if module != name:
             shown = f":members: {', '.join(members)}" if members else ":no-members:"
-            parts += [titled(module, "-"), f".. automodule:: {module}\n   {shown}\n"]
+            parts += [
+                titled(module.removeprefix("mvest."), "-"),
+                f".. automodule:: {module}\n   {shown}\n",
+            ]
     return "\n".join(parts)
 
 

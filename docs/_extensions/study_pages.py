@@ -157,12 +157,24 @@ def text_of(page: Page, results: Path) -> str:
     if page.experiments:
         rows = [f"    {experiment.command}" for experiment in page.experiments]
         parts += ["## Run it", "\n".join(rows)]
-    shown = []
-    for stem in page.pictures:
-        shown.append(f"![{page.title}: {stem}](../../results/{stem}.png)")
-    parts += ["## Results", *shown]
+    parts.append("## Results")
+    parts += [picture_text(stem, page) for stem in page.pictures]
     parts += [table_text(results / f"{stem}.md") for stem in page.tables]
     return "\n\n".join(parts) + "\n"
+
+
+def picture_text(stem: str, page: Page) -> str:
+    """A figure of ``results/`` that leads to itself in full size."""
+    options = f":alt: {page.title}, {stem}\n:target: ../_images/{stem}.png"
+    return f"```{{figure}} ../../results/{stem}.png\n{options}\n```"
+
+
+def question_of(page: Page) -> str:
+    """What a page is about: the first question of its notes, or else their first sentence."""
+    text = " ".join((page.notes or "".join(one.about for one in page.experiments)).split())
+    sentences = re.findall(r"[^.?]+(?:[.?](?!\s))*[^.?]*[.?](?=\s|$)", text)
+    asked = [sentence for sentence in sentences[:4] if sentence.endswith("?")]
+    return (asked or sentences or [""])[0].strip()
 
 
 def index_of(pages: list[Page]) -> str:
@@ -176,8 +188,10 @@ def index_of(pages: list[Page]) -> str:
     ]
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]
-        listing = "\n".join(f"{page.title} <{page.name}>" for page in members)
-        parts.append(f"```{{toctree}}\n:caption: {group}\n:maxdepth: 1\n\n{listing}\n```")
+        names = "\n".join(f"{page.title} <{page.name}>" for page in members)
+        lines = [f"* [{page.title}]({page.name}.md). {question_of(page)}" for page in members]
+        parts.append(f"## {group}\n\n" + "\n".join(lines))
+        parts.append(f"```{{toctree}}\n:hidden:\n:caption: {group}\n\n{names}\n```")
     return "\n\n".join(parts) + "\n"
 
 
