@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
+
+from experiments.common.study import load_study, study_names
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -166,7 +169,14 @@ def text_of(page: Page, results: Path) -> str:
 def picture_text(stem: str, page: Page) -> str:
     """A figure of ``results/`` that leads to itself in full size."""
     options = f":alt: {page.title}, {stem}\n:target: ../_images/{stem}.png"
-    return f"```{{figure}} ../../results/{stem}.png\n{options}\n```"
+    return f"```{{figure}} ../../results/{stem}.png\n{options}\n\n{captions().get(stem, '')}\n```"
+
+
+@cache
+def captions() -> dict[str, str]:
+    """Caption of each picture, as the studies give it for the page of all results."""
+    sections = [section for name in study_names() for section in load_study(name).sections]
+    return {stem: text for section in sections for stem, text in section.pictures.items()}
 
 
 def question_of(page: Page) -> str:

@@ -1,6 +1,8 @@
-"""The README: short, its example runs, its table is the published one, its links lead somewhere."""
+"""The README and a page beside it: examples run, Table 1 is the published one, links lead on."""
 
 import re
+
+import pytest
 
 from tests.places import ROOT
 
@@ -19,6 +21,17 @@ def test_the_example_prints_what_it_says(capsys):
     promised = re.search(r"# (\[.*\]) MPa$", lines[-1])
     assert promised is not None
     assert capsys.readouterr().out.strip() == promised[1]
+
+
+def test_the_page_on_own_models_is_right(capsys):
+    page = (ROOT / "docs" / "own_model.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    assert code is not None
+    names = {}
+    exec(compile(code[1], "own_model.md", "exec"), names)
+    assert names["estimate"].converged
+    assert names["estimate"].mean[0] == pytest.approx(2.0, rel=0.02)
+    assert "stiffness" in capsys.readouterr().out
 
 
 def cells(line):
