@@ -142,9 +142,10 @@ class SolveBar:
     def _left(self) -> str:
         """What has passed, and what is still to be expected."""
         text = f"{duration(time.monotonic() - self._began)} elapsed"
-        if not self._solve:
+        more = self._expected - self._solve
+        if not self._solve or (more <= 0 and self._expected <= 1):
             return text
-        each, more = self._solving / self._solve, self._expected - self._solve
+        each = self._solving / self._solve
         if more > 0:
             return f"{text}, about {duration(each * more)} left if {self._expected} solves do"
         return f"{text}, about {duration(each)} for each further solve"
