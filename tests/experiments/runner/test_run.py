@@ -333,7 +333,8 @@ def test_an_experiment_of_several_runs_keeps_a_record_of_each(
         "paths.results=published",
     )
     assert status == 0, err
-    kept = sorted(path.name for path in (tmp_path / "published" / "records").iterdir())
+    place = tmp_path / "published" / "records" / "mesh_independence"
+    kept = sorted(path.name for path in place.iterdir())
     assert kept == [
         "mesh-independence-hex18-structured-36-x-4.json",
         "mesh-independence-hex18-structured-36-x-8.json",
