@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from experiments.common.build import build_twin
 from mvest.errors import ConfigurationError
@@ -213,7 +213,7 @@ def fit_to_prior(problem: ComparedProblem, settings: Values, store: Path) -> Fit
     p, count = len(problem.parameters), settings["surrogate_runs"]
     wanted = count + settings["held_out"]
     region = Region(np.zeros(p), settings["reach"] * np.eye(p))
-    sobol = qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
+    sobol = scipy.stats.qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
     # The first of Sobol's points are a design by themselves; the further ones lie between them.
     points = region.points(2.0 * sobol.random_base2((wanted - 1).bit_length())[:wanted] - 1.0)
     runs = enumerate(_run_all(problem, points, store))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import skew
+import scipy
 
 from experiments.common.build import MADE_BY, filter_of
 from experiments.common.plain import Plain, each, flat, plain_run
@@ -174,7 +174,7 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> dict[str,
     }
     if found.transformed_samples is not None:
         row["histogram"] = [_histogram(draws) for draws in found.transformed_samples.T]
-        row["skewness"] = skew(found.transformed_samples, axis=0).tolist()
+        row["skewness"] = scipy.stats.skew(found.transformed_samples, axis=0).tolist()
     return row
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from scipy.stats import chi2
 
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
 from mvest.typing import FloatArray
@@ -214,7 +214,7 @@ def _draw_ellipse(
     if not np.all(np.isfinite(C)):
         return
     values, vectors = np.linalg.eigh(C * 1e4)
-    width, height = 2 * np.sqrt(chi2.ppf(0.95, 2) * values)
+    width, height = 2 * np.sqrt(scipy.stats.chi2.ppf(0.95, 2) * values)
     angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
     dashed = some["frames"] == "open and closed"
     axes.add_patch(
