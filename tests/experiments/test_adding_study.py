@@ -6,42 +6,49 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pandas as pd
 
 from tests.places import ROOT
 
-PAGE = ROOT / "docs" / "adding_study.md"
-FILE = re.compile(r"```\{code-block\} \w+\n:caption: (\S+)\n(.*?)```", re.DOTALL)
-COMMAND = re.compile(r"^\$ python (.*)$", re.MULTILINE)
+SECTION = (ROOT / "docs" / "adding.md").read_text(encoding="utf-8").partition("## A study")[2]
+SECTION = SECTION.partition("\n## ")[0]
+NAME = re.compile(r"`((?:experiments|conf)/[\w/]+\.(?:py|yaml))`")
+COMMAND = re.compile(r"^    python (-m experiments\.run experiment=\w+)$", re.MULTILINE)
 
 
 def test_the_page_on_adding_a_study_works_to_the_letter(tmp_path):
-    text = PAGE.read_text(encoding="utf-8")
     for name in ("experiments", "conf"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    files = FILE.findall(text)
-    assert {place.split("/")[0] for place, _ in files} == {"experiments", "conf"}
+    # Text, block, text, ...: a block is of the file that was named last before it.
+    parts = SECTION.split("```")
+    files = [
+        (NAME.findall(said)[-1], block.partition("\n")[2])
+        for said, block in zip(parts[::2], parts[1::2], strict=False)
+    ]
     rooms = {place.rpartition("/")[0] for place, _ in files}
-    assert rooms == {"experiments/studies/sizes", "conf/experiment"}
+    assert rooms == {"experiments/studies/tenting", "conf/experiment"}
     for place, content in files:
         path = tmp_path / place
         assert not path.exists(), f"{place} is no new file"
         path.parent.mkdir(exist_ok=True)
         path.write_text(content, encoding="utf-8")
-    commands = [command.split() for command in COMMAND.findall(text)]
-    assert len(commands) == 2
-    for command in commands:
+    (command,) = COMMAND.findall(SECTION)
+    for arguments in (command.split(), ["-m", "experiments.tables"]):
         subprocess.run(
-            [sys.executable, *command],
+            [sys.executable, *arguments],
             cwd=tmp_path,
             check=True,
             capture_output=True,
             env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
         )
     results = tmp_path / "results"
-    assert (results / "records" / "sizes" / "sizes.json").is_file()
-    assert list(pd.read_csv(results / "sizes.csv", comment="#")["rows"]) == [6, 12, 24]
-    assert (results / "sizes.png").stat().st_size > 10_000
+    assert (results / "records" / "tenting" / "tenting.json").is_file()
+    table = pd.read_csv(results / "tenting.csv")
+    assert list(table["pressure_mmHg"]) == [80.0, 100.0, 120.0]
+    # A higher pressure pushes the leaflets further towards the atrium.
+    assert (np.diff(table["tenting_mm"]) < 0).all()
+    assert (results / "tenting.png").stat().st_size > 10_000
     page = (results / "report.html").read_text(encoding="utf-8")
-    assert "Areas of the leaflets (simulated)" in page
-    assert "With 6 rows the anterior leaflet is" in page
+    assert "Tenting of a closed valve by pressure (simulated)" in page
+    assert f"{table['tenting_mm'][0]:.2f}" in page
