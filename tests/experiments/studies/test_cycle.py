@@ -77,25 +77,26 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
         "filter.initial=[3.74,2.93,0.95]",
     )
     assert status == 0, said.err
+    found = record["findings"]
     # Nothing to hide behind: without noise the truth is found, from 40 % and 1 % away.
-    assert np.abs(record["exact"]["error"]).max() < 1e-2
-    assert abs(record["start"][0] / record["truth"][0] - 1) > 0.3
-    whole = np.array(record["bounds"][1]["std"])
-    two = np.array(record["bounds"][0]["std"], dtype=float)
+    assert np.abs(found["exact"]["error"]).max() < 1e-2
+    assert abs(found["start"][0] / found["truth"][0] - 1) > 0.3
+    whole = np.array(found["bounds"][1]["std"])
+    two = np.array(found["bounds"][0]["std"], dtype=float)
     assert np.all(two > whole)
-    assert len(record["seeds"]) == 2
-    errors = np.array([entry["error"] for entry in record["seeds"]])
+    assert len(found["seeds"]) == 2
+    errors = np.array([entry["error"] for entry in found["seeds"]])
     expected = np.sqrt(np.mean(errors**2, axis=0)) / whole
-    np.testing.assert_allclose(record["rms_over_bound"], expected)
+    np.testing.assert_allclose(found["rms_over_bound"], expected)
     # Another mesh is another truth.
-    assert record["finer"]["distance_mm"] > 1e-3
+    assert found["finer"]["distance_mm"] > 1e-3
     error = logged(folder)["error_exact.E_f.anterior"]
-    assert error == pytest.approx(record["exact"]["error"][0], abs=1e-12)
+    assert error == pytest.approx(found["exact"]["error"][0], abs=1e-12)
     # What is left of the observation is its noise.
-    assert all(0.009 < entry["residual_mm"] < 0.011 for entry in record["seeds"])
-    assert record["exact"]["residual_mm"] < 1e-3
+    assert all(0.009 < entry["residual_mm"] < 0.011 for entry in found["seeds"])
+    assert found["exact"]["residual_mm"] < 1e-3
     # Meshes this coarse tell by far more than the noise, and the estimate says so.
-    finer, told = record["finer"], record["told"]
+    finer, told = found["finer"], found["told"]
     assert told["distance_mm"] > finer["distance_mm"] > 0
     assert told["error"] == finer["error"]
     np.testing.assert_allclose(np.hypot(told["shift"], finer["std"]), told["std"], rtol=1e-6)
@@ -110,13 +111,14 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
         "experiment=cycle", "cycle.time_steps=[0.05,0.025,0.0125]", "cycle.path_steps=4"
     )
     assert status == 0, said.err
-    frames = record["frames"]
+    found = record["findings"]
+    frames = found["frames"]
     # The open frame says nothing of any parameter.
     assert frames[0]["std_alone"] == [None, None, None]
-    assert [entry["count"] for entry in record["sets"]] == [2, 3, 5]
-    assert {entry["frames"] for entry in record["phases"]} == {"closing", "held closed", "opening"}
-    assert logged(folder)["bound_5_frames.E_f.anterior"] == record["sets"][-1]["std"][0]
-    steps = record["steps"]
+    assert [entry["count"] for entry in found["sets"]] == [2, 3, 5]
+    assert {entry["frames"] for entry in found["phases"]} == {"closing", "held closed", "opening"}
+    assert logged(folder)["bound_5_frames.E_f.anterior"] == found["sets"][-1]["std"][0]
+    steps = found["steps"]
     assert steps["rms_mm"][0] > steps["rms_mm"][1] > 0
     # So small a motion is smooth.
     changes = np.array([along["rms_mm"] for along in steps["along"]])
@@ -124,7 +126,7 @@ def test_the_cycle_study_records_frames_steps_and_the_drift(run):
     uneven = changes.max(axis=1) / np.median(changes, axis=1)
     assert max(uneven) < 1.5
     assert steps["path"][-1][0] / steps["path"][0][0] == pytest.approx(0.7)
-    drift = record["drift"]
+    drift = found["drift"]
     assert np.array(drift["truth"]).shape == (3, 2)
     # From the first to the last beat by -30 % in the first modulus alone.
     assert drift["truth"][2][0] / drift["truth"][0][0] == pytest.approx(0.7)

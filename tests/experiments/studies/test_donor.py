@@ -100,20 +100,21 @@ def test_made_up_valve_end_to_end(run, tmp_path: Path) -> None:
     assert "tricuspid" in out
     record = json.loads((tmp_path / "here" / "result.json").read_text())
     assert record["status"] == "converged"
-    assert record["truth"] is None
-    assert [row["closure"] for row in record["rows"]] == [
+    found = record["findings"]
+    assert found["truth"] is None
+    assert [row["closure"] for row in found["rows"]] == [
         "generic",
         "fitted, start 1",
         "fitted, start 2",
     ]
     # The recording is ours, but interpolated on other triangles than the mesh is made of.
-    for row in record["rows"][1:]:
+    for row in found["rows"][1:]:
         assert row["estimate"] == pytest.approx(TRUTH, rel=0.1)
-        assert row["distance_mm"]["mean"] < 0.5 * record["rows"][0]["distance_mm"]["mean"]
-    summary = record["summary"]
+        assert row["distance_mm"]["mean"] < 0.5 * found["rows"][0]["distance_mm"]["mean"]
+    summary = found["summary"]
     assert summary["closer_than_generic"] is True
     assert summary["largest_difference_between_starts"] < 5e-3
-    assert CITATION in record["data"]["citation"]
+    assert CITATION in found["data"]["citation"]
     names = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"donor.csv", "donor.md", "donor.png", "result.json", "fields.npz"} <= names
     # Overrides keep a run out of the results.

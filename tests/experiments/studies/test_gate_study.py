@@ -99,17 +99,21 @@ def test_each_case_changes_its_own_setting_only():
 def test_the_gate_study_records_every_case(run):
     status, record, folder, said = run("experiment=gate")
     assert status == 0
+    found = record["findings"]
     assert record["status"] == "converged"
-    assert record["forward_solves"] == len(record["rows"]) == 1 + len(GATE_CASES)
-    assert [row["case"] for row in record["rows"]] == ["reference", *(c.name for c in GATE_CASES)]
-    assert set(record["slopes"]) == {"0.01", "0.05", "0.2"}
-    assert record["limits"] == {"mean_mm": 0.1, "max_mm": 0.5, "slope": 0.05}
-    assert isinstance(record["passed"], bool)
+    assert record["forward_solves"] == len(found["rows"]) == 1 + len(GATE_CASES)
+    assert [row["case"] for row in found["rows"]] == [
+        "reference",
+        *(c.name for c in GATE_CASES),
+    ]
+    assert set(found["slopes"]) == {"0.01", "0.05", "0.2"}
+    assert found["limits"] == {"mean_mm": 0.1, "max_mm": 0.5, "slope": 0.05}
+    assert isinstance(found["passed"], bool)
     # No contact and little load: moduli change the state as the derivative says.
-    small = {row["case"]: row for row in record["rows"]}["E_f + 1 %"]
+    small = {row["case"]: row for row in found["rows"]}["E_f + 1 %"]
     assert small["passed"]
     assert 0 < small["max_mm"] < 0.05
-    assert record["slopes"]["0.01"] < 0.01
+    assert found["slopes"]["0.01"] < 0.01
     names = {path.name for path in folder.iterdir()}
     assert {"gate.csv", "gate.md", "result.json", "config.json"} <= names
     for case in GATE_CASES:
@@ -122,9 +126,10 @@ def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypat
     monkeypatch.setattr(ClosureModel, "__call__", lambda self, m: Prediction.failed("it buckled"))
     status, record, _, said = run("experiment=gate")
     assert status == 1
+    found = record["findings"]
     assert (record["status"], record["reason"]) == ("failed", "it buckled")
-    assert record["passed"] is False
-    assert len(record["rows"]) == 1
+    assert found["passed"] is False
+    assert len(found["rows"]) == 1
     assert "it buckled" in said.err
 
 
@@ -137,10 +142,11 @@ def test_a_case_that_does_not_close_has_no_distance(run, monkeypatch):
     monkeypatch.setattr(ClosureModel, "__call__", sometimes)
     status, record, _, _ = run("experiment=gate")
     assert status == 0
-    row = {row["case"]: row for row in record["rows"]}["mesh x 1.5"]
+    found = record["findings"]
+    row = {row["case"]: row for row in found["rows"]}["mesh x 1.5"]
     assert row["mean_mm"] is None
     assert (row["passed"], row["reason"]) == (False, "it buckled")
-    assert record["passed"] is False
+    assert found["passed"] is False
 
 
 def test_the_closure_study_measures_every_step(run):
@@ -148,7 +154,8 @@ def test_the_closure_study_measures_every_step(run):
         "experiment=closure", "mechanics.protocol.end=0.2", "mechanics.protocol.growth=1"
     )
     assert status == 0
-    rows = record["rows"]
+    found = record["findings"]
+    rows = found["rows"]
     assert [row["time"] for row in rows] == pytest.approx([0.0, 0.1, 0.2])
     assert [row["pressure_mmhg"] for row in rows] == pytest.approx([0.0, 5.0, 5.0])
     assert all(row["intersections"] == 0 for row in rows)

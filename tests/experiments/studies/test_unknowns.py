@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.common.plain import flat
 from experiments.run import main
 from experiments.studies.chord.report import chord_text, write_chord
 from experiments.studies.patch.report import patch_text, write_patch
@@ -71,14 +72,15 @@ FEW = (
 def test_a_patch_is_compared_with_the_truth_where_it_is(run):
     status, record, folder, said = run("experiment=patch", "patch.compared=true", *FEW)
     assert status == 0, said.err
-    assert set(record["results"]) == {"patch", "no patch"}
-    with_patch, without = record["results"]["patch"], record["results"]["no patch"]
+    found = record["findings"]
+    assert set(found["results"]) == {"patch", "no patch"}
+    with_patch, without = found["results"]["patch"], found["results"]["no patch"]
     # The truth is the leaflet's modulus, twice as much at the centre, and nowhere else.
     assert max(without["truth"]) == pytest.approx(6.23)
     assert min(with_patch["truth"]) == pytest.approx(6.23)
     assert 6.23 * 1.5 < with_patch["true_at_centre"] <= 2 * 6.23 + 1e-9
     # The other mesh is another object, and the noise the same: only the truth differs.
-    assert record["cells_of_truth"] != record["model"]["cells"][:2]
+    assert found["cells_of_truth"] != record["model"]["cells"][:2]
     assert with_patch["at_centre"] != without["at_centre"]
     # What is told of the highest modulus is what the map has.
     assert with_patch["peak"] == pytest.approx(max(with_patch["modulus"]))
@@ -92,7 +94,7 @@ def test_a_patch_is_compared_with_the_truth_where_it_is(run):
         assert 0.45 < entry["residual_mm"] < 0.7
     assert logged(folder)["peak"] == with_patch["peak"]
     assert (folder / "patch.png").is_file()
-    assert "half the patch's radius" in patch_text(record)
+    assert "half the patch's radius" in patch_text(flat(record))
 
 
 def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
@@ -100,13 +102,14 @@ def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
         "experiment=chord", "truth.values=[6,2,0.9,1.1,0.97,0.97]", "cycle.noise_mm=0.05"
     )
     assert status == 0, said.err
-    first = [entry for entry in record["results"] if entry["seed"] == 0]
+    found = record["findings"]
+    first = [entry for entry in found["results"] if entry["seed"] == 0]
     assert [entry["frames"] for entry in first] == ["open and closed", "whole cycle"]
-    prior, (two, whole) = np.array(record["prior_std"]), (np.array(e["std"]) for e in first)
+    prior, (two, whole) = np.array(found["prior_std"]), (np.array(e["std"]) for e in first)
     # Data never widen the posterior by more than its change of place, and more data tell more.
     assert np.all(two < 1.2 * prior)
     assert np.sum(np.log(whole)) < np.sum(np.log(two))
-    assert len([e for e in record["results"] if e["frames"] == "whole cycle"]) == 2
+    assert len([e for e in found["results"] if e["frames"] == "whole cycle"]) == 2
     assert logged(folder)["std.chord_stiffness.basal"] == whole[3]
     assert (folder / "chord.png").is_file()
 
