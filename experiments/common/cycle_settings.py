@@ -15,7 +15,7 @@ class CycleSettings:
 
     protocol: CycleProtocol = field(default_factory=CycleProtocol)
     noise_mm: float = 0.5  # SD of each coordinate
-    exact_told_mm: float = 0.1  # SD that the filter is told of coordinates without noise
+    exact_assumed_mm: float = 0.1  # SD that the filter assumes of coordinates without noise
     seeds: int = 8
     # Decrease of the objective below which a search ends that starts near its end: 0.02 moves no
     # parameter by more than a fifth of its standard deviation, 0.05 by a third.
@@ -34,4 +34,4 @@ class CycleSettings:
     beats: int = 10  # over which a modulus drifts
     beat_times: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4)  # s
     drift: float = -0.3  # of the first parameter, from the first beat to the last
-    drift_std: float = 0.04  # that the filter is told of the logarithm from beat to beat
+    drift_std: float = 0.04  # that the filter assumes of the logarithm from beat to beat

@@ -11,7 +11,9 @@ import numpy as np
 
 from experiments.common.build import Twin, build_filter, build_twin
 from experiments.common.progress import SolveBar
+from experiments.common.schema import build
 from experiments.common.whole_cycle import cycle_model, stored_cycle
+from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
 from mvest.personalise.chain import expect_case
@@ -119,7 +121,7 @@ def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
     parameters = tuple(config["parameters"])
     _, transform, prior = build_filter(config["filter"], parameters)
     noise = config["cycle"]["noise_mm"]
-    model = cycle_model(config)
+    model = cycle_model(config, build(CycleProtocol, config["cycle"]["protocol"]))
     with SolveBar(config["name"], len(model.protocol.steps()), 1) as bar:
         model.closure.on_step = bar.step
         found = expect_of_model(

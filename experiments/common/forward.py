@@ -1,20 +1,37 @@
-"""What the studies of the forward model share: what its record says."""
+"""What the studies of the forward model share: what their records say."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
+from experiments.common.record import Mesh, Outcome
 from mvest.closure.model import ClosureModel
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["forward_record", "without_nan"]
+__all__ = ["forward_record", "outcome_of", "without_nan"]
 
 Values = Mapping[str, Any]
+F = TypeVar("F")
+
+
+def outcome_of(
+    findings: F, mesh: SolidMesh, forward_solves: int, failures: Iterable[str] = ()
+) -> Outcome[F]:
+    """The outcome of a study, which failed for the first of the reasons given, if any."""
+    reason = next(iter(failures), None)
+    return Outcome(
+        findings=findings,
+        status="converged" if reason is None else "failed",
+        reason="completed" if reason is None else reason,
+        mesh=Mesh(mesh.sha256, len(mesh.nodes)),
+        forward_solves=forward_solves,
+    )
 
 
 def forward_record(

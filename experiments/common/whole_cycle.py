@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from experiments.common.build import closure_model
-from experiments.common.schema import build
+from experiments.common.cycle_settings import CycleSettings
 from experiments.common.store import Store, StoredModel
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
@@ -17,17 +17,18 @@ from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.information.identifiability import Identifiability
+from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.information.model_error import shift_by_model_error
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 
 __all__ = [
+    "Bound",
     "MeshShift",
-    "bound_entry",
     "closed_frame",
     "cycle_model",
+    "finer_steps",
     "frames_on_mesh",
     "shift_by_check_mesh",
     "stored_cycle",
@@ -37,9 +38,50 @@ __all__ = [
 Values = Mapping[str, Any]
 
 
-def cycle_model(config: Values, **changes: Any) -> CycleModel:
-    """The configured model of a cycle, its protocol with ``changes``."""
-    protocol = build(CycleProtocol, {**config["cycle"]["protocol"], **changes})
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """What some frames of a cycle could tell at best: the Cramér-Rao bound of p parameters.
+
+    Attributes
+    ----------
+    frames : str
+        Which.
+    count : int
+    std : (p,)
+        Relative to the parameters; None where the frames do not determine one.
+    correlation : (p, p)
+    condition_number : float or None
+        Of the information, scaled by the parameters.
+    flat : tuple of str
+        Combinations that are known badly.
+    """
+
+    frames: str
+    count: int
+    std: tuple[float | None, ...]
+    correlation: tuple[tuple[float | None, ...], ...]
+    condition_number: float | None
+    flat: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, label: str, frames: list[int], jacobian: FloatArray, noise_mm: float, truth: FloatArray
+    ) -> Bound:
+        """The bound of ``frames`` from the Jacobian ``(f, n, 3, p)`` mm of all at the truth."""
+        rows = jacobian[frames].reshape(-1, len(truth))
+        bound = identifiability(rows, noise_mm**2, truth)
+        return cls(
+            label,
+            len(frames),
+            tuple(map(_finite, bound.std / bound.scale)),
+            tuple(tuple(map(_finite, row)) for row in bound.correlation),
+            _finite(bound.condition_number),
+            tuple(bound.flat(0.05)),
+        )
+
+
+def cycle_model(config: Values, protocol: CycleProtocol) -> CycleModel:
+    """The configured model of a cycle."""
     return CycleModel(closure_model(config), protocol)
 
 
@@ -49,19 +91,6 @@ def closed_frame(protocol: CycleProtocol) -> int:
     if not held:
         raise ConfigurationError("cycle.protocol.times has no frame on the plateau of the pressure")
     return held[-1]
-
-
-def bound_entry(label: str, frames: list[int], bound: Identifiability) -> dict[str, Any]:
-    """Plain data of a Cramér-Rao bound; standard deviations relative to the parameters."""
-    relative = bound.std / bound.scale
-    return {
-        "frames": label,
-        "count": len(frames),
-        "std": [float(v) if np.isfinite(v) else None for v in relative],
-        "correlation": [[_finite(v) for v in row] for row in bound.correlation],
-        "condition_number": _finite(bound.condition_number),
-        "flat": list(bound.flat(0.05)),
-    }
 
 
 def _finite(value: float) -> float | None:
@@ -84,7 +113,9 @@ def stored_frames(config: Values, model: CycleModel, m: FloatArray) -> FloatArra
     return found.y.reshape(len(model.protocol.times), -1, 3)
 
 
-def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
+def frames_on_mesh(
+    config: Values, settings: CycleSettings, m: FloatArray, mesh: Literal["finer", "check"]
+) -> FloatArray:
     """Frames ``(f, n, 3)`` mm of parameters ``m (p,)`` on the "finer" or the "check" mesh.
 
     Cells and contact points are those of ``cycle.finer_...`` or ``cycle.check_...``, the time step
@@ -95,13 +126,24 @@ def frames_on_mesh(config: Values, m: FloatArray, mesh: str) -> FloatArray:
     InputError
         If the cycle cannot be followed to its end.
     """
-    settings = config["cycle"]
-    cells = {"columns": settings[f"{mesh}_columns"], "rows": settings[f"{mesh}_rows"]}
-    points = dict(zip(("columns", "rows"), settings[f"{mesh}_contact"], strict=True))
-    mechanics = {**config["mechanics"], "contact_points": points}
-    changed = {**config, "mesh": {**config["mesh"], **cells}, "mechanics": mechanics}
-    dt = settings["protocol"]["dt"] * settings["finer_dt_factor"]
-    return stored_frames(changed, cycle_model(changed, dt=dt), m)
+    columns, rows, points = (
+        (settings.finer_columns, settings.finer_rows, settings.finer_contact)
+        if mesh == "finer"
+        else (settings.check_columns, settings.check_rows, settings.check_contact)
+    )
+    contact = dict(zip(("columns", "rows"), points, strict=True))
+    changed = {
+        **config,
+        "mesh": {**config["mesh"], "columns": columns, "rows": rows},
+        "mechanics": {**config["mechanics"], "contact_points": contact},
+    }
+    return stored_frames(changed, cycle_model(changed, finer_steps(settings)), m)
+
+
+def finer_steps(settings: CycleSettings) -> CycleProtocol:
+    """The protocol with the time step of a finer truth."""
+    dt = settings.protocol.dt * settings.finer_dt_factor
+    return replace(settings.protocol, dt=dt)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +164,7 @@ class MeshShift:
 
 def shift_by_check_mesh(
     config: Values,
+    settings: CycleSettings,
     found: Estimate,
     model: ObservationModel,
     prior: Gaussian,
@@ -136,7 +179,7 @@ def shift_by_check_mesh(
         return f"no estimate: {found.reason.value}"
     predicted = predict(model, found.mean)
     try:
-        check = frames_on_mesh(config, found.mean, "check")
+        check = frames_on_mesh(config, settings, found.mean, "check")
     except InputError as error:
         return f"on the mesh of the check: {error}"
     off = check[observation.seen].ravel() - predicted.y

@@ -121,10 +121,10 @@ def metrics(record: Values) -> list[tuple[str, float, int]]:
     found.append(("nis", _mean([run["nis"] for run in done if run.get("nis") is not None]), 0))
     found.append(("failed", len(runs) - len(done), 0))
     found.append(("iterations", _mean([run.get("iterations") or 0 for run in runs]), 0))
-    found += [
-        (key, math.fsum(run.get(key) or 0 for run in runs), 0)
-        for key in ("forward_solves", "seconds")
-    ]
+    found.append(("forward_solves", math.fsum(run.get("forward_solves") or 0 for run in runs), 0))
+    # Studies that do more than one estimate have no time but their own.
+    seconds = math.fsum(run.get("seconds", record["seconds_total"]) or 0 for run in runs)
+    found.append(("seconds", seconds, 0))
     found += [
         (name, value, 0)
         for name, value in (record.get("measures") or {}).items()

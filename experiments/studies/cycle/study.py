@@ -3,39 +3,41 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.common.build import build_filter
+from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import foresee_cycle
-from experiments.common.forward import forward_record
-from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.study import Section, Study
+from experiments.common.record import Outcome
+from experiments.common.report import write_each
+from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
-    bound_entry,
+    Bound,
     closed_frame,
     cycle_model,
     stored_cycle,
     stored_frames,
 )
-from experiments.studies.cycle.report import cycle_text, write_cycle
+from experiments.studies.cycle.findings import Along, Band, Curve, Drift, Findings, Frame, Steps
+from experiments.studies.cycle.report import cycle_figure, cycle_table, cycle_words
 from experiments.studies.cycle.settings import Settings
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import Beats, CycleObservation
+from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.filters.drift import DriftSmoother
-from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.trajectory import Trajectory
 from mvest.estimation.transform import Log
 from mvest.typing import FloatArray
 
-__all__ = ["STUDY", "frame_sets", "run_cycle_study"]
+__all__ = ["STUDY", "frame_sets", "run_cycle"]
 
 Values = Mapping[str, Any]
 
@@ -49,26 +51,28 @@ def frame_sets(total: int, closed: int) -> list[list[int]]:
     return [[0, closed], *spread, list(range(total))]
 
 
-def run_cycle_study(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Information per frame, set of frames and phase; the time step; a drift over beats."""
-    settings = config["cycle"]
-    truth = np.array(config["truth"]["values"], dtype=float)
-    model = cycle_model(config)
-    with SolveBar("cycle", len(model.protocol.steps()), 1) as bar:
+def run_cycle(job: Job[Settings]) -> Outcome[Findings]:
+    """Information per frame, set of frames and phase; the time step; a drift over beats.
+
+    Raises
+    ------
+    ConfigurationError
+        If the truth has no cycle, or time steps are not halved.
+    """
+    values, settings = job.values, job.settings.cycle
+    truth, protocol = np.array(values["truth"]["values"], dtype=float), settings.protocol
+    model = cycle_model(values, protocol)
+    with SolveBar("cycle", len(protocol.steps()), 1) as bar:
         model.closure.on_step = bar.step
-        prediction = stored_cycle(config, model)(truth)
+        prediction = stored_cycle(values, model)(truth)
     if not prediction.converged:
         raise ConfigurationError(f"the truth has no cycle: {prediction.reason}")
-    protocol = model.protocol
     frames = prediction.y.reshape(len(protocol.times), -1, 3)
     H = prediction.jacobian.reshape(*frames.shape, len(truth))
     closed = closed_frame(protocol)
 
-    def bound(label: str, wanted: list[int]) -> dict[str, Any]:
-        rows = H[wanted].reshape(-1, len(truth))
-        return bound_entry(label, wanted, identifiability(rows, settings["noise_mm"] ** 2, truth))
+    def bound(label: str, wanted: list[int]) -> Bound:
+        return Bound.of(label, wanted, H, settings.noise_mm, truth)
 
     plateau = [k for k, t in enumerate(protocol.times) if protocol.phase(t) > 1 - 1e-9]
     phases = {
@@ -76,92 +80,92 @@ def run_cycle_study(
         "held closed": plateau,
         "opening": list(range(closed + 1, len(frames))),
     }
-    sets = frame_sets(len(frames), closed)
-    record = forward_record(config, config_hash, model.closure, truth, started, 1)
-    record |= {
-        "noise_mm": settings["noise_mm"],
-        "vertices": int(frames.shape[1]),
-        "frames": [
-            _frame(t, model, frames, H[k], truth, settings["noise_mm"], k)
-            for k, t in enumerate(protocol.times)
-        ],
-        "curve": _curve(model),
-        "sets": [bound(", ".join(f"{protocol.times[k]:g}" for k in s), s) for s in sets],
-        "phases": [bound(label, wanted) for label, wanted in phases.items() if wanted],
-        "steps": _time_steps(config, truth),
-    }
-    record["measures"] = {
-        f"bound_{entry['count']}_frames.{name}": value
-        for entry in record["sets"]
-        for name, value in zip(config["parameters"], entry["std"], strict=True)
-        if value is not None
-    }
-    drift = _drift(config, truth)
-    record["drift"] = drift
-    record["forward_solves"] = 1 + record["steps"]["runs"] + drift["runs"]
-    if drift["status"] != "converged":
-        record |= {"status": "failed", "reason": drift["reason"]}
-    record["seconds"] = record["seconds_total"] = time.time() - started
-    return record, []
+    sets = tuple(
+        bound(", ".join(f"{protocol.times[k]:g}" for k in wanted), wanted)
+        for wanted in frame_sets(len(frames), closed)
+    )
+    steps = _time_steps(values, settings, truth)
+    drift, runs = _drift(values, settings, truth)
+    findings = Findings(
+        truth=_of(truth),
+        noise_mm=settings.noise_mm,
+        vertices=frames.shape[1],
+        frames=tuple(
+            _frame(protocol, k, frames, H[k], truth, settings.noise_mm) for k in range(len(frames))
+        ),
+        curve=_curve(protocol),
+        sets=sets,
+        phases=tuple(bound(label, wanted) for label, wanted in phases.items() if wanted),
+        steps=steps,
+        drift=drift,
+        measures={
+            f"bound_{entry.count}_frames.{name}": value
+            for entry in sets
+            for name, value in zip(values["parameters"], entry.std, strict=True)
+            if value is not None
+        },
+    )
+    failed = (drift,) if isinstance(drift, str) else ()
+    return outcome_of(findings, model.closure.mesh, 1 + steps.runs + runs, failed)
+
+
+def _of(values: FloatArray) -> tuple[float, ...]:
+    return tuple(values.tolist())
+
+
+def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(_of, values))
 
 
 def _frame(
-    t: float,
-    model: CycleModel,
+    protocol: CycleProtocol,
+    k: int,
     frames: FloatArray,
     H: FloatArray,
     truth: FloatArray,
     noise: float,
-    k: int,
-) -> dict[str, Any]:
+) -> Frame:
     """What one frame says of each parameter if the others were known."""
     size = np.sqrt(np.sum(H.reshape(-1, len(truth)) ** 2, axis=0)) * truth
     with np.errstate(divide="ignore"):
         std = noise / size
-    return {
-        "time": t,
-        "pressure_mmHg": model.protocol.pressure_mmHg * model.protocol.phase(t),
-        "displacement_mm": float(np.linalg.norm(frames[k] - frames[0], axis=1).mean()),
-        "std_alone": [float(v) if np.isfinite(v) else None for v in std],
-    }
+    time = protocol.times[k]
+    return Frame(
+        time,
+        protocol.pressure_mmHg * protocol.phase(time),
+        float(np.linalg.norm(frames[k] - frames[0], axis=1).mean()),
+        tuple(float(v) if np.isfinite(v) else None for v in std),
+    )
 
 
-def _curve(model: CycleModel) -> dict[str, list[float]]:
-    t = np.linspace(0.0, model.protocol.times[-1], 141)
-    p = model.protocol
-    return {"time": t.tolist(), "pressure_mmHg": [p.pressure_mmHg * p.phase(v) for v in t]}
+def _curve(protocol: CycleProtocol) -> Curve:
+    t = np.linspace(0.0, protocol.times[-1], 141)
+    return Curve(_of(t), tuple(protocol.pressure_mmHg * protocol.phase(v) for v in t))
 
 
-def _time_steps(config: Values, truth: FloatArray) -> dict[str, Any]:
+def _time_steps(values: Values, settings: CycleSettings, truth: FloatArray) -> Steps:
     """What depends on the time step: the frames, and how smoothly they follow the parameters."""
-    dts: list[float] = config["cycle"]["time_steps"]
+    dts = settings.time_steps
     if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
         raise ConfigurationError(
-            f"cycle.time_steps = {dts}, expected each to be half of the one before"
+            f"cycle.time_steps = {list(dts)}, expected each to be half of the one before"
         )
-    path = np.tile(truth, (config["cycle"]["path_steps"] + 1, 1))
-    path[:, 0] *= np.linspace(1.0, 1.0 + config["cycle"]["drift"], len(path))
+    path = np.tile(truth, (settings.path_steps + 1, 1))
+    path[:, 0] *= np.linspace(1.0, 1.0 + settings.drift, len(path))
     found, along = [], []
     for dt in dts:
-        model = cycle_model(config, dt=dt)
+        model = cycle_model(values, replace(settings.protocol, dt=dt))
         with SolveBar(f"time step {dt:g} s", len(model.protocol.steps()), len(path)) as bar:
             model.closure.on_step = bar.step
-            frames, reason = _followed(config, model, path)
+            frames, reason = _followed(values, model, path)
         found.append(frames[0] if frames else None)
-        changes = [_rms(b - a) for a, b in pairwise(frames)]
-        along.append({"rms_mm": changes, "reason": reason})
-        told = reason or f"unevenness {max(changes) / np.median(changes):.1f}"
-        print(f"time step {dt:g} s: {told}", file=sys.stderr, flush=True)
-    halved = [None if a is None or b is None else b - a for a, b in pairwise(found)]
-    whole = [None if change is None else _rms(change) for change in halved]
-    return {
-        "dt": dts,
-        "rms_mm": whole,
-        "order": [None if not (a and b) else float(np.log2(a / b)) for a, b in pairwise(whole)],
-        "path": path.tolist(),
-        "along": along,
-        "runs": len(dts) * len(path),
-    }
+        changes = tuple(_rms(b - a) for a, b in pairwise(frames))
+        along.append(Along(changes, reason))
+        said = reason or f"unevenness {max(changes) / np.median(changes):.1f}"
+        print(f"time step {dt:g} s: {said}", file=sys.stderr, flush=True)
+    whole = tuple(None if a is None or b is None else _rms(b - a) for a, b in pairwise(found))
+    order = tuple(None if not (a and b) else float(np.log2(a / b)) for a, b in pairwise(whole))
+    return Steps(dts, whole, order, _rows(path), tuple(along), len(dts) * len(path))
 
 
 def _followed(config: Values, model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], str]:
@@ -179,83 +183,81 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _drift(config: Values, truth: FloatArray) -> dict[str, Any]:
-    """A modulus that drifts from beat to beat, filtered and smoothed."""
-    settings = config["cycle"]
-    moduli = [k for k, name in enumerate(config["parameters"]) if name.startswith("E_f.")]
-    kept = {n: truth[k] for k, n in enumerate(config["parameters"]) if k not in moduli}
-    changed = {
-        **config,
-        "parameters": [config["parameters"][k] for k in moduli],
-        "fixed": {**config["fixed"], **kept},
-    }
-    beats, times = settings["beats"], settings["beat_times"]
+def _drift(values: Values, settings: CycleSettings, truth: FloatArray) -> tuple[Drift | str, int]:
+    """A modulus that drifts from beat to beat, filtered and smoothed, and runs of the model."""
+    names = values["parameters"]
+    moduli = [k for k, name in enumerate(names) if name.startswith("E_f.")]
+    kept = {name: truth[k] for k, name in enumerate(names) if k not in moduli}
+    parameters = tuple(names[k] for k in moduli)
+    changed = {**values, "parameters": parameters, "fixed": {**values["fixed"], **kept}}
+    beats = settings.beats
     path = np.tile(truth[moduli], (beats, 1))
-    path[:, 0] *= 1 + settings["drift"] * 0.5 * (1 - np.cos(np.pi * np.arange(beats) / (beats - 1)))
-    maker, model = (cycle_model(changed, times=times) for _ in range(2))
-    rng = np.random.default_rng(config["seed"])
+    path[:, 0] *= 1 + settings.drift * 0.5 * (1 - np.cos(np.pi * np.arange(beats) / (beats - 1)))
+    protocol = replace(settings.protocol, times=settings.beat_times)
+    maker, model = (cycle_model(changed, protocol) for _ in range(2))
+    rng = np.random.default_rng(values["seed"])
     seen = [
-        CycleObservation.simulated(stored_frames(changed, maker, m), settings["noise_mm"], rng)
+        CycleObservation.simulated(stored_frames(changed, maker, m), settings.noise_mm, rng)
         for m in path
     ]
-    _, _, whole = build_filter(config["filter"], tuple(config["parameters"]))
+    _, _, whole = build_filter(values["filter"], tuple(names))
     initial = type(whole)(whole.mean[moduli], whole.covariance[np.ix_(moduli, moduli)])
     smoother = DriftSmoother(
-        tuple(sum(o.sizes) for o in seen), settings["drift_std"] ** 2, tolerance=0.1
+        tuple(sum(o.sizes) for o in seen), settings.drift_std**2, tolerance=0.1
     )
     y, R = (np.concatenate([getattr(o, name) for o in seen]) for name in ("y", "R"))
-    with SolveBar("drift", len(model.protocol.steps()), beats * TYPICAL_SOLVES) as bar:
+    with SolveBar("drift", len(protocol.steps()), beats * TYPICAL_SOLVES) as bar:
         model.closure.on_step = bar.step
         found = smoother(Beats(stored_cycle(changed, model)), initial, y, R, transform=Log())
     print(f"drift: {found.reason.value}, {found.forward_solves} runs", file=sys.stderr, flush=True)
     if found.smoothed is None:
-        return {"status": "failed", "reason": found.detail, "runs": found.forward_solves}
+        return found.detail, found.forward_solves
+    runs = found.forward_solves + beats
+    if not found.converged:
+        return found.reason.value, runs
     filtered = Trajectory(
         np.array([s.filtered.mean for s in found.extended]),
         np.array([s.filtered.covariance for s in found.extended]),
     )
-    return {
-        "status": "converged" if found.converged else "failed",
-        "reason": found.reason.value,
-        "runs": found.forward_solves + beats,
-        "parameters": changed["parameters"],
-        "times": list(times),
-        "truth": path.tolist(),
-        "told_std": settings["drift_std"],
-        "filter": _band(filtered, path),
-        "smoother": _band(found.smoothed, path),
-    }
+    return Drift(
+        runs,
+        parameters,
+        settings.beat_times,
+        _rows(path),
+        settings.drift_std,
+        _band(filtered, path),
+        _band(found.smoothed, path),
+    ), runs
 
 
-def _band(trajectory: Trajectory, path: FloatArray) -> dict[str, Any]:
+def _band(trajectory: Trajectory, path: FloatArray) -> Band:
     """Medians and 95 % bands of parameters that are estimated by their logarithm."""
     error = trajectory.mean - np.log(path)
     low, high = (np.exp(trajectory.mean + s * 1.96 * trajectory.std) for s in (-1, 1))
-    return {
-        "mean": np.exp(trajectory.mean).tolist(),
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "rms_error": np.sqrt(np.mean(error**2, axis=0)).tolist(),
-        "mean_std": trajectory.std.mean(axis=0).tolist(),
-        "coverage": np.mean(np.abs(error) <= 1.96 * trajectory.std, axis=0).tolist(),
-    }
+    return Band(
+        _rows(np.exp(trajectory.mean)),
+        _rows(low),
+        _rows(high),
+        _of(np.sqrt(np.mean(error**2, axis=0))),
+        _of(trajectory.std.mean(axis=0)),
+        _of(np.mean(np.abs(error) <= 1.96 * trajectory.std, axis=0)),
+    )
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_cycle_study),
-    words=lambda record: cycle_text(flat(record)),
-    write=each(write_cycle),
+    findings=Findings,
+    run=run_cycle,
+    words=cycle_words,
+    write=write_each(cycle_table, cycle_words, cycle_figure),
     keeps_failures=True,
     checks=lambda: (foresee_cycle,),
     sections=(
         Section(
             "cycle",
             {
-                "cycle": "The cycle and its frames, what they tell of each parameter, and a "
-                "modulus "
-                "that drifts over beats, filtered and smoothed. Simulated."
+                "cycle": "The cycle and its frames, what they tell of each parameter, and a"
+                " modulus that drifts over beats, filtered and smoothed. Simulated."
             },
         ),
     ),

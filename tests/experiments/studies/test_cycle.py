@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.common import whole_cycle
+from experiments.common.cycle_settings import CycleSettings
 from experiments.common.whole_cycle import shift_by_check_mesh
 from experiments.run import main
 from experiments.studies.cycle import study as cycle
@@ -40,7 +41,7 @@ TINY = (
     "cycle.beat_times=[0.05,0.1]",
     # What moves so little says little in 0.5 mm of noise.
     "cycle.noise_mm=0.01",
-    "cycle.exact_told_mm=0.001",
+    "cycle.exact_assumed_mm=0.001",
     "tracking.enabled=false",
 )
 
@@ -95,13 +96,14 @@ def test_the_joint_study_recovers_all_parameters_and_records_them(run):
     # What is left of the observation is its noise.
     assert all(0.009 < entry["residual_mm"] < 0.011 for entry in found["seeds"])
     assert found["exact"]["residual_mm"] < 1e-3
-    # Meshes this coarse tell by far more than the noise, and the estimate says so.
-    finer, told = found["finer"], found["told"]
-    assert told["distance_mm"] > finer["distance_mm"] > 0
-    assert told["error"] == finer["error"]
-    np.testing.assert_allclose(np.hypot(told["shift"], finer["std"]), told["std"], rtol=1e-6)
-    assert told["nees"] < finer["nees"]
-    assert np.max(np.abs(np.divide(told["shift"], finer["std"]))) > 3
+    # Meshes this coarse shift by far more than the noise, and the estimate says so.
+    finer, by_mesh = found["finer"], found["mesh_error"]
+    assert by_mesh["distance_mm"] > finer["distance_mm"] > 0
+    fit = finer["fit"]
+    np.testing.assert_allclose(np.hypot(by_mesh["shift"], fit["std"]), by_mesh["std"], rtol=1e-6)
+    assert by_mesh["nees"] < fit["nees"]
+    assert np.max(np.abs(np.divide(by_mesh["shift"], fit["std"]))) > 3
+    assert "the same, with the mesh's error" in (folder / "joint.csv").read_text()
     assert {"joint.csv", "joint.md", "joint.png"} <= {path.name for path in folder.iterdir()}
     assert "target" in said.out
 
@@ -175,36 +177,34 @@ def test_the_shift_by_a_mesh_is_the_difference_of_two_estimates(monkeypatch):
     found = estimated(observation.y)
     off = rng.normal(size=(2, 2, 3))
     at = LogLinear()(found.mean).y.reshape(2, 2, 3)
-    monkeypatch.setattr(whole_cycle, "frames_on_mesh", lambda config, m, mesh: at + off)
-    told = shift_by_check_mesh({}, found, model, prior, observation)
+    monkeypatch.setattr(whole_cycle, "frames_on_mesh", lambda values, settings, m, mesh: at + off)
+    by = shift_by_check_mesh({}, CycleSettings(), found, model, prior, observation)
     moved = estimated(observation.y + off[observation.seen].ravel())
-    np.testing.assert_allclose(
-        told.shift, moved.transformed.mean - found.transformed.mean, rtol=1e-8
-    )
+    np.testing.assert_allclose(by.shift, moved.transformed.mean - found.transformed.mean, rtol=1e-8)
     seen = np.linalg.norm(off[observation.seen], axis=1)
-    assert told.distance_mm == pytest.approx(seen.mean())
+    assert by.distance_mm == pytest.approx(seen.mean())
 
 
-def test_a_mesh_on_which_nothing_closes_is_told_and_not_raised(monkeypatch):
+def test_a_mesh_on_which_nothing_closes_is_said_and_not_raised(monkeypatch):
     observation = CycleObservation(np.zeros((2, 2, 3)), np.full(2, 0.2))
     model, prior = observation.of(LogLinear()), Gaussian.from_variance(np.ones(2), np.ones(2))
     found = IteratedFilter()(model, prior, observation.y, observation.R, transform=Log())
 
-    def lost(config, m, mesh):
+    def lost(values, settings, m, mesh):
         raise InputError("no cycle")
 
     monkeypatch.setattr(whole_cycle, "frames_on_mesh", lost)
-    told = shift_by_check_mesh({}, found, model, prior, observation)
-    assert told == "on the mesh of the check: no cycle"
+    by = shift_by_check_mesh({}, CycleSettings(), found, model, prior, observation)
+    assert by == "on the mesh of the check: no cycle"
 
 
 def test_time_steps_that_are_not_halves_are_refused():
-    settings = {"time_steps": [0.05, 0.02], "path_steps": 1, "drift": -0.3}
+    settings = CycleSettings(time_steps=(0.05, 0.02), path_steps=1)
     with pytest.raises(ConfigurationError, match="each to be half of the one before"):
-        cycle._time_steps({"cycle": settings}, np.array([6.0]))
+        cycle._time_steps({}, settings, np.array([6.0]))
 
 
-def test_a_time_step_that_cannot_be_followed_is_told(monkeypatch):
+def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
     def frames(config, model, m):
         if m[0] < 2:
             raise InputError("no cycle with the parameters")

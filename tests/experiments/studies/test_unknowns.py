@@ -3,15 +3,24 @@
 import json
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from experiments.common.plain import flat
+from experiments.common.record import Record
+from experiments.common.whole_cycle import Bound
 from experiments.run import main
-from experiments.studies.chord.report import chord_text, write_chord
-from experiments.studies.patch.report import patch_text, write_patch
+from experiments.studies.chord.findings import Findings as ChordFindings
+from experiments.studies.chord.findings import Fit as ChordFit
+from experiments.studies.chord.study import STUDY as CHORD
+from experiments.studies.patch.findings import Compared, Places
+from experiments.studies.patch.findings import Findings as PatchFindings
+from experiments.studies.patch.findings import Fit as PatchFit
+from experiments.studies.patch.study import STUDY as PATCH
+from mvest.mechanics.settings import ModulusField, StiffPatch
 from tests.experiments.runner.logged import logged
+from tests.experiments.studies.made_up import made_up
 
 TINY = (
     "mesh.columns=8",
@@ -52,15 +61,8 @@ def run(tmp_path, monkeypatch, capsys):
     return call
 
 
-PROVENANCE = {
-    "git": {"sha": "0" * 40, "dirty": False},
-    "versions": {"mvest": "0"},
-    "config_hash": "0" * 64,
-    "mesh_hash": "0" * 64,
-    "seed": 1,
-}
 FEW = (
-    # Meshes this coarse differ by more than they move: noise that is told is above that.
+    # Meshes this coarse differ by more than they move: assumed noise is above that.
     "cycle.noise_mm=0.5",
     "parameters=[E_f.anterior,E_f.posterior,field.anterior.0,field.anterior.1,field.anterior.2]",
     "filter.initial=[6.0,2.2,0,0,0]",
@@ -74,7 +76,8 @@ def test_a_patch_is_compared_with_the_truth_where_it_is(run):
     assert status == 0, said.err
     found = record["findings"]
     assert set(found["results"]) == {"patch", "no patch"}
-    with_patch, without = found["results"]["patch"], found["results"]["no patch"]
+    fits = [found["results"][label] for label in ("patch", "no patch")]
+    with_patch, without = (fit["compared"] for fit in fits)
     # The truth is the leaflet's modulus, twice as much at the centre, and nowhere else.
     assert max(without["truth"]) == pytest.approx(6.23)
     assert min(with_patch["truth"]) == pytest.approx(6.23)
@@ -82,19 +85,20 @@ def test_a_patch_is_compared_with_the_truth_where_it_is(run):
     # The other mesh is another object, and the noise the same: only the truth differs.
     assert found["cells_of_truth"] != record["model"]["cells"][:2]
     assert with_patch["at_centre"] != without["at_centre"]
-    # What is told of the highest modulus is what the map has.
+    # What is said of the highest modulus is what the map has.
     assert with_patch["peak"] == pytest.approx(max(with_patch["modulus"]))
     modulus, truth = np.array(with_patch["modulus"]), np.array(with_patch["truth"])
     assert np.all(modulus > 0)
     assert with_patch["rms_log_error"] <= np.abs(np.log(modulus / truth)).max()
     # More lies within wider limits, and what is left is noise of 0.5 mm.
-    for entry in (with_patch, without):
+    for fit in fits:
+        entry = fit["compared"]
         assert entry["shift_rms"] > 0
         assert entry["within_two_with_shift"] >= entry["within_two_std"]
-        assert 0.45 < entry["residual_mm"] < 0.7
+        assert 0.45 < fit["residual_mm"] < 0.7
     assert logged(folder)["peak"] == with_patch["peak"]
     assert (folder / "patch.png").is_file()
-    assert "half the patch's radius" in patch_text(flat(record))
+    assert "half the patch's radius" in said.out
 
 
 def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
@@ -115,58 +119,58 @@ def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
 
 
 def test_tables_say_what_missed_its_target(tmp_path):
-    entry = {
-        "truth": [6.0, 12.0, 6.0], "modulus": [6.0, 9.0, 6.0], "log_std": [0.1, 0.2, 0.1],
-        "at_centre": 9.0, "true_at_centre": 12.0, "log_std_at_centre": 0.2, "peak": 9.0,
-        "peak_distance_mm": 4.0, "outside": 6.0, "rms_log_error": 0.1, "within_two_std": 0.9,
-        "residual_mm": 0.5, "shift_rms": None, "within_two_with_shift": None,
-        "shift_unknown": "no cycle",
-    }  # fmt: skip
-    record = {
-        "title": "t", "results": {"patch": entry, "no patch": {**entry, "truth": [6.0] * 3}},
-        "map": {"along_mm": [0, 1, 0], "down_mm": [0, 0, 1], "triangles": [[0, 1, 2]]},
-        "patch": {"radius_mm": 7.0, "factor": 2.0, "region": "anterior"}, "truth": [6.0, 2.0],
-        "field": {"correlation_length_mm": 5.0, "std_log": 0.4, "modes": 3, "share": 0.5},
-        "cells_of_truth": [36, 4], "model": {"cells": [24, 3, 1]}, "times": [0, 1], "vertices": 9,
-        "noise_mm": 0.5,
-        "experiment": "made_up",
-        "provenance": PROVENANCE,
-    }  # fmt: skip
-    text = patch_text(record)
+    compared = Compared(
+        truth=(6.0, 12.0, 6.0), modulus=(6.0, 9.0, 6.0), log_std=(0.1, 0.2, 0.1),
+        at_centre=9.0, true_at_centre=12.0, log_std_at_centre=0.2, peak=9.0, peak_log_std=0.2,
+        peak_distance_mm=4.0, outside=6.0, rms_log_error=0.1, within_two_std=0.9,
+        shift_rms=None, within_two_with_shift=None,
+    )  # fmt: skip
+    with_patch = PatchFit("converged", "converged", (), (), 4, 0.5, compared, "no cycle")
+    without = replace(with_patch, compared=replace(compared, truth=(6.0,) * 3))
+    findings = PatchFindings(
+        truth=(6.0, 2.0), patch=StiffPatch("anterior", (0.0, 0.0, 0.0), 7.0, 2.0),
+        field=ModulusField(correlation_length_mm=5.0, std_log=0.4, modes=3), share=0.5,
+        noise_mm=0.5, times=(0.0, 1.0), vertices=9, cells_of_truth=(36, 4), prior_std=(),
+        map=Places((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), ((0, 1, 2),)),
+        results={"patch": with_patch, "no patch": without}, measures={},
+    )  # fmt: skip
+    record = made_up(findings)
+    text = PATCH.words(record)
     # 9 of 12 MPa is 25 % less; 4 mm is more than 3.5 mm.
     assert "-25 % off, target 20 %: missed" in text
     assert "may shift is not known (no cycle)" in text
     assert re.search(r"Place 4\.0 mm off, target 3\.5 mm .*: missed", text)
-    files = write_patch(tmp_path, json.loads(json.dumps(record)))
+    files = PATCH.write(tmp_path, {"made_up": record}, {})
     assert {path.suffix for path in files} == {".csv", ".md", ".png", ".pdf"}
 
 
-def chord_record():
-    def entry(frames, std):
-        return {
-            "frames": frames, "seed": 0, "status": "converged", "reason": "converged", "nees": 2.1,
-            "estimate": [6.1, 1.01], "error": [0.01, 0.01], "std": std,
-            "correlation": [[1, -0.7], [-0.7, 1]],
-        }  # fmt: skip
+def chord_record() -> Record[ChordFindings]:
+    def fit(frames: str, *std: float) -> ChordFit:
+        correlation = ((1.0, -0.7), (-0.7, 1.0))
+        return ChordFit(
+            frames, 0, "converged", "converged", (6.1, 1.01), (0.01, 0.01), std, correlation, 2.1, 4
+        )
 
-    return {
-        "title": "t", "parameters": ["E_f.anterior", "chord_stiffness.basal"], "truth": [6.0, 1.0],
-        "start": [5.0, 1.1], "prior_std": [0.5, 0.3], "noise_mm": 0.5, "times": [0, 1],
-        "vertices": 9, "results": [entry("open and closed", [0.3, 0.29]),
-                                   entry("whole cycle", [0.1, 0.14])],
-        "bounds": [{"frames": "open and closed", "std": [0.4, None]},
-                   {"frames": "whole cycle", "std": [0.1, 0.16]}],
-        "experiment": "made_up",
-        "provenance": PROVENANCE,
-    }  # fmt: skip
+    def bound(frames: str, *std: float | None) -> Bound:
+        return Bound(frames, 2, std, (), 1.0, ())
+
+    findings = ChordFindings(
+        truth=(6.0, 1.0), start=(5.0, 1.1), prior_std=(0.5, 0.3), noise_mm=0.5, times=(0.0, 1.0),
+        vertices=9,
+        results=(fit("open and closed", 0.3, 0.29), fit("whole cycle", 0.1, 0.14)),
+        bounds=(bound("open and closed", 0.4, None), bound("whole cycle", 0.1, 0.16)),
+        measures={},
+    )  # fmt: skip
+    return made_up(findings, parameters=("E_f.anterior", "chord_stiffness.basal"))
 
 
 def test_identified_is_what_the_data_make_twice_as_sure(tmp_path):
-    text = chord_text(chord_record())
+    record = chord_record()
+    text = CHORD.words(record)
     # 10 % of 50 % is, 30 % of 50 % is not; 14 % of 30 % is, 29 % of 30 % is not.
     modulus, chord = (line for line in text.splitlines() if line.startswith(("| ant", "| bas")))
     assert modulus.endswith("| whole cycle |")
     assert chord.endswith("| whole cycle |")
     assert "(unbounded)" in chord
     assert "-0.70" in text
-    assert len(write_chord(tmp_path, chord_record())) == 4
+    assert len(CHORD.write(tmp_path, {"made_up": record}, {})) == 4

@@ -1,0 +1,79 @@
+"""What reports of studies share: names of parameters, and the files of one record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.common.record import Record
+from mvest.files import write_atomically
+from mvest.reporting.figures import save_figure_with
+
+__all__ = ["parameter_label", "percent", "write_each", "write_report"]
+
+F = TypeVar("F")
+
+WORDS = {
+    "E_f": "modulus",
+    "chord_stiffness": "chordal stiffness",
+    "chord_rest_length": "chordal length",
+}
+
+
+def parameter_label(name: str) -> str:
+    """What a reader calls a parameter."""
+    kind, _, part = name.partition(".")
+    return f"{part} {WORDS[kind]}".strip() if kind in WORDS else name
+
+
+def percent(value: float | None, form: str, missing: str) -> str:
+    """A share in percent, or what is said where there is none."""
+    return missing if value is None else f"{100 * value:{form}} %"
+
+
+def write_report(
+    folder: Path,
+    record: Record[F],
+    table: pd.DataFrame,
+    words: str,
+    figure: Figure | None = None,
+) -> list[Path]:
+    """Write the table (csv), words (Markdown) and figure of a record, named after its experiment.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    base = folder / record.experiment
+    text = f"# {record.title}\n\n{words}\n\n{record.line}\n"
+    return [
+        write_atomically(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
+        write_atomically(base.with_suffix(".md"), text),
+        *([] if figure is None else save_figure_with(base, figure, record.line)),
+    ]
+
+
+def write_each(
+    table: Callable[[Record[F]], pd.DataFrame],
+    words: Callable[[Record[F]], str],
+    figure: Callable[[Record[F]], Figure] | None = None,
+) -> Callable[[Path, Mapping[str, Record[F]], Mapping[str, Path]], list[Path]]:
+    """How a study writes whose records are each reported by themselves, without arrays."""
+
+    def write(
+        folder: Path, records: Mapping[str, Record[F]], _arrays: Mapping[str, Path]
+    ) -> list[Path]:
+        return [
+            path
+            for record in records.values()
+            for path in write_report(
+                folder, record, table(record), words(record), figure and figure(record)
+            )
+        ]
+
+    return write
