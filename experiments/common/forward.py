@@ -6,15 +6,13 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
-import numpy as np
-
 from experiments.common.record import Mesh, Outcome
 from mvest.closure.model import ClosureModel
 from mvest.provenance import provenance
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["forward_record", "outcome_of", "without_nan"]
+__all__ = ["forward_record", "outcome_of"]
 
 Values = Mapping[str, Any]
 F = TypeVar("F")
@@ -79,8 +77,3 @@ def forward_record(
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
     }
-
-
-def without_nan(row: dict[str, Any]) -> dict[str, Any]:
-    """NaN, which JSON lacks, as None."""
-    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}

@@ -3,141 +3,207 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from experiments.common.plain import Plain, flat
-from experiments.common.record import Record as Run
-from mvest.files import write_atomically
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line
-from mvest.typing import FloatArray, IntArray
+from experiments.common.record import Record
+from experiments.common.report import write_report
+from mvest.closure.measures import StepMeasures
+from mvest.errors import InputError
+from mvest.reporting.case.drawing import (
+    ATRIUM,
+    View,
+    draw_valve,
+    leaflet_colours,
+    name_leaflets,
+    paint_gap,
+    same_scale,
+)
+from mvest.reporting.case.fields import CaseFields
+from mvest.reporting.style import COLOURS, plain_axes
+from mvest.typing import FloatArray
+from mvest.valve.measure.annulus import annulus_plane
+from mvest.valve.measure.gap import Gap, find_gap
 
-__all__ = ["closure_figure", "closure_text", "write_closure"]
+__all__ = ["Findings", "closure_figure", "closure_table", "closure_words", "write_closure"]
 
-Record = Mapping[str, Any]
+POSTERIOR = View("seen from the posterior side", 8.0, -90.0)
+CURVES = (
+    ("orifice_mm2", "orifice (mm²)", 1.0),
+    ("passing_ball_mm", "largest ball that passes (mm)", 1.0),
+    ("coaptation_mm", "coaptation in the middle (mm)", 1.0),
+    ("chord_strain", "largest strain of a chord (%)", 100.0),
+)
 
-COLOURS = np.array([[0.85, 0.45, 0.40], [0.40, 0.55, 0.85], [0.45, 0.70, 0.45]])
-LIGHT = np.array([0.3, 0.5, 0.81])
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """How the valve closes.
+
+    Attributes
+    ----------
+    rows : tuple of StepMeasures
+        One for each stored step.
+    contact_distance_mm : float
+        Between midsurfaces, up to which leaflets count as coapting.
+    equilibrium : bool
+        Whether the last step is the static equilibrium after the motion.
+    """
+
+    rows: tuple[StepMeasures, ...]
+    contact_distance_mm: float
+    equilibrium: bool
 
 
-def closure_figure(record: Record, fields: Path) -> Figure:
-    """Four moments seen from the atrium and from the side, above opening, leak and coaptation."""
-    with np.load(fields, allow_pickle=False) as stored:
-        frames, times = stored["frames"].astype(float), stored["times"]
-        triangles, region = stored["triangles"], stored["region"]
-    table = pd.DataFrame(record["rows"])
-    shown = _moments(table)
-    figure = Figure(figsize=(11, 8.2), layout="constrained")
-    grid = figure.add_gridspec(3, 4, height_ratios=[1.1, 0.9, 0.9])
-    for column, k in enumerate(shown):
-        for row, (elevation, azimuth) in enumerate(((89.0, -90.0), (8.0, -90.0))):
-            axes = figure.add_subplot(grid[row, column], projection="3d")
-            _draw(axes, frames[k], frames[0], triangles, region, elevation, azimuth)
-            if row == 0:
-                pressure = table.pressure_mmhg[k]
-                static = k == len(times) - 1
-                label = "equilibrium" if static else f"{times[k]:.2f} s"
-                axes.set_title(f"{label}, {pressure:.0f} mmHg", fontsize=9)
-    step = np.arange(len(table))
-    for column, (name, label) in enumerate(
-        (
-            ("orifice_mm2", "orifice (mm²)"),
-            ("passing_ball_mm", "passing ball (mm)"),
-            ("coaptation_mm", "coaptation (mm)"),
-            ("chord_strain", "largest chord strain"),
-        )
-    ):
-        axes = figure.add_subplot(grid[2, column])
-        axes.plot(step, table[name], ".-", color="black", lw=1)
-        axes.set_xlabel("stored step")
-        axes.set_ylabel(label)
-    figure.suptitle("A simulated valve closing: from the atrium (top) and from the posterior side")
+def closure_table(record: Record[Findings]) -> pd.DataFrame:
+    """One row per stored step."""
+    return pd.DataFrame(map(asdict, record.findings.rows))
+
+
+def closure_figure(record: Record[Findings], fields: Path) -> Figure:
+    """Four moments seen from the atrium and from the side, above opening, leak and coaptation.
+
+    Parameters
+    ----------
+    record : Record
+    fields : Path
+        An ``.npz`` file with ``frames (f, n, 3)`` mm, ``times (f,)`` s, ``triangles``, ``region``,
+        ``annulus`` in loop order, ``tips (f, t, 3)`` mm, ``chord_end (f, c, 3)`` mm and
+        ``chord_tip (c,)``.
+
+    Raises
+    ------
+    InputError
+        If the fields cannot be read.
+    """
+    try:
+        with np.load(fields, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        # The ends of the chordae are points of no triangle.
+        shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
+        valve = _valve(arrays, shapes)
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{fields}: no fields of a closing valve ({error})") from error
+    found = record.findings
+    moments = _moments(found)
+    figure = Figure(figsize=(11, 8.4), layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=[2.2, 1.0])
+    _draw_moments(parts[0], valve, shapes, found, moments)
+    _draw_curves(parts[1], found, moments)
+    figure.suptitle("A simulated valve closing, from the atrium and from the posterior side")
     return figure
 
 
-def _moments(table: pd.DataFrame) -> list[int]:
+def _valve(arrays: Mapping[str, Any], shapes: FloatArray) -> CaseFields:
+    count = len(arrays["chord_tip"])
+    return CaseFields(
+        triangles=arrays["triangles"].astype(np.int64),
+        region=arrays["region"].astype(np.int64),
+        rest=shapes[0],
+        annulus=arrays["annulus"].astype(np.int64),
+        free_edge=np.zeros(0, dtype=np.int64),
+        frames=tuple(f"{t:g} s" for t in arrays["times"][1:]),
+        seen=np.ones(len(shapes) - 1, dtype=bool),
+        tips=arrays["tips"].astype(float),
+        chord_tip=arrays["chord_tip"].astype(np.int64),
+        chord_insertion=shapes.shape[1] - count + np.arange(count),
+        observed_points={},
+    )
+
+
+def _moments(found: Findings) -> list[int]:
     """Open, half open, nearly closed, closed."""
-    opening = table.orifice_mm2.to_numpy()
+    opening = np.array([row.orifice_mm2 for row in found.rows])
     share = opening / max(float(opening[0]), 1e-9)
-    return [0, *(int(np.argmax(share < level)) for level in (0.75, 0.1)), len(table) - 1]
+    return [0, *(int(np.argmax(share < level)) for level in (0.75, 0.1)), len(opening) - 1]
 
 
-def _draw(
-    axes: Any,
-    x: FloatArray,
-    rest: FloatArray,
-    triangles: IntArray,
-    region: IntArray,
-    elevation: float,
-    azimuth: float,
+def _draw_moments(
+    part: Any, valve: CaseFields, shapes: FloatArray, found: Findings, moments: list[int]
 ) -> None:
-    corners = x[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    shade = 0.45 + 0.55 * np.abs(normal @ LIGHT)
-    colours = np.clip(COLOURS[region % len(COLOURS)] * shade[:, None], 0, 1)
-    axes.add_collection3d(Poly3DCollection(corners, facecolors=colours, edgecolors="none"))
-    low, high = rest.min(axis=0), rest.max(axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.22)
-    axes.set_proj_type("ortho")
-    axes.view_init(elevation, azimuth)
-    axes.set_axis_off()
+    panels = part.subplots(2, len(moments), height_ratios=[1.0, 1.35])
+    colours = leaflet_colours(valve.region)
+    for column, k in enumerate(moments):
+        for view, panel in zip((ATRIUM, POSTERIOR), panels[:, column], strict=True):
+            draw_valve(panel, valve, shapes[k], colours, view, k, chords=view is POSTERIOR)
+        row = found.rows[k]
+        at_rest = found.equilibrium and k == len(found.rows) - 1
+        when = "at rest" if at_rest else f"{row.time:.2f} s"
+        panels[0, column].set_title(f"{when}, {row.pressure_mmhg:.0f} mmHg", fontsize=10)
+    paint_gap(panels[0, -1], *_gap(valve, shapes[moments[-1]], moments[-1]))
+    name_leaflets(panels[0, 0], valve, ("anterior", "posterior"))
+    shown = [shapes[k] for k in moments]
+    same_scale(list(panels[0]), shown, ATRIUM)
+    same_scale(list(panels[1]), [*shown, *(valve.tips[k] for k in moments)], POSTERIOR)
 
 
-def _summary(record: Record) -> str:
-    rows = record["rows"]
+def _gap(valve: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, FloatArray]:
+    """What is open between the thick leaflets, and the origin ``(3,)`` mm of its coordinates."""
+    annulus = points[valve.annulus]
+    own = valve.vertex_region[valve.annulus] == 0
+    plane = annulus_plane(annulus, valve.tips[frame].mean(axis=0), annulus[own].mean(axis=0))
+    return find_gap(points, valve.triangles, annulus, plane, 0.0), plane.origin
+
+
+def _draw_curves(part: Any, found: Findings, moments: list[int]) -> None:
+    """Measures over time; what was drawn above is marked, and the equilibrium stands apart."""
+    table = pd.DataFrame(map(asdict, found.rows))
+    moving = table[: len(table) - 1] if found.equilibrium else table
+    end = float(moving.time.iloc[-1])
+    # The equilibrium is at no time.
+    place = np.append(moving.time, 1.13 * end)[: len(table)]
+    for axes, (name, label, scale) in zip(part.subplots(1, len(CURVES)), CURVES, strict=True):
+        plain_axes(axes)
+        values = scale * table[name].to_numpy()
+        axes.plot(moving.time, values[: len(moving)], ".-", color="black", lw=1, ms=4)
+        axes.plot(place[moments], values[moments], "o", color=COLOURS[1], ms=5.5)
+        axes.set(xlabel="time (s)", ylim=(min(0.0, 1.1 * values.min()), 1.08 * values.max()))
+        axes.set_title(label, fontsize=9, loc="left")
+        if found.equilibrium:
+            axes.axvline(1.065 * end, color="0.8", lw=0.8)
+            ticks = [t for t in axes.get_xticks() if 0 <= t <= 0.9 * end]
+            axes.set_xticks([*ticks, place[-1]], [*(f"{t:g}" for t in ticks), "at rest"])
+            axes.set_xlim(-0.03 * end, 1.22 * end)
+
+
+def closure_words(record: Record[Findings]) -> str:
+    """The summary for readers."""
+    found = record.findings
+    rows = found.rows
     first, last = rows[0], rows[-1]
     return "\n".join(
         [
             "| measure | value |",
             "|---|---|",
-            f"| orifice open | {first['orifice_mm2']:.0f} mm² |",
-            f"| orifice closed | {last['orifice_mm2']:.1f} mm² |",
-            f"| largest passing ball, closed | {last['passing_ball_mm']:.2f} mm |",
+            f"| orifice open | {first.orifice_mm2:.0f} mm² |",
+            f"| orifice closed | {last.orifice_mm2:.1f} mm² |",
+            f"| largest passing ball, closed | {last.passing_ball_mm:.2f} mm |",
             f"| coaptation in the middle (midsurfaces within "
-            f"{record['contact_distance_mm']:.2f} mm) | {last['coaptation_mm']:.1f} mm |",
+            f"{found.contact_distance_mm:.2f} mm) | {last.coaptation_mm:.1f} mm |",
             f"| intersecting leaflet faces, all {len(rows)} stored steps | "
-            f"{sum(r['intersections'] for r in rows)} |",
-            f"| peak chord strain, closed / any step | {100 * last['chord_strain']:.1f} % / "
-            f"{100 * max(r['chord_strain'] for r in rows):.1f} % |",
-            f"| peak chord force, closed | {last['chord_force_n']:.2f} N |",
+            f"{sum(row.intersections for row in rows)} |",
+            f"| peak chord strain, closed / any step | {100 * last.chord_strain:.1f} % / "
+            f"{100 * max(row.chord_strain for row in rows):.1f} % |",
+            f"| peak chord force, closed | {last.chord_force_n:.2f} N |",
             f"| smallest determinant of F, any step | "
-            f"{min(r['smallest_jacobian'] for r in rows):.2f} |",
-            f"| Newton iterations | {last['newton_iterations']} |",
+            f"{min(row.smallest_jacobian for row in rows):.2f} |",
+            f"| Newton iterations | {last.newton_iterations} |",
         ]
     )
 
 
-def closure_text(record: Record) -> str:
-    """The summary for the terminal."""
-    return _summary(record)
-
-
-def write_closure_tables(folder: Path, record: Record) -> list[Path]:
-    """``closure.csv`` (every step) and ``closure.md`` (the summary)."""
-    table = pd.DataFrame(record["rows"])
-    text = f"# {record['title']}\n\n{_summary(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_atomically(folder / "closure.csv", lambda path: table.to_csv(path, index=False)),
-        write_atomically(folder / "closure.md", text),
-    ]
-
-
 def write_closure(
-    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
+    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """Table and words of each closure, and its figure where its frames are still there."""
     written = []
-    for name, run in records.items():
-        record = flat(run)
-        written += write_closure_tables(folder, record)
-        if name in arrays:
-            written += save_figure(folder / "closure", closure_figure(record, arrays[name]), record)
+    for name, record in records.items():
+        figure = closure_figure(record, arrays[name]) if name in arrays else None
+        words = closure_words(record)
+        written += write_report(folder, record, closure_table(record), words, figure)
     return written

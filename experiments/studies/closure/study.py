@@ -3,74 +3,89 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.common.build import closure_model, template_of
-from experiments.common.forward import forward_record, without_nan
-from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.forward import outcome_of
 from experiments.common.progress import SolveBar
-from experiments.common.study import Section, Study
-from experiments.studies.closure.report import closure_text, write_closure
+from experiments.common.record import Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.closure.report import Findings, closure_words, write_closure
 from experiments.studies.closure.settings import Settings
 from mvest.closure.measures import measure_steps
+from mvest.closure.model import ClosureModel, ClosureResult
+from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.embedding import embed
 
-__all__ = ["STUDY", "run_closure_study"]
+__all__ = ["STUDY", "run_closure"]
 
 Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
 
 
-def run_closure_study(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
+def run_closure(job: Job[Settings]) -> Outcome[Findings]:
     """Close the valve once and measure every stored step."""
-    values = np.array(config["truth"]["values"], dtype=float)
-    model = closure_model(config)
+    values = job.values
+    model = closure_model(values)
+    truth = np.array(values["truth"]["values"], dtype=float)
     with SolveBar("closure", len(model.settings.protocol.steps()), 1) as bar:
         model.on_step = bar.step
-        result = model.close(values, sensitivities=False, every_frame=True)
+        result = model.close(truth, sensitivities=False, every_frame=True)
+    contact = model.settings.contact
     thickness = float(model.valve.surface.thickness.mean())
-    distance = (
-        0.5
-        * thickness
-        * (model.settings.contact.reference_distance + model.settings.contact.activation_distance)
+    distance = 0.5 * thickness * (contact.reference_distance + contact.activation_distance)
+    normals = _normals(values)
+    simulation = result.simulation
+    findings = Findings(
+        rows=measure_steps(model, result, distance, normals),
+        contact_distance_mm=distance,
+        equilibrium=model.settings.protocol.equilibrium and simulation.converged,
     )
-    observed = config["observation"]
-    normals = _normals(config, observed["columns"], observed["rows"])
-    steps = measure_steps(model, result, distance, normals)
-    record = forward_record(config, config_hash, model, values, started, 1)
-    record |= {"rows": [without_nan(asdict(s)) for s in steps], "contact_distance_mm": distance}
-    if not result.simulation.converged:
-        record |= {"status": "failed", "reason": result.simulation.reason.value}
-    surface = thicken(model.valve.surface, normals)
+    _write_fields(job.folder / "fields.npz", model, result, normals)
+    failed = () if simulation.converged else (simulation.reason.value,)
+    return outcome_of(findings, model.mesh, 1, failed)
+
+
+def _write_fields(
+    path: Path, model: ClosureModel, result: ClosureResult, normals: FloatArray
+) -> None:
+    """What the picture shows of each stored step: thick leaflets, chordae and papillary tips."""
+    valve, simulation = model.valve, result.simulation
+    surface = thicken(valve.surface, normals)
     faces = embed(model.mesh, surface.vertices)
-    frames = np.stack([faces(x) for x in result.simulation.frames])
-    fields = folder / "fields.npz"
+    loading = boundary_loading(result.system, valve, model.contact_valve, model.settings)
+    cables = result.system.cables
+    assert cables is not None
     np.savez_compressed(
-        fields,
-        frames=frames.astype(np.float32),
-        times=result.simulation.times,
+        path,
+        frames=np.stack([faces(x) for x in simulation.frames]).astype(np.float32),
+        times=simulation.times,
         triangles=surface.triangles.astype(np.int32),
         region=surface.region.astype(np.int8),
+        # Along the atrial faces.
+        annulus=valve.annulus + len(valve.surface.vertices),
+        tips=np.stack([loading(float(t)).tips for t in simulation.times]).astype(np.float32),
+        chord_end=np.stack([cables.patches(x) for x in simulation.frames]).astype(np.float32),
+        chord_tip=cables.tip,
     )
-    return record, []
 
 
-def _normals(config: Values, columns: int, rows: int) -> FloatArray:
+def _normals(values: Values) -> FloatArray:
+    """Directions ``(n, 3)`` of the thickness at the observed vertices."""
+    columns, rows = (values["observation"][key] for key in ("columns", "rows"))
     j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    return template_of(config).normal(360.0 * i / columns, j / (rows - 1))
+    return template_of(values).normal(360.0 * i / columns, j / (rows - 1))
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_closure_study),
-    words=lambda record: closure_text(flat(record)),
+    findings=Findings,
+    run=run_closure,
+    words=closure_words,
     write=write_closure,
     sections=(Section("closure", {"closure": "A valve closing. Simulated."}, validation=True),),
 )

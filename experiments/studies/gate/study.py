@@ -3,59 +3,60 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments.common.build import closure_model
-from experiments.common.forward import forward_record, without_nan
-from experiments.common.plain import Plain, each, flat, plain_run
-from experiments.common.study import Section, Study
-from experiments.studies.gate.report import gate_text, write_gate_tables
+from experiments.common.forward import outcome_of
+from experiments.common.record import Outcome
+from experiments.common.report import write_each
+from experiments.common.study import Job, Section, Study
+from experiments.studies.gate.findings import Findings, Limits, Row
+from experiments.studies.gate.report import gate_table, gate_words
 from experiments.studies.gate.settings import Settings
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateRow, run_gate
 
 __all__ = ["STUDY", "run_gate_study"]
 
-Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
 
-
-def run_gate_study(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
+def run_gate_study(job: Job[Settings]) -> Outcome[Findings]:
     """Close the valve under every variation of the gate."""
+    values = job.values
+    report = run_gate(
+        lambda case: closure_model(values, case),
+        np.array(values["truth"]["values"], dtype=float),
+        on_case=_say,
+    )
+    rows = tuple(Row.of(row) for row in report.rows)
+    findings = Findings(
+        passed=report.passed,
+        rows=rows,
+        slopes=report.slopes,
+        limits=Limits(MEAN_LIMIT, MAX_LIMIT, SLOPE_LIMIT),
+    )
+    reference = rows[0]
+    return outcome_of(
+        findings,
+        closure_model(values).mesh,
+        len(rows),
+        () if reference.passed else (reference.reason,),
+    )
 
-    def tell(row: GateRow) -> None:
-        print(
-            f"{row.case}: mean {row.mean_mm:.3g} mm, max {row.max_mm:.3g} mm, "
-            f"{row.seconds:.0f} s, {row.reason}",
-            file=sys.stderr,
-            flush=True,
-        )
 
-    values = np.array(config["truth"]["values"], dtype=float)
-    reference = closure_model(config)
-    report = run_gate(lambda case: closure_model(config, case), values, on_case=tell)
-    rows = [without_nan(asdict(row)) for row in report.rows]
-    record = forward_record(config, config_hash, reference, values, started, len(rows))
-    record |= {
-        "passed": report.passed,
-        "rows": rows,
-        "slopes": {str(step): value for step, value in report.slopes.items()},
-        "limits": {"mean_mm": MEAN_LIMIT, "max_mm": MAX_LIMIT, "slope": SLOPE_LIMIT},
-    }
-    if not rows[0]["passed"]:
-        record |= {"status": "failed", "reason": rows[0]["reason"]}
-    return record, []
+def _say(row: GateRow) -> None:
+    print(
+        f"{row.case}: mean {row.mean_mm:.3g} mm, max {row.max_mm:.3g} mm, "
+        f"{row.seconds:.0f} s, {row.reason}",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_gate_study),
-    words=lambda record: gate_text(flat(record)),
-    write=each(write_gate_tables),
+    findings=Findings,
+    run=run_gate_study,
+    words=lambda record: gate_words(record).replace("**", ""),
+    write=write_each(gate_table, gate_words),
     sections=(Section("gate", validation=True),),
 )

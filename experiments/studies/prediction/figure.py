@@ -17,9 +17,12 @@ from matplotlib.patches import Patch
 from mvest.errors import InputError
 from mvest.reporting.case.drawing import (
     ATRIUM,
+    BLOOD,
+    TISSUE,
     draw_valve,
     leaflet_colours,
     name_leaflets,
+    paint_gap,
     same_scale,
 )
 from mvest.reporting.case.fields import CaseFields
@@ -40,8 +43,6 @@ PANELS = (
     ("stress_p99_anterior_mpa", "stress, anterior,\n99th percentile (MPa)"),
     ("stress_p99_posterior_mpa", "stress, posterior,\n99th percentile (MPa)"),
 )
-BLOOD = (0.70, 0.05, 0.10)
-TISSUE = (0.80, 0.76, 0.72)
 OTHER = "0.55"
 
 
@@ -112,7 +113,7 @@ def _draw_valves(
             continue
         gap, origin = _gap(valve, shape, record["reach_mm"])
         draw_valve(panel, valve, shape, colours, ATRIUM, 0)
-        _paint(panel, gap, origin)
+        paint_gap(panel, gap, origin)
         area = found[name]["measures"]["gap_mm2"]["estimate"]
         panel.set_title(f"{title}\ngap {area:.1f} mm²", fontsize=10)
     name_leaflets(panels[0], valve, ("anterior", "posterior"))
@@ -136,26 +137,6 @@ def _gap(valve: CaseFields, shape: FloatArray, reach: float) -> tuple[Gap, Float
     own = valve.vertex_region[valve.annulus] == 0
     plane = annulus_plane(annulus, valve.tips[0].mean(axis=0), annulus[own].mean(axis=0))
     return find_gap(shape, valve.triangles, annulus, plane, reach), plane.origin
-
-
-def _paint(panel: Any, gap: Gap, origin: FloatArray) -> None:
-    """The gap and the slit as an image over the valve, in its coordinates."""
-    image = np.zeros((*gap.open.shape, 4))
-    image[gap.slit] = (*TISSUE, 1.0)
-    image[gap.open] = (*BLOOD, 1.0)
-    half = 0.5 * gap.resolution
-    panel.imshow(
-        image,
-        extent=(
-            origin[0] + gap.lateral[0] - half,
-            origin[0] + gap.lateral[-1] + half,
-            origin[1] + gap.anterior[0] - half,
-            origin[1] + gap.anterior[-1] + half,
-        ),
-        origin="lower",
-        interpolation="nearest",
-        zorder=3,
-    )
 
 
 # -- measures -------------------------------------------------------------------------------------

@@ -16,24 +16,32 @@ from matplotlib.collections import PolyCollection
 from mvest.reporting.case.fields import CaseFields
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
+from mvest.valve.measure.gap import Gap
 
 __all__ = [
     "ATRIUM",
+    "BLOOD",
     "LEAFLET_COLOURS",
     "LINE_PIECES",
     "SIDE",
+    "TISSUE",
     "UNSEEN",
     "VIEWS",
     "View",
     "draw_valve",
     "leaflet_colours",
     "name_leaflets",
+    "paint_gap",
     "quartered",
     "same_scale",
 ]
 
 LEAFLET_COLOURS = np.array([[0.87, 0.57, 0.49], [0.50, 0.66, 0.86], [0.58, 0.77, 0.57]])
 """Of the leaflets in the order of their regions, light enough to be shaded."""
+BLOOD = (0.70, 0.05, 0.10)
+"""Of a gap."""
+TISSUE = (0.80, 0.76, 0.72)
+"""Of the slit between midsurfaces that touch, a thickness apart."""
 UNSEEN = np.array([0.75, 0.75, 0.75])
 LINE = np.array([0.10, 0.10, 0.10])
 CHORD = np.array([0.45, 0.42, 0.40])
@@ -199,6 +207,29 @@ def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
         np.repeat(seen[:, 2], len(disc)),
         np.tile(colour, (count, 1)),
         np.full(count, 0.3),
+    )
+
+
+def paint_gap(axes: Any, gap: Gap, origin: FloatArray) -> None:
+    """Draw what is open of a valve seen from the atrium, and the slit where leaflets touch.
+
+    ``origin (3,)`` mm is that of the gap's coordinates: its annulus plane's.
+    """
+    image = np.zeros((*gap.open.shape, 4))
+    image[gap.slit] = (*TISSUE, 1.0)
+    image[gap.open] = (*BLOOD, 1.0)
+    half = 0.5 * gap.resolution
+    axes.imshow(
+        image,
+        extent=(
+            origin[0] + gap.lateral[0] - half,
+            origin[0] + gap.lateral[-1] + half,
+            origin[1] + gap.anterior[0] - half,
+            origin[1] + gap.anterior[-1] + half,
+        ),
+        origin="lower",
+        interpolation="nearest",
+        zorder=3,
     )
 
 
