@@ -95,7 +95,11 @@ def closure_figure(record: Record[Findings], fields: Path) -> Figure:
     parts: Any = figure.subfigures(2, 1, height_ratios=[2.2, 1.0])
     _draw_moments(parts[0], valve, shapes, found, moments)
     _draw_curves(parts[1], found, moments)
-    figure.suptitle("A simulated valve closing, from the atrium and from the posterior side")
+    figure.suptitle(
+        "A simulated valve closing, from the atrium and from the posterior side"
+        " (dots: the moments shown)",
+        fontsize=11,
+    )
     return figure
 
 
@@ -162,7 +166,8 @@ def _draw_curves(part: Any, found: Findings, moments: list[int]) -> None:
         values = scale * table[name].to_numpy()
         axes.plot(moving.time, values[: len(moving)], ".-", color="black", lw=1, ms=4)
         axes.plot(place[moments], values[moments], "o", color=COLOURS[1], ms=5.5)
-        axes.set(xlabel="time (s)", ylim=(min(0.0, 1.1 * values.min()), 1.08 * values.max()))
+        axes.set_xlabel("time (s)")
+        axes.set_ylim(bottom=min(0.0, 1.1 * values.min()))
         axes.set_title(label, fontsize=9, loc="left")
         if found.equilibrium:
             axes.axvline(1.065 * end, color="0.8", lw=0.8)

@@ -73,5 +73,5 @@ class Findings:
 
     passed: bool
     rows: tuple[Row, ...]
-    slopes: Mapping[float, float]
+    slopes: Mapping[str, float]
     limits: Limits

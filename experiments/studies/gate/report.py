@@ -29,7 +29,7 @@ def gate_words(record: Record[Findings]) -> str:
         verdict = "yes" if row.passed else f"no: {row.reason}"
         lines.append(f"| {row.case} | {mean} | {largest} | {verdict} | {row.seconds:.0f} |")
     slopes = ", ".join(
-        f"{100 * difference:.2g} % at a step of {100 * step:g} %"
+        f"{100 * difference:.2g} % at a step of {100 * float(step):g} %"
         for step, difference in found.slopes.items()
     )
     lines += [

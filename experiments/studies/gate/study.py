@@ -31,7 +31,7 @@ def run_gate_study(job: Job[Settings]) -> Outcome[Findings]:
     findings = Findings(
         passed=report.passed,
         rows=rows,
-        slopes=report.slopes,
+        slopes={str(step): difference for step, difference in report.slopes.items()},
         limits=Limits(MEAN_LIMIT, MAX_LIMIT, SLOPE_LIMIT),
     )
     reference = rows[0]
