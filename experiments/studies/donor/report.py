@@ -13,22 +13,21 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from experiments.common.plain import Plain, flat
-from experiments.common.record import Record as Run
+from experiments.common.record import Record
+from experiments.studies.donor.findings import Distances, Findings
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure
-from mvest.reporting.files import provenance_line
+from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure_with
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["donor_figure", "donor_text", "write_donor"]
-
-Record = Mapping[str, Any]
+__all__ = ["donor_figure", "donor_table", "donor_words", "write_donor"]
 
 PLAIN = np.array([0.82, 0.80, 0.76])
 """Colour of the recorded valve, which has no distance from itself."""
 LIGHT = np.array([0.30, 0.50, 0.81])
 MISSING = "–"
+WHOLE = ("mean", "median", "rms", "max", "surface")
+"""Distances of the whole valve."""
 
 
 def donor_figure(fields: Path) -> Figure:
@@ -103,86 +102,97 @@ def _draw(
     axes.set_axis_off()
 
 
-def _frame(record: Record) -> pd.DataFrame:
+def donor_table(record: Record[Findings]) -> pd.DataFrame:
     """One row for each closure: the generic one, then the fit from each start."""
     rows = []
-    for row in record["rows"]:
-        plain: dict[str, Any] = {"closure": row["closure"]}
-        for key in ("start", "estimate", "std"):
-            values = row[key] or [None] * len(record["parameters"])
+    for row in record.findings.rows:
+        plain: dict[str, Any] = {"closure": row.closure}
+        for key, values in (("start", row.start), ("estimate", row.estimate), ("std", row.std)):
+            shown = values or [None] * len(record.parameters)
             plain |= {
                 f"{key} {name} [MPa]": value
-                for name, value in zip(record["parameters"], values, strict=True)
+                for name, value in zip(record.parameters, shown, strict=True)
             }
-        distance = row["distance_mm"] or {}
-        for part in ("mean", "median", "rms", "max", "surface", *record["regions"]):
-            plain[f"distance {part} [mm]"] = distance.get(part)
-        for key in ("iterations", "forward_solves", "equilibria", "seconds", "reason"):
-            plain[key.replace("_", " ")] = row[key]
+        distances = _whole(row.distance_mm)
+        if row.distance_mm is not None:
+            distances |= row.distance_mm.leaflets
+        for part in (*WHOLE, *record.findings.regions):
+            plain[f"distance {part} [mm]"] = distances.get(part)
+        plain |= {
+            "iterations": row.iterations,
+            "forward solves": row.forward_solves,
+            "equilibria": row.equilibria,
+            "seconds": row.seconds,
+            "reason": row.reason,
+        }
         rows.append(plain)
     return pd.DataFrame(rows)
 
 
-def _readable(record: Record) -> str:
+def _whole(distance: Distances | None) -> dict[str, float]:
+    """Distances of the whole valve by name; none of a closure that failed."""
+    if distance is None:
+        return {}
+    values = (distance.mean, distance.median, distance.rms, distance.max, distance.surface)
+    return dict(zip(WHOLE, values, strict=True))
+
+
+def donor_words(record: Record[Findings]) -> str:
     """Markdown of the table, with the words that go with it."""
-    names = [name.partition(".")[2] for name in record["parameters"]]
+    found = record.findings
+    names = [name.partition(".")[2] for name in record.parameters]
     head = [
         "closure",
         *(f"E {name} [MPa]" for name in names),
-        "mean [mm]",
-        "median [mm]",
-        "rms [mm]",
-        "max [mm]",
-        "surface [mm]",
+        *(f"{part} [mm]" for part in WHOLE),
         "forward solves",
         "equilibria",
         "time [s]",
         "ended",
     ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for row in record["rows"]:
-        values = row["estimate"] or row["start"]
-        std = row["std"] or [None] * len(names)
-        cells = [row["closure"]]
-        cells += [
-            f"{v:.3g}" if s is None else f"{v:.3g} ± {s:.2g}"
-            for v, s in zip(values, std, strict=True)
-        ]
-        distance = row["distance_mm"] or {}
-        for part in ("mean", "median", "rms", "max", "surface"):
-            cells.append(f"{distance[part]:.2f}" if part in distance else MISSING)
-        cells += [
-            str(row["forward_solves"]),
-            str(row["equilibria"]),
-            f"{row['seconds']:.0f}",
-            row["reason"].split(":")[0],
+    for row in found.rows:
+        values = row.estimate or row.start
+        std = row.std or [None] * len(names)
+        distances = _whole(row.distance_mm)
+        cells = [
+            row.closure,
+            *(
+                f"{v:.3g}" if s is None else f"{v:.3g} ± {s:.2g}"
+                for v, s in zip(values, std, strict=True)
+            ),
+            *(f"{distances[part]:.2f}" if part in distances else MISSING for part in WHOLE),
+            str(row.forward_solves),
+            str(row.equilibria),
+            f"{row.seconds:.0f}",
+            row.reason.split(":")[0],
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    summary = record["summary"]
-    spread = summary["largest_difference_between_starts"]
-    lines += ["", record["claim"], "", f"Data: {record['data']['citation']}."]
+    summary = found.summary
+    spread = summary.largest_difference_between_starts
+    lines += ["", found.claim, "", f"Data: {found.data.citation}."]
     facts = [
         f"Mean motion of the leaflets between the open and the recorded closed frame: "
-        f"{summary['recorded_motion_mm']:.2f} mm."
+        f"{summary.recorded_motion_mm:.2f} mm."
     ]
     if spread is not None:
         facts.append(
-            f"Largest relative difference between the moduli from the {summary['starts']} starts: "
+            f"Largest relative difference between the moduli from the {summary.starts} starts: "
             f"{100 * spread:.2g} %."
         )
-    if summary["closer_than_generic"] is not None:
-        verdict = "nearer to" if summary["closer_than_generic"] else "NOT nearer to"
+    if summary.closer_than_generic is not None:
+        verdict = "nearer to" if summary.closer_than_generic else "NOT nearer to"
         facts.append(
             f"The fitted closure is {verdict} the recording than the generic one: mean distance "
-            f"{summary['generic_mean_mm']:.2f} → {summary['fitted_mean_mm']:.2f} mm "
-            f"({summary['closer_percent']:.0f} % less) of the vertices from where they were "
-            f"recorded, {summary['generic_surface_mm']:.2f} → "
-            f"{summary['fitted_surface_mm']:.2f} mm of the whole surface from the recorded one, "
+            f"{summary.generic_mean_mm:.2f} → {summary.fitted_mean_mm:.2f} mm "
+            f"({summary.closer_percent:.0f} % less) of the vertices from where they were "
+            f"recorded, {summary.generic_surface_mm:.2f} → "
+            f"{summary.fitted_surface_mm:.2f} mm of the whole surface from the recorded one, "
             "both ways."
         )
-    facts.append(f"{record['seconds']:.0f} s and {record['memory_mb']:.0f} MB.")
-    bound = (record["identifiability"] or {}).get("cramer_rao_std")
-    if bound:
+    facts.append(f"{found.seconds:.0f} s and {found.memory_mb:.0f} MB.")
+    if found.identifiability is not None:
+        bound = found.identifiability.cramer_rao_std
         alone = ", ".join(MISSING if v is None else f"{v:.2g}" for v in bound)
         facts.append(
             "The ± are the filter's standard deviations, prior included; the data alone would "
@@ -192,38 +202,26 @@ def _readable(record: Record) -> str:
     return "\n".join([*lines, "", " ".join(facts)])
 
 
-def donor_text(record: Record) -> str:
-    """The table for the terminal."""
-    return _readable(record)
-
-
-def write_donor_tables(folder: Path, record: Record) -> list[Path]:
-    """Write ``donor.csv`` and ``donor.md``; returns their paths.
+def write_donor(
+    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table of each run, and its picture where its surfaces are still there.
 
     Raises
     ------
     InputError
-        If a file cannot be written.
+        If a file cannot be written, or the surfaces cannot be read.
     """
-    line = provenance_line(record)
-    table = _frame(record).to_csv(index=False, float_format="%.6g")
-    title = f"# {record['title']}"
-    text = f"{title}\n\n{_readable(record)}\n\n<sub>{line}</sub>\n"
-    note = f"# {record['claim']}\n# data: {record['data']['citation']}\n# {line}\n"
-    return [
-        write_atomically(folder / "donor.csv", note + table),
-        write_atomically(folder / "donor.md", text),
-    ]
-
-
-def write_donor(
-    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Table of each run, and its picture where its surfaces are still there."""
     written = []
-    for name, run in records.items():
-        record = flat(run)
-        written += write_donor_tables(folder, record)
+    for name, record in records.items():
+        found, base = record.findings, folder / record.experiment
+        table = donor_table(record).to_csv(index=False, float_format="%.6g")
+        text = f"# {record.title}\n\n{donor_words(record)}\n\n<sub>{record.line}</sub>\n"
+        note = f"# {found.claim}\n# data: {found.data.citation}\n# {record.line}\n"
+        written += [
+            write_atomically(base.with_suffix(".csv"), note + table),
+            write_atomically(base.with_suffix(".md"), text),
+        ]
         if name in arrays:
-            written += save_figure(folder / "donor", donor_figure(arrays[name]), record)
+            written += save_figure_with(base, donor_figure(arrays[name]), record.line)
     return written

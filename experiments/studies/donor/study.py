@@ -13,18 +13,27 @@ import time
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of
-from experiments.common.estimate_record import make_record
-from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import SolveBar
-from experiments.common.study import Section, Study
-from experiments.studies.donor.report import donor_figure, donor_text, write_donor
-from experiments.studies.donor.settings import Settings
+from experiments.common.record import Mesh, Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.donor.findings import (
+    Data,
+    Distances,
+    Findings,
+    Identified,
+    Innovation,
+    Modulus,
+    Row,
+    Spread,
+    Summary,
+)
+from experiments.studies.donor.report import donor_words, write_donor
+from experiments.studies.donor.settings import DonorSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -37,7 +46,6 @@ from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Problem
-from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
 from mvest.valve.io.donor.arrays import CITATION, donor_file
 from mvest.valve.io.donor.recording import DonorRecording, read_donor
@@ -116,7 +124,7 @@ class DonorStudy:
         )
 
 
-def build_donor(config: Values) -> DonorStudy:
+def build_donor(config: Values, donor: DonorSettings) -> DonorStudy:
     """Read, mesh and load the recorded valve as configured.
 
     Raises
@@ -125,17 +133,16 @@ def build_donor(config: Values) -> DonorStudy:
         If the data are absent (the message says where to get them) or a setting is inadmissible.
     """
     parameters = tuple(config["parameters"])
-    donor = config["donor"]
     filter_, transform, prior = build_filter(config["filter"], parameters)
     if not isinstance(filter_, IteratedFilter):
         raise ConfigurationError(
             f"filter.mode = {config['filter']['mode']!r}: a recorded valve needs the iterated "
             "filter, whose result does not depend on the start by construction"
         )
-    starts = [np.array(start, dtype=float) for start in donor["starts"]]
+    starts = [np.array(start, dtype=float) for start in donor.starts]
     if not starts or any(start.shape != prior.mean.shape for start in starts):
         raise ConfigurationError(
-            f"donor.starts = {donor['starts']}, expected lists of {len(parameters)} moduli each"
+            f"donor.starts = {list(donor.starts)}, expected lists of {len(parameters)} moduli each"
         )
     settings = mechanics_of(config)
     recording = read_donor(config["paths"]["donor"])
@@ -145,8 +152,8 @@ def build_donor(config: Values) -> DonorStudy:
             f"parameters = {list(parameters)}, expected one modulus for each leaflet: {unknown}"
         )
     coarse, contact = (
-        remesh(recording.surface, recording.annulus, recording.free_edge, donor[key])
-        for key in ("vertices", "contact_vertices")
+        remesh(recording.surface, recording.annulus, recording.free_edge, vertices)
+        for vertices in (donor.vertices, donor.contact_vertices)
     )
     mesh = layered_wedges(
         coarse.surface,
@@ -168,69 +175,102 @@ def build_donor(config: Values) -> DonorStudy:
         Observation(("closed",), seen[None], np.asarray(config["filter"]["R"])),
         tuple(starts),
         config["continuation"],
-        donor["largest_change"],
+        donor.largest_change,
     )
 
 
-def run_donor(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Fit the recorded valve from every start: the record, and the picture in ``folder``."""
-    study = build_donor(config)
+def run_donor(job: Job[Settings]) -> Outcome[Findings]:
+    """Fit the recorded valve from every start.
+
+    Raises
+    ------
+    MvestError
+        If the data are absent (the message says where to get them) or a setting is inadmissible.
+    """
+    study = build_donor(job.values, job.settings.donor)
     fits = _fit(study)
-    generic, results = fits.generic, list(fits.results)
-    first = results[0]
-    record = make_record(
-        first,
-        {**config, "filter": {**config["filter"], "initial": study.starts[0].tolist()}},
-        config_hash=config_hash,
-        meshes={
-            "sha256": study.mesh.sha256,
-            "nodes": len(study.mesh.nodes),
-            "elements": len(study.mesh.elements),
-        },
-        closure=None,
-        truth_values=None,
-        started=started,
-    )
-    rows = [_generic_row(study, fits)]
-    rows += [
-        _fit_row(f"fitted, start {k + 1}", study, start, result)
-        | {"equilibria": fits.equilibria[k]}
-        for k, (start, result) in enumerate(zip(study.starts, results, strict=True))
+    first = fits.results[0]
+    generic = _generic_row(study, fits)
+    fitted = [
+        _fit_row(f"fitted, start {k + 1}", study, start, result, equilibria)
+        for k, (start, result, equilibria) in enumerate(
+            zip(study.starts, fits.results, fits.equilibria, strict=True)
+        )
     ]
-    record |= {
-        "claim": CLAIM,
-        "data": {
-            "citation": CITATION,
-            "sha256": hashlib.sha256(donor_file(config["paths"]["donor"]).read_bytes()).hexdigest(),
-        },
-        "regions": list(study.recording.surface.region_names),
-        "rows": rows,
-        "summary": _summary(study, rows, results),
-        "forward_solves": sum(row["forward_solves"] for row in rows),
-        "seconds": sum(row["seconds"] for row in rows),
-        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-    }
-    failed = [row for row in rows if row["status"] != "converged"]
-    if failed:
-        record |= {"status": "failed", "reason": f"{failed[0]['closure']}: {failed[0]['reason']}"}
-    files: list[Path] = []
-    if generic.converged and first.fitted is not None:
-        fields = folder / "fields.npz"
+    rows = (generic, *fitted)
+    if fits.generic.converged and first.fitted is not None:
         np.savez_compressed(
-            fields,
+            job.folder / "fields.npz",
             triangles=study.coarse.surface.triangles,
             region=study.coarse.surface.region,
             annulus=study.coarse.annulus,
             free_edge=study.coarse.free_edge,
             rest=study.coarse.surface.vertices,
             recorded=study.observation.positions[-1],
-            generic=_closed(generic),
+            generic=_closed(fits.generic),
             fitted=first.fitted[-1],
         )
-        files += save_figure(folder / "donor", donor_figure(fields), record)
-    return record, files
+    recording = donor_file(job.values["paths"]["donor"]).read_bytes()
+    filtered = first.filtered
+    findings = Findings(
+        estimate=_of(first.estimate),
+        std=_of(first.std),
+        iterates=None if filtered is None else _rows(filtered.iterates),
+        iterate_std=None if filtered is None else _rows(filtered.iterate_std),
+        moduli=tuple(Modulus(m.region, m.name, m.estimate, m.std) for m in first.moduli),
+        distance_mm=_spread(first),
+        innovation=_innovation(first),
+        identifiability=_identified(first),
+        iterations=0 if filtered is None else filtered.iterations,
+        seconds=sum(row.seconds for row in rows),
+        memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        claim=CLAIM,
+        data=Data(CITATION, hashlib.sha256(recording).hexdigest()),
+        regions=tuple(study.recording.surface.region_names),
+        rows=rows,
+        summary=_summary(study, generic, fitted),
+    )
+    failed = next((row for row in rows if row.status != "converged"), None)
+    return Outcome(
+        findings=findings,
+        status="converged" if failed is None else "failed",
+        reason=first.reason if failed is None else f"{failed.closure}: {failed.reason}",
+        detail=first.detail,
+        mesh=Mesh(study.mesh.sha256, len(study.mesh.nodes), len(study.mesh.elements)),
+        forward_solves=sum(row.forward_solves for row in rows),
+    )
+
+
+def _of(values: FloatArray | None) -> tuple[float, ...] | None:
+    return None if values is None else tuple(values.tolist())
+
+
+def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, np.asarray(values).tolist()))
+
+
+def _spread(result: StudyResult) -> Spread | None:
+    d = result.distance
+    return None if d is None else Spread(float(d.mean()), float(d.std()), float(d.max()))
+
+
+def _innovation(result: StudyResult) -> Innovation | None:
+    found = None if result.filtered is None else result.filtered.innovation
+    if found is None:
+        return None
+    return Innovation(found.size, found.rms, found.max_abs, found.nis, found.nis_band)
+
+
+def _identified(result: StudyResult) -> Identified | None:
+    found = result.identifiability
+    if found is None:
+        return None
+    condition = found.condition_number
+    return Identified(
+        tuple(float(v) if np.isfinite(v) else None for v in found.std),
+        float(condition) if np.isfinite(condition) else None,
+        tuple(found.flat()),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,99 +328,94 @@ def _closed(prediction: Prediction) -> FloatArray:
     return prediction.y.reshape(2, -1, 3)[1]
 
 
-def _distances(study: DonorStudy, closed: FloatArray) -> dict[str, float]:
-    """Distances (mm) from the recording, in numbers.
-
-    Of the vertices from where they were recorded, but for ``surface``: the mean distance of the
-    whole closed surface from the recorded one, both ways, whatever its points are.
-    """
+def _distances(study: DonorStudy, closed: FloatArray) -> Distances:
+    """Distances of closed positions ``(n, 3)`` mm from the recording."""
     d = np.linalg.norm(closed - study.observation.positions[-1], axis=1)
     surface = study.coarse.surface
-    leaflets = {
-        name: float(d[np.unique(surface.triangles[surface.region == k])].mean())
-        for k, name in enumerate(surface.region_names)
-    }
-    return {
-        "mean": float(d.mean()),
-        "median": float(np.median(d)),
-        "rms": float(np.sqrt(np.mean(d**2))),
-        "max": float(d.max()),
-        "surface": mean_surface_distance(
+    return Distances(
+        float(d.mean()),
+        float(np.median(d)),
+        float(np.sqrt(np.mean(d**2))),
+        float(d.max()),
+        mean_surface_distance(
             closed,
             surface.triangles,
             study.recording.frames[-1],
             study.recording.surface.triangles,
         ),
-        **leaflets,
-    }
+        {
+            name: float(d[np.unique(surface.triangles[surface.region == k])].mean())
+            for k, name in enumerate(surface.region_names)
+        },
+    )
 
 
-def _generic_row(study: DonorStudy, fits: Fits) -> dict[str, Any]:
-    found = fits.generic
-    return {
-        "closure": "generic",
-        "status": "converged" if found.converged else "failed",
-        "reason": "closed" if found.converged else found.reason,
-        "start": study.prior.mean.tolist(),
-        "estimate": None,
-        "std": None,
-        "distance_mm": _distances(study, _closed(found)) if found.converged else None,
-        "iterations": 0,
-        "forward_solves": 1,
-        "equilibria": 1,
-        "seconds": fits.seconds,
-    }
+def _generic_row(study: DonorStudy, fits: Fits) -> Row:
+    closed = fits.generic
+    return Row(
+        closure="generic",
+        status="converged" if closed.converged else "failed",
+        reason="closed" if closed.converged else closed.reason,
+        start=tuple(study.prior.mean.tolist()),
+        estimate=None,
+        std=None,
+        distance_mm=_distances(study, _closed(closed)) if closed.converged else None,
+        iterations=0,
+        forward_solves=1,
+        equilibria=1,
+        seconds=fits.seconds,
+    )
 
 
 def _fit_row(
-    name: str, study: DonorStudy, start: FloatArray, result: StudyResult
-) -> dict[str, Any]:
-    fitted = result.fitted
-    filtered = result.filtered
-    return {
-        "closure": name,
-        "status": "converged" if result.converged else "failed",
-        "reason": result.reason,
-        "start": start.tolist(),
-        "estimate": None if result.estimate is None else result.estimate.tolist(),
-        "std": None if result.std is None else result.std.tolist(),
-        "distance_mm": None if fitted is None else _distances(study, fitted[-1]),
-        "iterations": 0 if filtered is None else filtered.iterations,
-        "forward_solves": 0 if filtered is None else filtered.forward_solves,
-        "seconds": result.seconds,
-    }
+    name: str, study: DonorStudy, start: FloatArray, result: StudyResult, equilibria: int
+) -> Row:
+    fitted, filtered = result.fitted, result.filtered
+    return Row(
+        closure=name,
+        status="converged" if result.converged else "failed",
+        reason=result.reason,
+        start=tuple(start.tolist()),
+        estimate=_of(result.estimate),
+        std=_of(result.std),
+        distance_mm=None if fitted is None else _distances(study, fitted[-1]),
+        iterations=0 if filtered is None else filtered.iterations,
+        forward_solves=0 if filtered is None else filtered.forward_solves,
+        equilibria=equilibria,
+        seconds=result.seconds,
+    )
 
 
-def _summary(
-    study: DonorStudy, rows: list[dict[str, Any]], results: list[StudyResult]
-) -> dict[str, Any]:
+def _summary(study: DonorStudy, generic_row: Row, fitted_rows: list[Row]) -> Summary:
     """What the run is for, in numbers."""
-    estimates = [r.estimate for r in results if r.estimate is not None]
+    estimates = [row.estimate for row in fitted_rows if row.estimate is not None]
     spread = None
-    if len(estimates) == len(results) and len(results) > 1:
+    if len(estimates) == len(fitted_rows) > 1:
         spread = float(np.max(np.ptp(np.array(estimates), axis=0) / np.mean(estimates, axis=0)))
-    generic, fitted = (rows[k]["distance_mm"] for k in (0, 1))
-    means = [None if d is None else d["mean"] for d in (generic, fitted)]
-    open_ = study.coarse.surface.vertices
-    motion = np.linalg.norm(study.observation.positions[-1] - open_, axis=1)
-    return {
-        "starts": len(results),
-        "largest_difference_between_starts": spread,
-        "recorded_motion_mm": float(motion.mean()),
-        "generic_mean_mm": means[0],
-        "fitted_mean_mm": means[1],
-        "closer_percent": None if None in means else 100.0 * (means[0] - means[1]) / means[0],  # type: ignore[operator]
-        "generic_surface_mm": None if generic is None else generic["surface"],
-        "fitted_surface_mm": None if fitted is None else fitted["surface"],
-        "closer_than_generic": None if None in means else bool(means[1] < means[0]),  # type: ignore[operator]
-    }
+    generic, fitted = generic_row.distance_mm, fitted_rows[0].distance_mm
+    motion = np.linalg.norm(study.observation.positions[-1] - study.coarse.surface.vertices, axis=1)
+    return Summary(
+        starts=len(fitted_rows),
+        largest_difference_between_starts=spread,
+        recorded_motion_mm=float(motion.mean()),
+        generic_mean_mm=None if generic is None else generic.mean,
+        fitted_mean_mm=None if fitted is None else fitted.mean,
+        closer_percent=None
+        if generic is None or fitted is None
+        else 100.0 * (generic.mean - fitted.mean) / generic.mean,
+        generic_surface_mm=None if generic is None else generic.surface,
+        fitted_surface_mm=None if fitted is None else fitted.surface,
+        closer_than_generic=None
+        if generic is None or fitted is None
+        else fitted.mean < generic.mean,
+    )
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_donor),
-    words=lambda record: donor_text(flat(record)),
+    findings=Findings,
+    run=run_donor,
+    words=donor_words,
     write=write_donor,
     sections=(
         Section("donor", {"donor": "A recorded donor tricuspid valve and closures of its model."}),

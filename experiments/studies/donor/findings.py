@@ -1,0 +1,230 @@
+"""Findings of the fit of a recorded valve; moduli and their standard deviations in MPa."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from experiments.common.record import Status
+
+__all__ = [
+    "Data",
+    "Distances",
+    "Findings",
+    "Identified",
+    "Innovation",
+    "Modulus",
+    "Row",
+    "Spread",
+    "Summary",
+]
+
+Vector = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """Distances from the recording, in mm.
+
+    Attributes
+    ----------
+    mean, median, rms, max : float
+        Of the vertices from where they were recorded.
+    surface : float
+        Mean of the whole closed surface from the recorded one, both ways, whatever its points are.
+    leaflets : mapping
+        Leaflet -> mean of its vertices.
+    """
+
+    mean: float
+    median: float
+    rms: float
+    max: float
+    surface: float
+    leaflets: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One closure: with generic moduli, or fitted from one start.
+
+    Attributes
+    ----------
+    closure : str
+    status : {"converged", "failed"}
+    reason : str
+    start : (p,)
+    estimate, std : (p,) or None
+    distance_mm : Distances or None
+    iterations, forward_solves : int
+    equilibria : int
+        Closed states that it went through.
+    seconds : float
+    """
+
+    closure: str
+    status: Status
+    reason: str
+    start: Vector
+    estimate: Vector | None
+    std: Vector | None
+    distance_mm: Distances | None
+    iterations: int
+    forward_solves: int
+    equilibria: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """The recording.
+
+    Attributes
+    ----------
+    citation, sha256 : str
+    """
+
+    citation: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Distances of the vertices of the first fit from the recording, in mm.
+
+    Attributes
+    ----------
+    mean, std, max : float
+    """
+
+    mean: float
+    std: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True)
+class Modulus:
+    """One modulus of a leaflet, estimated or following from one that is.
+
+    Attributes
+    ----------
+    region, name : str
+    estimate : float
+    std : float or None
+    """
+
+    region: str
+    name: str
+    estimate: float
+    std: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """What of the recording the first prediction leaves over, in standard deviations.
+
+    Attributes
+    ----------
+    size : int
+        Numbers of the observation.
+    rms, max_abs : float
+    nis : float
+        Normalised innovation squared.
+    nis_band : (2,)
+        Where 95 % of such values lie.
+    """
+
+    size: int
+    rms: float
+    max_abs: float
+    nis: float
+    nis_band: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What the recording alone could tell at best.
+
+    Attributes
+    ----------
+    cramer_rao_std : (p,)
+        None where it determines a modulus not at all.
+    condition_number : float or None
+    flat : tuple of str
+        Combinations that are known badly.
+    """
+
+    cramer_rao_std: tuple[float | None, ...]
+    condition_number: float | None
+    flat: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """What the run is for, in numbers; None where a closure is missing.
+
+    Attributes
+    ----------
+    starts : int
+    largest_difference_between_starts : float or None
+        Of a modulus, relative.
+    recorded_motion_mm : float
+        Mean, from the open to the recorded closed frame.
+    generic_mean_mm, fitted_mean_mm, generic_surface_mm, fitted_surface_mm : float or None
+    closer_percent : float or None
+        By how much the mean distance of the fitted closure is less than that of the generic one.
+    closer_than_generic : bool or None
+    """
+
+    starts: int
+    largest_difference_between_starts: float | None
+    recorded_motion_mm: float
+    generic_mean_mm: float | None
+    fitted_mean_mm: float | None
+    closer_percent: float | None
+    generic_surface_mm: float | None
+    fitted_surface_mm: float | None
+    closer_than_generic: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What is found of p moduli; the estimate is that from the first start.
+
+    Attributes
+    ----------
+    estimate, std : (p,) or None
+    iterates, iterate_std : (i, p) or None
+    moduli : tuple of Modulus
+    distance_mm : Spread or None
+    innovation : Innovation or None
+    identifiability : Identified or None
+    iterations : int
+    seconds : float
+        Of all closures.
+    memory_mb : float
+        Largest, of the process.
+    claim : str
+        What is shown, and what is not.
+    data : Data
+    regions : tuple of str
+    rows : tuple of Row
+    summary : Summary
+    """
+
+    estimate: Vector | None
+    std: Vector | None
+    iterates: tuple[Vector, ...] | None
+    iterate_std: tuple[Vector, ...] | None
+    moduli: tuple[Modulus, ...]
+    distance_mm: Spread | None
+    innovation: Innovation | None
+    identifiability: Identified | None
+    iterations: int
+    seconds: float
+    memory_mb: float
+    claim: str
+    data: Data
+    regions: tuple[str, ...]
+    rows: tuple[Row, ...]
+    summary: Summary
