@@ -1,6 +1,7 @@
 """The README and a page beside it: examples run, Table 1 is the published one, links lead on."""
 
 import re
+from importlib import import_module
 
 import pytest
 
@@ -53,3 +54,41 @@ def test_local_links_lead_somewhere():
     targets = re.findall(r"\]\((?!https?:|#)([^)#]+)", TEXT)
     assert len(targets) > 15
     assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+PAGES = [
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "study_notes").glob("*.md")),
+    *sorted((ROOT / "mvest").rglob("README.md")),
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+]
+MADE = ("tenting", "sizes", "NAME", "HASH", "*")
+"""Parts of paths that stand for another, or that a page says how to make."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_what_a_page_names_exists(page):
+    quoted = re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))
+    paths = [q for q in quoted if re.fullmatch(r"(mvest|experiments|tests|conf|docs)/[\w./*-]+", q)]
+    missing = [p for p in paths if not any(m in p for m in MADE) and not (ROOT / p).exists()]
+    assert missing == []
+    for name in (q for q in quoted if re.fullmatch(r"mvest(\.\w+)+", q)):
+        assert resolves(name), name
+
+
+def resolves(name):
+    """Whether a dotted name is a module or something in one."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            found = import_module(".".join(parts[:end]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[end:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
