@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,10 @@ from experiments.common.build import mechanics_of
 from experiments.common.cases.record import case_record, fields_of
 from experiments.common.progress import SolveBar
 from experiments.common.schema import build
-from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError
 from mvest.personalise.chain import personalise_case
-from mvest.personalise.model import build_model
 from mvest.personalise.settings import (
     CaseMesh,
     PaperSettings,
@@ -26,14 +25,8 @@ from mvest.personalise.settings import (
     Unknown,
 )
 from mvest.problem.registration import REGISTRATION
-from mvest.reporting.case.fields import turn_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 __all__ = [
-    "check_case",
     "read_configured",
     "run_case",
     "settings_of",
@@ -86,66 +79,6 @@ def read_configured(config: Values) -> ValveCase:
             "mvest/cases/README.md says what it holds"
         )
     return read_case(Path(config["case"]))
-
-
-def check_case(config: Values, folder: Path) -> str:
-    """Read, check and draw a case without simulating anything: what to tell the user.
-
-    Raises
-    ------
-    MvestError
-        If the case is not in order.
-    """
-    from mvest.reporting.figures import save_figure_with
-
-    case = read_configured(config)
-    settings = settings_of(config)
-    model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")
-    files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
-    surface = case.surface
-    lines = [
-        f"{case.name}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles, "
-        f"leaflets {', '.join(surface.region_names)}; {len(case.chordae)} chordae from "
-        f"{len(case.frame(Role.REFERENCE).papillary_tips)} papillary tips",
-        *(f"  {_told(frame)}" for frame in case.frames),
-        *(f"  derived: {sentence}" for sentence in case.derived),
-        f"  mesh: {len(model.mesh.nodes)} nodes, {len(model.mesh.elements)} "
-        f"{model.mesh.element_type}",
-        f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
-        f"In order; drawn in {files[0]}",
-    ]
-    return "\n".join(lines)
-
-
-def _drawn(case: ValveCase) -> Figure:
-    from mvest.reporting.case.frames import frame_fields, frames_figure
-
-    surface, chordae = case.surface, case.chordae
-    tips = case.frame(Role.REFERENCE).papillary_tips
-    middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
-    shapes = {}
-    for frame in case.frames:
-        at_rest = frame.role is Role.REFERENCE
-        title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
-        shapes[title] = frame_fields(
-            (frame.vertices - middle) @ axes,
-            frame.triangles,
-            frame.region,
-            (frame.annulus - middle) @ axes,
-            (frame.papillary_tips - middle) @ axes,
-            chordae.tip if at_rest else None,
-            (chordae.insertion - middle) @ axes if at_rest else None,
-        )
-    return frames_figure(shapes, case.surface.region_names)
-
-
-def _told(frame: Frame) -> str:
-    same = ", same vertices as the reference" if frame.corresponds else ", without correspondence"
-    return (
-        f"frame {frame.name} ({frame.role.value}) at {frame.time:g} s, "
-        f"{frame.pressure_mmHg:g} mmHg, {len(frame.vertices)} vertices"
-        f"{'' if frame.role is Role.REFERENCE else same}"
-    )
 
 
 def run_case(

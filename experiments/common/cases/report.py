@@ -1,25 +1,21 @@
-"""What is told and kept of a case and of a virtual patient."""
+"""Text and table of a case and of a virtual patient."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mvest.files import write_atomically
-from mvest.reporting.markup import number
+from mvest.reporting.markup import MISSING, number
 
-if TYPE_CHECKING:
-    from experiments.common.cases.tables import Record
+__all__ = ["case_text", "interval_words", "write_case_tables"]
 
-
-__all__ = ["case_text", "write_case_tables"]
+Record = Mapping[str, Any]
 
 
 def case_text(record: Record) -> str:
     """What a finished case says on the terminal."""
-    from experiments.common.cases.tables import interval_words
-
     lines = [f"{record['case']['name']}: {record['reason']}"]
     for row in record["unknowns"]:
         lines.append(
@@ -32,6 +28,14 @@ def case_text(record: Record) -> str:
             f"{row['personalised']['mean']:.2f} personalised"
         )
     return "\n".join(lines)
+
+
+def interval_words(row: Mapping[str, Any]) -> str:
+    """Estimate and interval of an unknown, crossed if the truth is not in it."""
+    if row["estimate"] is None:
+        return MISSING
+    outside = " ✗" if row.get("inside") is False else ""
+    return f"{number(row['estimate'])} ({number(row['low'])} to {number(row['high'])}){outside}"
 
 
 def _truth(row: Mapping[str, Any]) -> str:

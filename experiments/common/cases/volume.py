@@ -38,7 +38,7 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["FoundValve", "check_volume", "find_valve", "run_volume", "write_image_step"]
+__all__ = ["FoundValve", "find_valve", "run_volume", "write_image_step"]
 
 Values = Mapping[str, Any]
 
@@ -83,12 +83,6 @@ def run_volume(
         {**config, "case": str(case)}, config_hash, folder, started, {"image_step": about}
     )
     return record, files
-
-
-def check_volume(config: Values, folder: Path) -> str:
-    """Find, measure and draw the valve without simulating anything: what to tell the user."""
-    about = write_image_step(find_valve(config), folder)
-    return "\n".join([*about["sentences"], f"In order; drawn in {folder / 'montage.png'}"])
 
 
 def find_valve(config: Values) -> FoundValve:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
-from experiments.studies.imaging.tables import write_volume_tables
+from experiments.studies.imaged_patient.tables import write_volume_tables
 
 __all__ = ["kept_of_volume", "write_volumes"]
 

@@ -129,7 +129,7 @@ def volume_rows(
 ) -> list[dict[str, Any]]:
     """What was found of each modulus, from the volume and from the known geometry, MPa.
 
-    As `experiments.studies.imaging.tables.volume_table` wants them.
+    As `experiments.studies.imaged_patient.tables.volume_table` wants them.
     """
     rows = []
     for name in sorted(name for name in truth if name.startswith("E_f.")):

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.cases.tables import write_table
+from experiments.common.tables import write_table
 from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_tables
 from mvest.imaging.layout import ValveLayout
 from mvest.reporting.figures import save_figure

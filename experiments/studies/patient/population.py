@@ -10,13 +10,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import beta
 
-from experiments.common.cases.tables import (
-    Record,
-    distance_words,
-    provenance_of,
-    table3,
-    write_table,
-)
+from experiments.common.tables import write_table
+from experiments.studies.patient.tables import Record, distance_words, provenance_of, table3
 from mvest.reporting.figures import save_figure
 from mvest.reporting.markup import MISSING
 

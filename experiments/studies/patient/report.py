@@ -25,8 +25,8 @@ def write_patients(
     folder: Path, records: Mapping[str, Record[Plain]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """Tables 2 and 3 and Figure 3, or the table of the population."""
-    from experiments.common.cases.tables import POPULATION, in_order, write_patient_tables
     from experiments.studies.patient.population import write_population_tables
+    from experiments.studies.patient.tables import POPULATION, in_order, write_patient_tables
 
     kept = in_order({name: flat(record) for name, record in records.items()})
     if next(iter(records.values())).table == POPULATION:
@@ -36,7 +36,7 @@ def write_patients(
 
 def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
     """What tables need of a record; the settings are in ``conf``."""
-    from experiments.common.cases.tables import POPULATION
+    from experiments.studies.patient.tables import POPULATION
 
     dropped = ("settings", "measurements") if record.table == POPULATION else ()
     findings = {key: value for key, value in record.findings.items() if key not in dropped}
@@ -45,7 +45,7 @@ def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
 
 def arrays_of_patient(record: Record[Plain], path: Path) -> dict[str, Any]:
     """Arrays that Figure 3 needs, in single precision."""
-    from experiments.common.cases.tables import PATIENTS
+    from experiments.studies.patient.tables import PATIENTS
 
     if record.table != PATIENTS:
         return {}

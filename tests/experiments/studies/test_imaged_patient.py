@@ -9,6 +9,11 @@ from experiments.common.record import record_from
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
 from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
+from experiments.studies.imaged_patient.tables import (
+    volume_table,
+    volume_words,
+    write_volume_tables,
+)
 from mvest.errors import InputError
 from tests.reporting.records import record as a_record
 from tests.reporting.records import stored
@@ -94,3 +99,60 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
     assert [row["estimate"] for row in record["rows"]] == [5.0, 2.5]
     assert [row["known_geometry"] for row in record["rows"]] == [None, None]
     assert "MemoryError" in record["known_geometry"]["reason"]
+
+
+MODULI = [
+    {
+        "patient": "normal_small", "modulus": "E_f.anterior", "truth": 5.0, "estimate": 6.0,
+        "low": 4.5, "high": 7.5, "known_geometry": 5.2,
+    },
+    {
+        "patient": "normal_small", "modulus": "E_f.posterior", "truth": 2.0, "estimate": 1.5,
+        "low": 1.2, "high": 1.8, "known_geometry": 2.1,
+    },
+    {
+        "patient": "prolapse", "modulus": "E_f.anterior", "truth": 4.0, "estimate": None,
+        "low": None, "high": None, "known_geometry": 4.0,
+    },
+]  # fmt: skip
+
+
+def test_errors_of_moduli_add_up():
+    table = volume_table(MODULI)
+    assert table["inside"].tolist() == [True, False, None]
+    assert table["error [%]"][0] == pytest.approx(20.0)
+    assert table["error from known geometry [%]"][0] == pytest.approx(4.0)
+    assert table["part from the images [%]"][0] == pytest.approx(16.0)
+    assert table["part from the images [%]"][1] == pytest.approx(-30.0)
+    assert pd.isna(table["error [%]"][2])
+    words = volume_words(table)
+    assert words[0] == "The 95 % interval contains the truth for 1 of 2 moduli."
+    assert words[1] == "For 1 of 3 moduli no estimate was found."
+    assert "from the volume 22.5 %" in words[2]
+    assert "from the known geometry 4.0 %" in words[2]
+
+
+def test_the_table_of_moduli_is_readable(tmp_path):
+    written = write_volume_tables(tmp_path, a_record() | {"rows": MODULI})
+    assert [path.name for path in written] == ["volume.csv", "volume.md", "volume.tex"]
+    text = written[1].read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    assert "6 (4.5 to 7.5) |" in rows[0]
+    assert "✗" in rows[1]
+    assert "-25.0" in rows[1]
+    assert rows[2].count("–") == 3
+    assert "Simulated" in text or "simulated" in text
+    assert "\\" in written[2].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "no rows"),
+        ([MODULI[0] | {"truth": 0.0}], "truth 0.0 MPa"),
+        ([{"patient": "a"}], "row 0 has no modulus"),
+    ],
+)
+def test_moduli_that_are_none_are_refused(rows, message):
+    with pytest.raises(InputError, match=message):
+        volume_table(rows)

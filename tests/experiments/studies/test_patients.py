@@ -10,11 +10,10 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from experiments.common.cases import tables as patient_tables
 from experiments.common.cases.report import case_text, write_case_tables
-from experiments.common.cases.tables import figure3, in_order, table2, table3, write_patient_tables
 from experiments.common.record import record_from
 from experiments.results.keep import publish
+from experiments.studies.patient import tables as patient_tables
 from experiments.studies.patient.population import (
     _clopper_pearson,
     population_figure,
@@ -23,6 +22,13 @@ from experiments.studies.patient.population import (
 )
 from experiments.studies.patient.report import KEPT_ARRAYS
 from experiments.studies.patient.study import STUDY
+from experiments.studies.patient.tables import (
+    figure3,
+    in_order,
+    table2,
+    table3,
+    write_patient_tables,
+)
 from mvest.errors import InputError
 from mvest.reporting.case.fields import read_case_fields
 from tests.reporting.case.made_up_case import arrays

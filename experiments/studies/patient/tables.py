@@ -16,14 +16,15 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from experiments.common.cases.report import interval_words
+from experiments.common.tables import write_table
 from mvest.errors import InputError
-from mvest.files import write_atomically
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, same_scale
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.figures import corner_colours, distance_top, spread
 from mvest.reporting.figures import DISTANCE_MAP, save_figure
 from mvest.reporting.files import provenance_line
-from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
+from mvest.reporting.markup import MISSING, number
 
 __all__ = [
     "PATIENTS",
@@ -31,12 +32,10 @@ __all__ = [
     "Record",
     "distance_words",
     "in_order",
-    "interval_words",
     "provenance_of",
     "table2",
     "table3",
     "write_patient_tables",
-    "write_table",
 ]
 
 Record = Mapping[str, Any]
@@ -49,7 +48,7 @@ ORDER = ("normal_small", "normal_large", "functional_mr", "prolapse", "fibroelas
 
 
 WHICH = ("generic", "registered", "personalised")
-"""The closed valves whose distances are told; registered is generic, laid on the frame rigidly."""
+"""The closed valves whose distances are listed; registered: generic, laid on the frame rigidly."""
 
 NOTE = (
     "Simulated valves; the moduli and distances in the rows of the paper belong to five patients "
@@ -275,10 +274,10 @@ def distance_words(table: pd.DataFrame) -> list[str]:
         )
     columns = [f"{which} to the truth [mm]" for which in WHICH]
     if table[columns].notna().all(axis=None):
-        told = ", ".join(
+        means = ", ".join(
             f"{table[c].mean():.2f} mm {w}" for c, w in zip(columns, WHICH, strict=True)
         )
-        out.append(f"Mean distance to where the valve truly was, all frames: {told}.")
+        out.append(f"Mean distance to where the valve truly was, all frames: {means}.")
     return out
 
 
@@ -335,14 +334,6 @@ def _moduli(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     return [row for row in rows if row["name"].startswith("E_f.")]
 
 
-def interval_words(row: Mapping[str, Any]) -> str:
-    """Estimate and interval of an unknown, crossed if the truth is not in it."""
-    if row["estimate"] is None:
-        return MISSING
-    outside = " ✗" if row.get("inside") is False else ""
-    return f"{number(row['estimate'])} ({number(row['low'])} to {number(row['high'])}){outside}"
-
-
 def _name(record: Record) -> str:
     return _words(record["case"]["name"])
 
@@ -355,21 +346,3 @@ def provenance_of(records: Sequence[Record]) -> str:
     """Where the first of several records came from, and how many there are besides."""
     lines = sorted({provenance_line(record) for record in records})
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
-
-
-def write_table(
-    base: Path,
-    table: pd.DataFrame,
-    readable: Sequence[Mapping[str, str]],
-    line: str,
-    notes: Sequence[str],
-) -> list[Path]:
-    """Write a table as CSV, Markdown and LaTeX, with notes and provenance; returns the paths."""
-    words = "\n\n".join(notes)
-    comment = "".join(f"% {note}\n" for note in [*notes, line])
-    text = f"{markdown_rows(readable)}\n\n{words}\n\n{line}\n"
-    return [
-        write_atomically(base.with_suffix(".csv"), f"# {line}\n" + table.to_csv(index=False)),
-        write_atomically(base.with_suffix(".md"), text),
-        write_atomically(base.with_suffix(".tex"), comment + latex_rows(readable)),
-    ]

@@ -1,0 +1,54 @@
+"""Tables of results: from rows of plain data to CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from mvest.errors import InputError
+from mvest.files import write_atomically
+from mvest.reporting.markup import latex_rows, markdown_rows
+
+__all__ = ["checked_rows", "write_table"]
+
+
+def checked_rows(
+    rows: Sequence[Mapping[str, Any]], wanted: Sequence[str], what: str
+) -> pd.DataFrame:
+    """Rows as a table, each of which has all entries ``wanted``; ``what`` names them in an error.
+
+    Raises
+    ------
+    InputError
+        No rows, or an entry that is missing.
+    """
+    if not rows:
+        raise InputError(f"{what}: no rows, expected at least one")
+    for k, row in enumerate(rows):
+        missing = [name for name in wanted if name not in row]
+        if missing:
+            raise InputError(
+                f"{what}: row {k} has no {', '.join(missing)}, expected {', '.join(wanted)}"
+            )
+    return pd.DataFrame(list(rows))
+
+
+def write_table(
+    base: Path,
+    table: pd.DataFrame,
+    readable: Sequence[Mapping[str, str]],
+    line: str,
+    notes: Sequence[str],
+) -> list[Path]:
+    """Write a table as CSV, Markdown and LaTeX, with notes and provenance; returns the paths."""
+    words = "\n\n".join(notes)
+    comment = "".join(f"% {note}\n" for note in [*notes, line])
+    text = f"{markdown_rows(readable)}\n\n{words}\n\n{line}\n"
+    return [
+        write_atomically(base.with_suffix(".csv"), f"# {line}\n" + table.to_csv(index=False)),
+        write_atomically(base.with_suffix(".md"), text),
+        write_atomically(base.with_suffix(".tex"), comment + latex_rows(readable)),
+    ]
