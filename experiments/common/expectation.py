@@ -23,7 +23,7 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text
 from mvest.typing import FloatArray
 
-__all__ = ["TwinForesight", "foresee_cycle", "foresee_own", "told"]
+__all__ = ["TwinForesight", "expect_own", "foresee_cycle"]
 
 Values = Mapping[str, Any]
 
@@ -57,10 +57,10 @@ class TwinForesight:
             if key not in self._known:
                 self._known[key] = SharedStart(twin.model, start)(start)
         title = f"{config['name']}, {config['row']}"
-        return told(title, _foreseen(twin, self._known[key], start), _noise(config))
+        return _words(title, _expected_at_start(twin, self._known[key], start), _noise(config))
 
 
-def _foreseen(twin: Twin, first: Prediction, start: FloatArray) -> Expectation | str:
+def _expected_at_start(twin: Twin, first: Prediction, start: FloatArray) -> Expectation | str:
     """What to expect where the model is known at the start alone; the reason if it is not."""
 
     def model(m: FloatArray) -> Prediction:
@@ -90,7 +90,7 @@ def _noise(config: Values) -> str:
     return f"{' and '.join(f'{s:.3g}' for s in std)} mm of noise assumed, {errors}"
 
 
-def foresee_own(config: Values, _folder: Path | None = None) -> str:
+def expect_own(config: Values, _folder: Path | None = None) -> str:
     """The answer for a case.
 
     Raises
@@ -103,11 +103,11 @@ def foresee_own(config: Values, _folder: Path | None = None) -> str:
     case, settings = read_configured(config), settings_of(config)
     store = Path(config["paths"]["outputs"]) / "meshes"
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        found = expect_case(case, settings, store=store, on_step=bar.step)
-    doubt = case.uncertainty
-    length = doubt.correlation_length_mm
+        expected = expect_case(case, settings, store=store, on_step=bar.step)
+    uncertainty = case.uncertainty
+    length = uncertainty.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"
-    return told(case.name, found, f"{doubt.typical_mm:.3g} mm of noise stated, {errors}")
+    return _words(case.name, expected, f"{uncertainty.typical_mm:.3g} mm of noise stated, {errors}")
 
 
 def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
@@ -124,7 +124,7 @@ def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
     model = cycle_model(config, build(CycleProtocol, config["cycle"]["protocol"]))
     with SolveBar(config["name"], len(model.protocol.steps()), 1) as bar:
         model.closure.on_step = bar.step
-        found = expect_of_model(
+        expected = expect_of_model(
             stored_cycle(config, model),
             prior,
             noise**2,
@@ -132,25 +132,27 @@ def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
             transform=transform,
             frames=tuple(f"{t:g} s" for t in model.protocol.times),
         )
-    return told(
-        f"{config['name']}, {config['row']}", found, f"{noise:g} mm of noise assumed, independent"
+    return _words(
+        f"{config['name']}, {config['row']}",
+        expected,
+        f"{noise:g} mm of noise assumed, independent",
     )
 
 
-def told(title: str, found: Expectation | str, noise: str) -> str:
-    """A foresight as text."""
-    if isinstance(found, str) or found.data is None:
-        reason = found if isinstance(found, str) else found.reason
+def _words(title: str, expected: Expectation | str, noise: str) -> str:
+    """What to expect, as text."""
+    if isinstance(expected, str) or expected.data is None:
+        reason = expected if isinstance(expected, str) else expected.reason
         return (
             f"{title}: what the data will tell is not known, the model has no prediction at the "
             f"assumed parameters ({reason})"
         )
     return expectation_text(
         title,
-        found.assumed,
-        found.prior,
-        found.transform,
-        found.data,
-        found.informed,
-        f"{found.observations} numbers of {', '.join(found.frames)}; {noise}",
+        expected.assumed,
+        expected.prior,
+        expected.transform,
+        expected.data,
+        expected.informed,
+        f"{expected.observations} numbers of {', '.join(expected.frames)}; {noise}",
     )

@@ -1,7 +1,7 @@
 """Estimates a case in a process that cannot open what the case hides.
 
 A virtual patient's truth lies in a folder of its own. This process is started for the estimation
-alone, is told nothing of the patient but the folder of its case, and refuses to open, list or
+alone, is given nothing of the patient but the folder of its case, and refuses to open, list or
 rename anything within the sealed folder for as long as it lives: Python's audit hooks cannot be
 removed once they are set (PEP 578). They see what Python opens; a file that a compiled library or a
 program started from here opened by itself would not be seen.
@@ -31,7 +31,7 @@ __all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
 
-MOST_MEMORY = 10 * 2**30
+MAX_MEMORY = 10 * 2**30
 """Bytes that the process may ask for: a leaflet that crumples while no equilibrium is found can
 take all there is, and what else runs on the machine with it."""
 
@@ -114,7 +114,7 @@ def estimate_blindly(
 def main() -> int:
     """Answer the one request on the standard input; returns the exit status."""
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, hard))
     request = json.load(sys.stdin)
     folder = Path(request["folder"])
     seal(Path(request["sealed"]))

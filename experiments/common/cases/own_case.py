@@ -95,7 +95,7 @@ def run_case(
     from mvest.reporting.case.report import write_case_report
 
     fields = folder / "fields.npz"
-    # Of an earlier run: there are none where nothing is found now.
+    # Of an earlier run: there are none where no estimate is reached now.
     fields.unlink(missing_ok=True)
     case = read_configured(config)
     for sentence in case.derived:
@@ -107,13 +107,13 @@ def run_case(
     # As they are estimated: those of the closure first.
     names = sorted(free, key=lambda name: name in REGISTRATION)
     with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
-        found = personalise_case(
+        personalised = personalise_case(
             case, settings, store=store, on_step=bar.step, on_iterate=bar.iterate
         )
-    record = {**case_record(config, found, config_hash, started), **(about or {})}
+    record = {**case_record(config, personalised, config_hash, started), **(about or {})}
     files: list[Path] = []
-    if found.distances:
-        np.savez_compressed(fields, **fields_of(found))
+    if personalised.distances:
+        np.savez_compressed(fields, **fields_of(personalised))
         files.append(fields)
         if config["figures"]:
             files += write_case_report(folder, {**record, "parameters": record["unknowns"]}, fields)

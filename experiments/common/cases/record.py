@@ -32,27 +32,27 @@ Values = Mapping[str, Any]
 
 
 def case_record(
-    config: Values, found: Personalised, config_hash: str, started: float
+    config: Values, fit: Personalised, config_hash: str, started: float
 ) -> dict[str, Any]:
     """Plain data of a personalised case, what it hides excluded."""
-    case, result = found.case, found.result
+    case, result = fit.case, fit.result
     record = make_record(
         result,
-        {**config, "filter": {**config["filter"], "initial": found.prior.mean.tolist()}},
+        {**config, "filter": {**config["filter"], "initial": fit.prior.mean.tolist()}},
         config_hash=config_hash,
         meshes={
-            "sha256": found.mesh.sha256,
-            "nodes": len(found.mesh.nodes),
-            "elements": len(found.mesh.elements),
+            "sha256": fit.mesh.sha256,
+            "nodes": len(fit.mesh.nodes),
+            "elements": len(fit.mesh.elements),
         },
         closure=None,
         truth_values=None,
         started=started,
     )
-    unknowns = _unknowns(found, result, found.names)
+    unknowns = _unknowns(fit, result, fit.names)
     innovation = record["innovation"]
     if innovation is not None:
-        innovation = {**innovation, "tests": _whiteness(found)}
+        innovation = {**innovation, "tests": _whiteness(fit)}
     of_all = {key: record[key] for key in ("iterates", "iterate_std", "identifiability")}
     if of_all["identifiability"] is not None:
         of_all["identifiability"]["observation_std_mm"] = case.uncertainty.typical_mm
@@ -72,17 +72,17 @@ def case_record(
             "regions": list(case.surface.region_names),
         },
         "model": {
-            "element": found.mesh.element_type,
-            "cells": [found.settings.mesh.columns, found.settings.mesh.rows, 1],
-            "source": found.settings.mesh.source,
+            "element": fit.mesh.element_type,
+            "cells": [fit.settings.mesh.columns, fit.settings.mesh.rows, 1],
+            "source": fit.settings.mesh.source,
             "filter": "iterated",
             "noise_mm": case.uncertainty.typical_mm,
         },
         "data": {"citation": case.source, "sha256": case.sha256},
         "unknowns": unknowns,
-        "moduli": _moduli(found, unknowns),
-        "without_nuisances": _others(found, found.moduli_only),
-        "as_in_the_paper": _others(found, found.paper),
+        "moduli": _moduli(fit, unknowns),
+        "without_nuisances": _others(fit, fit.moduli_only),
+        "as_in_the_paper": _others(fit, fit.paper),
         "distances": [
             {
                 "frame": d.frame,
@@ -92,25 +92,25 @@ def case_record(
                 "personalised": _spread(d.personalised),
                 "to_truth": None,
             }
-            for d in found.distances
+            for d in fit.distances
         ],
         "objective": None
         if result.filtered is None
         else [v if np.isfinite(v) else None for v in result.filtered.objective.tolist()],
         "innovation": innovation,
-        "narrow": _narrow(found),
-        "image_errors": _image_errors(found),
-        "measurements": _measurements(found),
-        "confirmed_mm": found.confirmed_mm,
+        "narrow": _narrow(fit),
+        "image_errors": _image_errors(fit),
+        "measurements": _measurements(fit),
+        "confirmed_mm": fit.confirmed_mm,
         "gate": None
-        if found.confirmed_mm is None
-        else f"closed anew from the open valve it differs by at most {found.confirmed_mm:.2g} mm",
+        if fit.confirmed_mm is None
+        else f"closed anew from the open valve it differs by at most {fit.confirmed_mm:.2g} mm",
         "settings": {
             "personal": dict(config["personal"]),
             "mechanics": dict(config["mechanics"]),
         },
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-        "parts_s": dict(found.seconds),
+        "parts_s": dict(fit.seconds),
     }
 
 
@@ -147,10 +147,10 @@ def _of_moduli(record: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def fields_of(found: Personalised) -> dict[str, Any]:
+def fields_of(fit: Personalised) -> dict[str, Any]:
     """The arrays of the report, mm."""
-    case, surface = found.case, found.case.surface
-    frames = [d.frame for d in found.distances]
+    case, surface = fit.case, fit.case.surface
+    frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
     seen = [by_name[name] for name in frames]
     reference = case.frame(Role.REFERENCE)
@@ -161,7 +161,7 @@ def fields_of(found: Personalised) -> dict[str, Any]:
         "annulus": case.annulus.astype(np.int32),
         "free_edge": case.free_edge.astype(np.int32),
         "frames": np.array(frames),
-        "seen": np.array([d.seen for d in found.distances]),
+        "seen": np.array([d.seen for d in fit.distances]),
         "tips": np.stack(
             [reference.papillary_tips, *(frame.papillary_tips for frame in seen)]
         ).astype(np.float32),
@@ -175,35 +175,35 @@ def fields_of(found: Personalised) -> dict[str, Any]:
         ),
     }
     for name, positions in (
-        ("generic", found.generic),
-        ("registered", found.registered),
-        ("fitted", found.fitted),
+        ("generic", fit.generic),
+        ("registered", fit.registered),
+        ("fitted", fit.fitted),
     ):
         arrays[name] = np.stack([positions[frame] for frame in frames]).astype(np.float32)
     if all(frame.corresponds for frame in seen):
         arrays["observed"] = np.stack([frame.vertices for frame in seen]).astype(np.float32)
-        if found.settings.correspondence:
-            arrays["distance_generic"] = np.stack([d.generic for d in found.distances])
-            arrays["distance_registered"] = np.stack([d.registered for d in found.distances])
-            arrays["distance_fitted"] = np.stack([d.personalised for d in found.distances])
+        if fit.settings.correspondence:
+            arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
+            arrays["distance_registered"] = np.stack([d.registered for d in fit.distances])
+            arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
     else:
         for frame in seen:
             arrays[f"observed_points_{frame.name}"] = frame.vertices.astype(np.float32)
-    filtered = found.result.filtered
+    filtered = fit.result.filtered
     if filtered is not None and filtered.prediction is not None:
         sensitivity = filtered.prediction.jacobian
-        if sensitivity.size == surface.vertices.size * len(found.names):
-            arrays["sensitivity"] = sensitivity.reshape(-1, 3, len(found.names)).astype(np.float32)
+        if sensitivity.size == surface.vertices.size * len(fit.names):
+            arrays["sensitivity"] = sensitivity.reshape(-1, 3, len(fit.names)).astype(np.float32)
             if filtered.innovation is not None:
                 arrays["innovation"] = filtered.innovation.standardised.reshape(-1, 3)
     return arrays
 
 
 def _unknowns(
-    found: Personalised, result: StudyResult, names: tuple[str, ...]
+    fit: Personalised, result: StudyResult, names: tuple[str, ...]
 ) -> list[dict[str, Any]]:
     """What is known of each unknown before and after; intervals of 95 %."""
-    about = {unknown.name: unknown for unknown in found.settings.unknowns}
+    about = {unknown.name: unknown for unknown in fit.settings.unknowns}
     low: FloatArray | None = None
     high: FloatArray | None = None
     if result.estimate is not None and result.filtered is not None:
@@ -230,11 +230,11 @@ def _unknowns(
     return rows
 
 
-def _moduli(found: Personalised, unknowns: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _moduli(fit: Personalised, unknowns: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """All moduli that follow from the estimated ones through the fixed ratios."""
     by_name = {row["name"]: row for row in unknowns}
     rows = []
-    for modulus in found.result.moduli:
+    for modulus in fit.result.moduli:
         row = by_name[f"E_f.{modulus.region}"]
         share = modulus.estimate / row["estimate"]
         rows.append(
@@ -248,7 +248,7 @@ def _moduli(found: Personalised, unknowns: list[dict[str, Any]]) -> list[dict[st
     return rows
 
 
-def _others(found: Personalised, result: StudyResult | None) -> dict[str, Any] | None:
+def _others(fit: Personalised, result: StudyResult | None) -> dict[str, Any] | None:
     """An estimation of the moduli alone."""
     if result is None:
         return None
@@ -258,19 +258,19 @@ def _others(found: Personalised, result: StudyResult | None) -> dict[str, Any] |
         "reason": result.reason,
         "detail": result.detail,
         "forward_solves": 0 if filtered is None else filtered.forward_solves,
-        "parameters": _unknowns(found, result, result.parameters),
+        "parameters": _unknowns(fit, result, result.parameters),
         "distance_mm": None if result.distance is None else _spread(result.distance),
     }
 
 
-def _whiteness(found: Personalised) -> list[dict[str, Any]]:
+def _whiteness(fit: Personalised) -> list[dict[str, Any]]:
     """Tests of the standardised innovation of the closed frame."""
-    filtered = found.result.filtered
+    filtered = fit.result.filtered
     if filtered is None or filtered.innovation is None:
         return []
     standardised = filtered.innovation.standardised
     rows = [("mean zero", zero_mean(standardised))]
-    surface = found.case.surface
+    surface = fit.case.surface
     if standardised.size == surface.vertices.size:
         adjacency = _adjacency(len(surface.vertices), surface.triangles)
         by_axis = standardised.reshape(-1, 3)
@@ -296,12 +296,12 @@ def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:
     return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
 
 
-def _narrow(found: Personalised) -> list[dict[str, Any]]:
+def _narrow(fit: Personalised) -> list[dict[str, Any]]:
     """How wide the interval of each modulus would be if something more were known."""
-    moduli = [name for name in found.names if name.startswith("E_f.")]
-    if not found.narrower:
+    moduli = [name for name in fit.names if name.startswith("E_f.")]
+    if not fit.narrower:
         return []
-    now = found.narrower["now"]
+    now = fit.narrower["now"]
     return [
         {
             "what": f"{_label(name)}, {what}",
@@ -309,38 +309,38 @@ def _narrow(found: Personalised) -> list[dict[str, Any]]:
             "std_now": float(now[k]),
             "std_if_known": float(values[k]),
         }
-        for what, values in found.narrower.items()
+        for what, values in fit.narrower.items()
         if what != "now"
         for k, name in enumerate(moduli)
     ]
 
 
-def _image_errors(found: Personalised) -> dict[str, Any] | None:
+def _image_errors(fit: Personalised) -> dict[str, Any] | None:
     """What errors of the frames that the model was built from do to the estimate."""
-    if found.geometry is None:
+    if fit.geometry is None:
         return None
-    moduli = [name for name in found.names if name.startswith("E_f.")]
-    share = found.image_share
+    moduli = [name for name in fit.names if name.startswith("E_f.")]
+    share = fit.image_share
     return {
-        "samples": found.geometry.asked,
-        "failures": list(found.geometry.failures),
+        "samples": fit.geometry.asked,
+        "failures": list(fit.geometry.failures),
         "share_of_variance": None
         if share is None
         else dict(zip(moduli, map(float, share), strict=True)),
     }
 
 
-def _measurements(found: Personalised) -> dict[str, Any]:
+def _measurements(fit: Personalised) -> dict[str, Any]:
     """Frame -> what is measured -> measurements."""
-    case, surface = found.case, found.case.surface
+    case, surface = fit.case, fit.case.surface
     thickness = float(surface.thickness.mean())
-    reach = found.settings.mechanics.contact.activation_distance * thickness
+    reach = fit.settings.mechanics.contact.activation_distance * thickness
     measured: dict[str, Any] = {}
     for frame in case.frames:
         shapes: dict[str, FloatArray] = {}
         if frame.corresponds:
             shapes["observed"] = frame.vertices
-        for which, positions in (("generic", found.generic), ("personalised", found.fitted)):
+        for which, positions in (("generic", fit.generic), ("personalised", fit.fitted)):
             if frame.name in positions:
                 shapes[which] = positions[frame.name]
         measured[frame.name] = {

@@ -38,7 +38,7 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["FoundValve", "find_valve", "run_volume", "write_image_step"]
+__all__ = ["DetectedValve", "detect_in_volume", "run_volume", "write_image_step"]
 
 Values = Mapping[str, Any]
 
@@ -47,8 +47,8 @@ IMAGES, CASE = "images", "case"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundValve:
-    """What the image step found in a volume.
+class DetectedValve:
+    """The valve that the image step detected in a volume.
 
     Attributes
     ----------
@@ -74,8 +74,8 @@ def run_volume(
     config: Values, config_hash: str, folder: Path, started: float
 ) -> tuple[dict[str, Any], list[Path]]:
     """Find the valve of the configured volume and personalise it: its record, and the files."""
-    found = find_valve(config)
-    about = write_image_step(found, folder)
+    detected = detect_in_volume(config)
+    about = write_image_step(detected, folder)
     for sentence in about["sentences"]:
         print(sentence, file=sys.stderr)
     case = folder / CASE
@@ -85,7 +85,7 @@ def run_volume(
     return record, files
 
 
-def find_valve(config: Values) -> FoundValve:
+def detect_in_volume(config: Values) -> DetectedValve:
     """The valve of the configured volume, and the case that it makes.
 
     Raises
@@ -93,33 +93,33 @@ def find_valve(config: Values) -> FoundValve:
     MvestError
         If the volume cannot be read, shows no valve, or the valve found makes no case.
     """
-    told = config["imaged"]
+    settings = config["imaged"]
     if config["volume"] is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
     # What is asked for, before anything that takes long.
-    by_hand = _landmarks(_pairs("landmarks", told["landmarks"], str))
-    held = _pairs("held_out", told["held_out"], float)
-    curve = _pressure_curve(told)
-    thickness = _thickness(told["thickness_mm"])
+    by_hand = _landmarks(_pairs("landmarks", settings["landmarks"], str))
+    held = _pairs("held_out", settings["held_out"], float)
+    curve = _pressure_curve(settings)
+    thickness = _thickness(settings["thickness_mm"])
     volume = read_volume(
         Path(config["volume"]),
-        modality=_modality(told["modality"]),
-        frame_interval_s=told["frame_interval_s"],
-        time_unit=told["time_unit"],
+        modality=_modality(settings["modality"]),
+        frame_interval_s=settings["frame_interval_s"],
+        time_unit=settings["time_unit"],
     )
     if len(volume.times) < 2:
         raise InputError(
             f"{volume.source}: one frame, expected two or more: the valve open and closed"
         )
-    if told["model"] is None and volume.modality is not Modality.ULTRASOUND:
+    if settings["model"] is None and volume.modality is not Modality.ULTRASOUND:
         raise ConfigurationError(
             f"imaged.model is not given; for {volume.modality.value} no model comes with the "
             "package: expected a detection model's file"
         )
-    model = default_model() if told["model"] is None else load_model(Path(told["model"]))
+    model = default_model() if settings["model"] is None else load_model(Path(settings["model"]))
     if model.accuracy is None:
         raise InputError(
-            f"{told['model'] or MODEL_FILE}: its accuracy was never measured, expected a model "
+            f"{settings['model'] or MODEL_FILE}: its accuracy was never measured, expected a model "
             "whose was"
         )
     if thickness is not None and set(thickness) != set(model.shape.layout.region_names):
@@ -127,7 +127,7 @@ def find_valve(config: Values) -> FoundValve:
             f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
             f"{', '.join(model.shape.layout.region_names)}"
         )
-    tracking = TrackingSettings(min_confidence=told["valve_confidence"])
+    tracking = TrackingSettings(min_confidence=settings["valve_confidence"])
     with PartBar("valve in the frames", len(volume.times), "frame") as bar:
         valve = detect_valve(
             volume,
@@ -137,19 +137,19 @@ def find_valve(config: Values) -> FoundValve:
             progress=lambda _done, _all: bar.step(),
         )
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
-    frames = _frames(told, curve, held, valve, rows)
+    frames = _frames(settings, curve, held, valve, rows)
     texts = CaseTexts(
-        told["name"] or Path(config["volume"]).name.partition(".")[0],
-        told["description"],
-        told["source"] or volume.source,
-        told["licence"],
-        told["simulated"],
+        settings["name"] or Path(config["volume"]).name.partition(".")[0],
+        settings["description"],
+        settings["source"] or volume.source,
+        settings["licence"],
+        settings["simulated"],
     )
     accuracy = model.accuracy
     corrected, errors, tip_errors = without_mean_error(
         valve, frames, accuracy.samples, accuracy.tip_samples
     )
-    kept = _thinned(len(errors), told["error_samples"])
+    kept = _thinned(len(errors), settings["error_samples"])
     case = case_of_sequence(
         corrected,
         frames,
@@ -166,10 +166,10 @@ def find_valve(config: Values) -> FoundValve:
             f"({off.mean():.2f} mm in the closed frame)",
         ),
     )
-    return FoundValve(volume, valve, rows, frames, case, _about(model))
+    return DetectedValve(volume, valve, rows, frames, case, _about(model))
 
 
-def write_image_step(found: FoundValve, folder: Path) -> dict[str, Any]:
+def write_image_step(detected: DetectedValve, folder: Path) -> dict[str, Any]:
     """Write pictures, measures, surfaces, landmarks and the case; what the record says of it."""
     from mvest.reporting.figures import save_figure_with
     from mvest.reporting.images.figures import measures_figure
@@ -180,14 +180,16 @@ def write_image_step(found: FoundValve, folder: Path) -> dict[str, Any]:
         # Of an earlier run.
         shutil.rmtree(place, ignore_errors=True)
     images.mkdir(parents=True)
-    name, line = found.case.name, f"volume {found.volume.sha256[:12]}"
+    name, line = detected.case.name, f"volume {detected.volume.sha256[:12]}"
     drawn = {
         "montage": (
-            montage_figure(found.volume, found.valve, title=name, closed=found.frames.closed),
+            montage_figure(
+                detected.volume, detected.valve, title=name, closed=detected.frames.closed
+            ),
             "The valve as it was found, drawn on the volume.",
         ),
         "measures_over_time": (
-            measures_figure(found.rows, title=name),
+            measures_figure(detected.rows, title=name),
             "Measures of the valve over time. Hollow: frames of low confidence.",
         ),
     }
@@ -195,50 +197,50 @@ def write_image_step(found: FoundValve, folder: Path) -> dict[str, Any]:
     for key, (figure, caption) in drawn.items():
         save_figure_with(folder / key, figure, line)
         pictures[key] = {"file": f"{key}.png", "caption": caption}
-    write_measures(images, found.rows)
-    write_surfaces(images, found.valve)
+    write_measures(images, detected.rows)
+    write_surfaces(images, detected.valve)
     write_for_slicer(
         images,
-        found.volume,
-        found.valve,
-        float(found.case.surface.thickness.mean()),
-        [found.frames.open, found.frames.closed],
+        detected.volume,
+        detected.valve,
+        float(detected.case.surface.thickness.mean()),
+        [detected.frames.open, detected.frames.closed],
     )
-    write_case(case, found.case)
+    write_case(case, detected.case)
     return {
         "pictures": pictures,
-        "sentences": _sentences(found),
-        "frames": [dict(row) for row in found.rows],
+        "sentences": _sentences(detected),
+        "frames": [dict(row) for row in detected.rows],
         "files": [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"],
-        "model": found.model,
+        "model": detected.model,
         "volume": {
-            "source": found.volume.source,
-            "sha256": found.volume.sha256,
-            "modality": found.volume.modality.value,
-            "shape": list(found.volume.frames.shape),
-            "spacing_mm": found.volume.spacing.tolist(),
+            "source": detected.volume.source,
+            "sha256": detected.volume.sha256,
+            "modality": detected.volume.modality.value,
+            "shape": list(detected.volume.frames.shape),
+            "spacing_mm": detected.volume.spacing.tolist(),
         },
-        "open_frame": found.frames.open,
-        "closed_frame": found.frames.closed,
-        "confidence": found.valve.frame_confidence.tolist(),
-        "std_mm": found.case.uncertainty.typical_mm,
-        "correlation_length_mm": found.case.uncertainty.correlation_length_mm,
+        "open_frame": detected.frames.open,
+        "closed_frame": detected.frames.closed,
+        "confidence": detected.valve.frame_confidence.tolist(),
+        "std_mm": detected.case.uncertainty.typical_mm,
+        "correlation_length_mm": detected.case.uncertainty.correlation_length_mm,
     }
 
 
-def _sentences(found: FoundValve) -> list[str]:
-    volume, valve = found.volume, found.valve
+def _sentences(detected: DetectedValve) -> list[str]:
+    volume, valve = detected.volume, detected.valve
     confidence = valve.frame_confidence
     size = " x ".join(map(str, volume.frames.shape[1:]))
     return [
         f"{volume.source}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
         f"Valve found with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
-        f"(open frame {found.frames.open}: {confidence[found.frames.open]:.2f}, closed frame "
-        f"{found.frames.closed}: {confidence[found.frames.closed]:.2f}).",
+        f"(open frame {detected.frames.open}: {confidence[detected.frames.open]:.2f}, closed frame "
+        f"{detected.frames.closed}: {confidence[detected.frames.closed]:.2f}).",
         "The detectors were trained and tested on simulated volumes only; their error there is "
-        f"{found.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
-        f"{found.case.uncertainty.correlation_length_mm:.0f} mm.",
-        *(f"Derived: {sentence}." for sentence in found.case.derived),
+        f"{detected.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
+        f"{detected.case.uncertainty.correlation_length_mm:.0f} mm.",
+        *(f"Derived: {sentence}." for sentence in detected.case.derived),
     ]
 
 
@@ -259,22 +261,22 @@ def _thickness(given: Sequence[float]) -> dict[str, float] | None:
     return dict(zip(names, given, strict=True)) if given else None
 
 
-def _pressure_curve(told: Values) -> PressureCurve | None:
+def _pressure_curve(settings: Values) -> PressureCurve | None:
     """The configured curve, or None where the pressure in the closed frame is given."""
-    if (told["pressure_mmHg"] is None) == (told["pressure_curve"] is None):
+    if (settings["pressure_mmHg"] is None) == (settings["pressure_curve"] is None):
         raise ConfigurationError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
             "pressure on the closed valve"
         )
-    if told["pressure_curve"] is None:
+    if settings["pressure_curve"] is None:
         return None
-    table = read_numbers(Path(told["pressure_curve"]), ("time", "pressure"))
+    table = read_numbers(Path(settings["pressure_curve"]), ("time", "pressure"))
     return PressureCurve(table[:, 0], table[:, 1])
 
 
 def _pairs(setting: str, given: Sequence[Any], kind: type) -> dict[int, Any]:
     """Frame -> value of a setting that is a list of pairs."""
-    found: dict[int, Any] = {}
+    values: dict[int, Any] = {}
     for pair in given:
         whole = isinstance(pair, Sequence) and len(pair) == 2 and isinstance(pair[0], int)
         if not whole or not isinstance(pair[1], (kind, int) if kind is float else kind):
@@ -282,13 +284,13 @@ def _pairs(setting: str, given: Sequence[Any], kind: type) -> dict[int, Any]:
                 f"imaged.{setting} has {pair!r}, expected [frame, "
                 f"{'mmHg' if kind is float else 'FILE'}]"
             )
-        found[pair[0]] = kind(pair[1])
-    return found
+        values[pair[0]] = kind(pair[1])
+    return values
 
 
 def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | None:
     """Frame -> name -> position, of the files that a configuration names."""
-    found: dict[int, dict[str, FloatArray]] = {}
+    landmarks: dict[int, dict[str, FloatArray]] = {}
     for frame, file in files.items():
         points = {
             label: item.points[k]
@@ -302,22 +304,22 @@ def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | N
                 f"{file}: points {', '.join(strange) or 'none'}, expected some of "
                 f"{', '.join(LANDMARKS)}"
             )
-        found[frame] = points
-    return found or None
+        landmarks[frame] = points
+    return landmarks or None
 
 
 def _frames(
-    told: Values,
+    settings: Values,
     curve: PressureCurve | None,
     held: Mapping[int, float],
     valve: ValveSequence,
     rows: list[Row],
 ) -> CaseFrames:
-    pressure, closed, count = told["pressure_mmHg"], told["closed_frame"], len(valve.times)
-    least = told["min_confidence"]
+    pressure, closed, count = settings["pressure_mmHg"], settings["closed_frame"], len(valve.times)
+    min_confidence = settings["min_confidence"]
     if curve is not None:
         if closed is None:
-            sure = [row for row in rows if (row["confidence"] or 0.0) >= least]
+            sure = [row for row in rows if (row["confidence"] or 0.0) >= min_confidence]
             closed = closed_frame(sure)
         if closed is None or not 0 <= closed < count:
             raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
@@ -326,10 +328,10 @@ def _frames(
         valve,
         rows,
         float(pressure),
-        open_=told["open_frame"],
+        open_=settings["open_frame"],
         closed=closed,
         held_out=held,
-        min_confidence=least,
+        min_confidence=min_confidence,
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.common.cases.own_case import read_configured, run_case, settings_of
 from experiments.common.cases.report import case_text, write_case_tables
-from experiments.common.expectation import foresee_own
+from experiments.common.expectation import expect_own
 from experiments.common.plain import Plain, each, flat, plain_run
 from experiments.common.study import Study
 from experiments.studies.case.settings import Settings
@@ -90,5 +90,5 @@ STUDY = Study(
     run=plain_run(run_case),
     words=lambda record: case_text(flat(record)),
     write=each(write_case_tables),
-    checks=lambda: (check_case, foresee_own),
+    checks=lambda: (check_case, expect_own),
 )

@@ -44,7 +44,7 @@ __all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient", 
 Values = Mapping[str, Any]
 
 VOLUME, KNOWN, TRUTH, HIDDEN = "volume.seq.nrrd", "known", "truth", "hidden.json"
-MOST_DRAWS = 10
+MAX_DRAWS = 10
 """Anatomies that are drawn, one after another, until one closes as a valve does."""
 
 
@@ -85,11 +85,11 @@ def run_imaged_patient(
     """Simulate, estimate apart from the volume and from the true positions, reveal: the record."""
     place = make_imaged_patient(config)
     hidden = json.loads((place.truth / HIDDEN).read_text(encoding="utf-8"))
-    told = {**config["imaged"], **hidden["told"]}
+    imaged = {**config["imaged"], **hidden["stated"]}
     reason, found = "", None
     try:
         found = estimate_blindly(
-            {**config, "imaged": told}, config_hash, folder, place.volume, place.hidden
+            {**config, "imaged": imaged}, config_hash, folder, place.volume, place.hidden
         )
     except InputError as fault:
         reason = str(fault)
@@ -225,7 +225,7 @@ def _write(place: ImagedPlace, found: _Made, patient: Values, described: Values)
         place.truth / HIDDEN,
         {
             "values": dict(made.hidden.values),
-            "told": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
+            "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
             "made_from": dict(described),
             "anatomies_drawn": draws,
         },
@@ -238,7 +238,7 @@ def _drawn(
     """The first anatomy that closes as a valve does, and how many were drawn."""
     template, scale = template_of(config), config["patient"]["variation"]
     reach = (float(config["echo"]["tip_motion_mm"][0]), float(config["echo"]["tip_motion_mm"][1]))
-    for draws in range(1, MOST_DRAWS + 1):
+    for draws in range(1, MAX_DRAWS + 1):
         drawn = Template(vary(template.parameters, rng, scale)) if scale else template
         motion: FloatArray = draw_tip_motion(drawn, reach, rng)
         try:
@@ -252,7 +252,7 @@ def _drawn(
                 motion,
             )
         except GeometryError:
-            if draws == MOST_DRAWS:
+            if draws == MAX_DRAWS:
                 raise
             continue
         return made, draws
@@ -261,7 +261,7 @@ def _drawn(
 
 def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: Values) -> ValveCase:
     n = sequence.layout.size
-    told = replace(
+    stated = replace(
         sequence,
         std_mm=np.full(n, KNOWN_UNCERTAINTY["std_mm"]),
         correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
@@ -269,7 +269,7 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: Values) ->
     texts = CaseTexts(
         patient["name"], f"{patient['description']}, its true positions", "simulated", "MIT", True
     )
-    return case_of_sequence(told, frames, texts)
+    return case_of_sequence(stated, frames, texts)
 
 
 STUDY = Study(

@@ -15,7 +15,7 @@ from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.record import of_all_unknowns
 from experiments.common.cases.report import case_text, write_case_tables
-from experiments.common.expectation import foresee_own
+from experiments.common.expectation import expect_own
 from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.schema import build
 from experiments.common.store import Store
@@ -41,7 +41,7 @@ __all__ = ["STUDY", "PatientPlace", "make_patient", "reveal", "run_patient"]
 Values = Mapping[str, Any]
 
 HIDDEN, POSITIONS = "hidden.json", "positions.npz"
-MOST_DRAWS = 5
+MAX_DRAWS = 5
 """Anatomies that are drawn, one after another, until one closes."""
 
 
@@ -141,7 +141,7 @@ def _simulate(config: Values) -> tuple[VirtualPatient, int]:
                 rng,
             )
         except GeometryError:
-            if not patient["variation"] or draws == MOST_DRAWS:
+            if not patient["variation"] or draws == MAX_DRAWS:
                 raise
             continue
         return made, draws
@@ -234,7 +234,7 @@ def _spread(values: FloatArray) -> dict[str, float]:
     return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
 
 
-def foresee_patient(config: Values, folder: Path | None = None) -> str:
+def expect_patient(config: Values, folder: Path | None = None) -> str:
     """The answer for the case of a virtual patient, which is simulated first unless it is there.
 
     Raises
@@ -242,7 +242,7 @@ def foresee_patient(config: Values, folder: Path | None = None) -> str:
     MvestError
         If the configuration is inadmissible or the patient's valve does not close.
     """
-    return foresee_own({**config, "case": str(make_patient(config).case)}, folder)
+    return expect_own({**config, "case": str(make_patient(config).case)}, folder)
 
 
 STUDY = Study(
@@ -255,7 +255,7 @@ STUDY = Study(
     keep=kept_of_patient,
     keep_arrays=arrays_of_patient,
     keeps_failures=True,
-    checks=lambda: (foresee_patient,),
+    checks=lambda: (expect_patient,),
     sections=(
         Section("table2", title="Table 2: moduli of five virtual patients (simulated)"),
         Section(

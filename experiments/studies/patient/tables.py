@@ -237,7 +237,7 @@ def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
 
 
 def _narrower(records: Sequence[Record]) -> list[str]:
-    """By how much intervals would shrink if something were known, the most first."""
+    """By how much intervals would shrink if something were known, the largest share first."""
     ratios: dict[str, list[float]] = {}
     for record in records:
         for row in record["narrow"]:

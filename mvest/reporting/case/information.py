@@ -131,7 +131,7 @@ def _seen(fields: CaseFields) -> Any:
 
 
 def where_words(
-    fields: CaseFields, field: FloatArray, names: Sequence[str], most: int = 3
+    fields: CaseFields, field: FloatArray, names: Sequence[str], count: int = 3
 ) -> list[tuple[str, float]]:
     """Parts of the valve that hold most of a field: words and shares, the largest first."""
     total = float(np.nansum(field))
@@ -144,7 +144,7 @@ def where_words(
         for z, place in enumerate(ZONES):
             share = float(np.nansum(field[(region == r) & (zone == z)])) / total
             shares.append((f"{place} of the {leaflet}", share))
-    return sorted(shares, key=lambda part: -part[1])[:most]
+    return sorted(shares, key=lambda part: -part[1])[:count]
 
 
 def _zone(fields: CaseFields) -> Any:

@@ -82,7 +82,7 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
 ):
     place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
     place.truth.mkdir(parents=True)
-    hidden = {"told": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
+    hidden = {"stated": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
     (place.truth / "hidden.json").write_text(json.dumps(hidden))
 
     def blindly(config, config_hash, folder, case, sealed):

@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from experiments.common.cases.blind import SECRET
 from experiments.common.cases.own_case import run_case
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import foresee_patient, make_patient, reveal, run_patient
+from experiments.studies.patient.study import expect_patient, make_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
@@ -302,7 +302,7 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
 
 def test_a_check_tells_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
     use(monkeypatch)
-    said = foresee_patient(config_of(tmp_path))
+    said = expect_patient(config_of(tmp_path))
     assert len(simulated) == 1
     assert "numbers of closed" in said
     assert "No estimation was run." in said
