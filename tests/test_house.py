@@ -101,6 +101,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
 NEVER_IN_EXPERIMENTS = ("tests",)
+STUDIES, IN_COMMON = "experiments.studies", "experiments.common"
+"""A study's room imports of the experiments itself and what all have in common, no other study."""
 
 IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
@@ -161,6 +163,8 @@ def import_violations(source: str, module: str, is_package: bool = False) -> lis
     """Import-direction rules that a module's source breaks, one message each."""
     if not within(module, "mvest"):
         forbidden, allowed, station = NEVER_IN_EXPERIMENTS, ("mvest",), module.split(".")[0]
+        if within(module, STUDIES):
+            station = ".".join(module.split(".")[:3])
     else:
         forbidden = NEVER_IN_MVEST
         rooms = [room for room in MAY_IMPORT if within(module, room) and room != "mvest"]
@@ -172,6 +176,9 @@ def import_violations(source: str, module: str, is_package: bool = False) -> lis
     for line, name, _ in imports(source, module, is_package):
         if any(within(name, other) for other in forbidden):
             broken.append(f"{module}:{line} imports {name}")
+        elif within(module, STUDIES) and within(name, "experiments"):
+            if not within(name, station) and not within(name, IN_COMMON):
+                broken.append(f"{module}:{line} imports {name}")
         elif within(name, "mvest"):
             inside = station != "mvest" and within(name, station)
             if not inside and not any(within(name, other) for other in allowed):
@@ -238,6 +245,11 @@ def test_conf_is_data() -> None:
         ("mvest.problem.estimate", "from experiments.run import main"),
         ("mvest.problem.estimate", "import tests.test_house"),
         ("experiments.run", "from tests.valve import shapes"),
+        # A study knows no other, nor what runs or publishes it.
+        ("experiments.studies.a.study", "from experiments.studies.ab.report import words"),
+        ("experiments.studies.a.study", "def f():\n    import experiments.runner.job"),
+        ("experiments.studies.a.report", "from experiments.results.keep import publish"),
+        ("experiments.studies.a.report", "from experiments import studies"),
         # The package's face imports lazily, nothing here imports the face, and a new station has to
         # be given its place.
         ("mvest", "from mvest.errors import MvestError"),
@@ -269,6 +281,10 @@ def test_a_wrong_import_is_seen(module: str, source: str) -> None:
             "from mvest import closure, estimation, mechanics, observation, valve",
         ),
         ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.problem import Problem"),
+        (
+            "experiments.studies.a.study",
+            "from experiments.common.study import Study\nfrom experiments.studies.a import report",
+        ),
         # A name that only begins alike is another package.
         ("mvest.problem.estimate", "import hydrate, mlflower, testslide"),
     ],
