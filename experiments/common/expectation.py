@@ -23,7 +23,7 @@ from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text
 from mvest.typing import FloatArray
 
-__all__ = ["TwinForesight", "expect_own", "foresee_cycle"]
+__all__ = ["TwinExpectation", "expect_cycle", "expect_own"]
 
 Values = Mapping[str, Any]
 
@@ -32,7 +32,7 @@ OF_THE_MODEL = ("valve", "mesh", "mechanics", "parameters", "fixed", "guided")
 
 
 @dataclass(slots=True)
-class TwinForesight:
+class TwinExpectation:
     """Answers for synthetic studies; jobs of a sweep that begin alike share their closure."""
 
     _known: dict[str, Prediction] = field(default_factory=dict)
@@ -110,7 +110,7 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     return _words(case.name, expected, f"{uncertainty.typical_mm:.3g} mm of noise stated, {errors}")
 
 
-def foresee_cycle(config: Values, _folder: Path | None = None) -> str:
+def expect_cycle(config: Values, _folder: Path | None = None) -> str:
     """The answer for all frames of a cycle.
 
     Raises

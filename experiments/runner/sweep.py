@@ -66,7 +66,7 @@ def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str
         _tell(plan)
         return 0
     if config.check:
-        _foresee(plan)
+        _run_checks(plan)
         return 0
     with nothing_empty(plan.folder, Path(config.paths.outputs)):
         require_writable(plan.folder)
@@ -214,7 +214,7 @@ def _tell(plan: Plan) -> None:
     print(plan.listing())
 
 
-def _foresee(plan: Plan) -> None:
+def _run_checks(plan: Plan) -> None:
     """Say what the data of each job will tell."""
     checks = load_study(plan.jobs[0].values["study"]).checks()
     for job in plan.jobs:

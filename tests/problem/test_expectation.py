@@ -44,7 +44,7 @@ def observation(noise):
     return Observation(("closed",), closed, np.array(noise**2))
 
 
-def test_the_foreseen_intervals_are_those_of_the_estimate():
+def test_the_expected_intervals_are_those_of_the_estimate():
     # At the prior's mean, where the noise-free truth lies, the filter linearises at the same point.
     case = case_of([3.0, 1.0, 0.1])
     found = expect(case, observation(0.02))

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 
 from experiments.common.build import build_filter
-from experiments.common.expectation import foresee_cycle
+from experiments.common.expectation import expect_cycle
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -119,7 +119,7 @@ STUDY = Study(
     words=chord_words,
     write=write_each(chord_table, chord_words, chord_figure),
     keeps_failures=True,
-    checks=lambda: (foresee_cycle,),
+    checks=lambda: (expect_cycle,),
     sections=(
         Section(
             "chord",

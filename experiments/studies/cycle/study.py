@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.common.build import build_filter
 from experiments.common.cycle_settings import CycleSettings
-from experiments.common.expectation import foresee_cycle
+from experiments.common.expectation import expect_cycle
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -251,7 +251,7 @@ STUDY = Study(
     words=cycle_words,
     write=write_each(cycle_table, cycle_words, cycle_figure),
     keeps_failures=True,
-    checks=lambda: (foresee_cycle,),
+    checks=lambda: (expect_cycle,),
     sections=(
         Section(
             "cycle",

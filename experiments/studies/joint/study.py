@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.common.build import build_filter
 from experiments.common.cycle_settings import CycleSettings
-from experiments.common.expectation import foresee_cycle
+from experiments.common.expectation import expect_cycle
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -255,7 +255,7 @@ STUDY = Study(
     run=run_joint,
     words=joint_words,
     write=write_each(joint_table, joint_words, joint_figure),
-    checks=lambda: (foresee_cycle,),
+    checks=lambda: (expect_cycle,),
     sections=(
         Section(
             "joint",

@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of, template_of
 from experiments.common.cycle_settings import CycleSettings
-from experiments.common.expectation import foresee_cycle
+from experiments.common.expectation import expect_cycle
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -254,7 +254,7 @@ STUDY = Study(
     run=run_patch,
     words=patch_words,
     write=write_each(patch_table, patch_words, patch_figure),
-    checks=lambda: (foresee_cycle,),
+    checks=lambda: (expect_cycle,),
     sections=(
         Section(
             "patch",

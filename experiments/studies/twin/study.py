@@ -18,7 +18,7 @@ from experiments.common.estimate_record import (
     repeat_entry,
     write_fields,
 )
-from experiments.common.expectation import TwinForesight
+from experiments.common.expectation import TwinExpectation
 from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
@@ -150,7 +150,7 @@ STUDY = Study(
     words=lambda record: text_table_of(flat(record)),
     write=write_twin,
     write_run=write_twin_run,
-    checks=lambda: (TwinForesight(),),
+    checks=lambda: (TwinExpectation(),),
     require=require_twin,
     sections=(
         Section(
