@@ -110,7 +110,7 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
         if record is not None and record["status"] == "converged":
             whole = flat(record)
             computing[job.config_hash[:16]] = float(
-                whole.get("seconds_computing") or whole.get("seconds") or 0.0
+                whole.get("seconds_computing") or whole.get("seconds") or whole["seconds_total"]
             )
     processes: dict[str, list[Mapping[str, Any]]] = {}
     for end in returned.values():
@@ -165,5 +165,6 @@ def _runs(record: Mapping[str, Any] | None) -> list[dict[str, Any]]:
         "bound": bound,
         "nis": innovation.get("nis"),
         "nis_band": innovation.get("nis_band"),
+        "seconds": record.get("seconds", record["seconds_total"]),
     }
     return [{key: more[key] if key in more else record.get(key) for key in RUN}]

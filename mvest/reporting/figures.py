@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
@@ -21,7 +20,7 @@ from mvest.files import write_atomically
 from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["iterates_figure", "save_figure", "save_figure_with", "valve_figure", "write_study"]
+__all__ = ["iterates_figure", "save_figure", "save_figure_with", "valve_figure"]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
@@ -112,25 +111,6 @@ def valve_figure(fields: Path) -> Figure:
     bar = figure.colorbar(shown, ax=[axes[1], axes[3]], shrink=0.6, pad=0.02)
     bar.set_label(f"distance, fitted to observed [{unit}]")
     return figure
-
-
-def write_study(
-    folder: Path, record: Mapping[str, Any], table: pd.DataFrame, words: str, figure: Figure
-) -> list[Path]:
-    """Write a study's table (csv), words (Markdown) and figure, named after its experiment.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
-    """
-    base = folder / record["experiment"]
-    text = f"# {record['title']}\n\n{words}\n\n{provenance_line(record)}\n"
-    return [
-        write_atomically(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
-        write_atomically(base.with_suffix(".md"), text),
-        *save_figure(base, figure, record),
-    ]
 
 
 def save_figure(base: Path, figure: Figure, record: Mapping[str, Any]) -> list[Path]:

@@ -74,7 +74,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What is found of p parameters.
+    """What follows for p parameters.
 
     Attributes
     ----------

@@ -143,7 +143,7 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What is found of p parameters.
+    """What follows for p parameters.
 
     Attributes
     ----------

@@ -189,7 +189,7 @@ class Summary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What is found of p moduli; the estimate is that from the first start.
+    """What follows for p moduli; the estimate is that from the first start.
 
     Attributes
     ----------

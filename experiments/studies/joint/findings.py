@@ -142,7 +142,7 @@ class MeshError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What is found of p parameters.
+    """What follows for p parameters.
 
     Attributes
     ----------

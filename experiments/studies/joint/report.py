@@ -78,7 +78,7 @@ def joint_words(record: Record[Findings]) -> str:
         f"{' | '.join(f'{v:.2f}' for v in ratio)} |",
         f"| error, truth on {finer.cells[0]} x {finer.cells[1]} cells and half the time step "
         f"| {' | '.join(_percent(v, '+.2f') for v in finer.fit.error)} |",
-        f"| std that the filter told of it | {' | '.join(_percent(v) for v in finer.fit.std)} |",
+        f"| std that the filter states | {' | '.join(_percent(v) for v in finer.fit.std)} |",
         *_mesh_rows(found.mesh_error),
         "",
         f"{len(found.times)} frames of {found.vertices} vertices; noise of "
@@ -137,7 +137,7 @@ def _band_words(n: int) -> str:
 def _first_pass(found: Findings, names: list[str]) -> str:
     last = found.first[-1]
     parts = [
-        f"{name} {_percent(last.error[k], '+.1f')} (told std {_percent(last.std[k])})"
+        f"{name} {_percent(last.error[k], '+.1f')} (stated std {_percent(last.std[k])})"
         for k, name in enumerate(names)
     ]
     worst = max(abs(e) / s for e, s in zip(last.error, last.std, strict=True))

@@ -106,7 +106,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What is found of a valve with a patch, and of one without it.
+    """What follows for a valve with a patch, and of one without it.
 
     Attributes
     ----------

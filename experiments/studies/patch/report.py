@@ -61,15 +61,15 @@ def patch_words(record: Record[Findings]) -> str:
     compared = [fit.compared for fit in results.values()]
     rows: list[tuple[str, Sequence[float | None], str]] = [
         ("true modulus at the centre (MPa)", [c.true_at_centre for c in compared], ".2f"),
-        ("modulus found there (MPa)", [c.at_centre for c in compared], ".2f"),
+        ("estimated modulus there (MPa)", [c.at_centre for c in compared], ".2f"),
         (
             "its standard deviation (of the logarithm)",
             [c.log_std_at_centre for c in compared],
             ".2f",
         ),
-        ("highest modulus found (MPa)", [c.peak for c in compared], ".2f"),
+        ("highest estimated modulus (MPa)", [c.peak for c in compared], ".2f"),
         ("its distance from the centre (mm)", [c.peak_distance_mm for c in compared], ".1f"),
-        ("modulus found outside the patch (MPa)", [c.outside for c in compared], ".2f"),
+        ("estimated modulus outside the patch (MPa)", [c.outside for c in compared], ".2f"),
         ("RMS error of log E over the leaflet", [c.rms_log_error for c in compared], ".2f"),
         (
             "share of the leaflet within two standard deviations",
@@ -107,7 +107,7 @@ def patch_words(record: Record[Findings]) -> str:
         f"{field.std_log:g} of log E, {field.modes} modes "
         f"({100 * found.share:.0f} % of its variance), together with both moduli.",
         f"{len(found.times)} frames of a cycle, {found.vertices} vertices, noise of "
-        f"{found.noise_mm:g} mm per coordinate. What is found beside the true modulus comes "
+        f"{found.noise_mm:g} mm per coordinate. What is estimated beside the true modulus comes "
         "from the noise, the other mesh and the field's smoothness. The shift by the estimator's "
         "mesh is to first order. Everything is simulated.",
         *(
@@ -120,7 +120,7 @@ def patch_words(record: Record[Findings]) -> str:
 
 
 def patch_figure(record: Record[Findings]) -> Figure:
-    """Maps of the unrolled leaflet: true modulus, found modulus, standard deviation."""
+    """Maps of the unrolled leaflet: true modulus, estimated modulus, standard deviation."""
     places = record.findings.map
     results = {label: fit.compared for label, fit in record.findings.results.items()}
     mesh = Triangulation(places.along_mm, places.down_mm, places.triangles)
@@ -149,7 +149,7 @@ def patch_figure(record: Record[Findings]) -> Figure:
     bar.minorticks_off()
     figure.colorbar(drawn["log_std"], ax=list(grid[:, 2]), format="%.2f",
                     label="standard deviation of log E_f")  # fmt: skip
-    titles = ("true modulus", "modulus found (x: highest)", "its standard deviation")
+    titles = ("true modulus", "estimated modulus (x: highest)", "its standard deviation")
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title)
     grid[0, 0].invert_yaxis()

@@ -1,4 +1,4 @@
-"""A stiff patch of one leaflet, found by a modulus that may vary over it.
+"""A stiff patch of one leaflet, estimated by a modulus that may vary over it.
 
 The truth has the patch and another mesh; the estimator has the smooth field of the configuration,
 in whose span the patch does not lie. The same is done with a truth without a patch: what the field
