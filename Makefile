@@ -90,4 +90,5 @@ lock: $(INSTALLED) ## renew requirements.lock after a change of dependencies (ad
 
 clean: ## remove caches and the virtual environment; results and outputs stay
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info
+	rm -rf docs/_build docs/api docs/gallery docs/pictures docs/studies
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
