@@ -11,19 +11,14 @@ import numpy as np
 
 from experiments.common.build import mechanics_of
 from experiments.common.cases.record import case_record, fields_of
+from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar
 from experiments.common.schema import build
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError
 from mvest.personalise.chain import personalise_case
-from mvest.personalise.settings import (
-    CaseMesh,
-    PaperSettings,
-    PersonaliseSettings,
-    Treatment,
-    Unknown,
-)
+from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 
 __all__ = [
@@ -46,28 +41,27 @@ def settings_of(config: Values) -> PersonaliseSettings:
     MvestError
         If a setting is inadmissible.
     """
-    personal = config["personal"]
+    personal = build(PersonalSettings, config["personal"])
     known = [treatment.value for treatment in Treatment]
     unknowns = []
-    for name, about in personal["unknowns"].items():
-        if about["treatment"] not in known:
+    for name, about in personal.unknowns.items():
+        if about.treatment not in known:
             raise ConfigurationError(
-                f"personal.unknowns.{name}.treatment = {about['treatment']!r}, expected one of "
+                f"personal.unknowns.{name}.treatment = {about.treatment!r}, expected one of "
                 f"{', '.join(known)}"
             )
-        unknowns.append(Unknown(name, about["mean"], about["std"], Treatment(about["treatment"])))
-    paper = personal["paper"]
+        unknowns.append(Unknown(name, about.mean, about.std, Treatment(about.treatment)))
     return PersonaliseSettings(
         tuple(unknowns),
         mechanics_of(config),
-        build(CaseMesh, personal["mesh"]),
-        personal["tolerance"],
-        personal["max_iterations"],
-        personal["largest_change"],
-        None if paper is None else build(PaperSettings, paper),
-        personal["moduli_only"],
-        personal["confirm"],
-        personal["correspondence"],
+        personal.mesh,
+        personal.tolerance,
+        personal.max_iterations,
+        personal.largest_change,
+        personal.paper,
+        personal.moduli_only,
+        personal.confirm,
+        personal.correspondence,
     )
 
 

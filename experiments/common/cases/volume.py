@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from experiments.common.cases.own_case import run_case
+from experiments.common.cases.settings import ImagedSettings
 from experiments.common.progress import PartBar
+from experiments.common.schema import build
 from mvest.cases.case import ValveCase
 from mvest.cases.csv_files import read_numbers
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
@@ -93,33 +95,33 @@ def detect_in_volume(config: Values) -> DetectedValve:
     MvestError
         If the volume cannot be read, shows no valve, or the valve found makes no case.
     """
-    settings = config["imaged"]
+    settings = build(ImagedSettings, config["imaged"])
     if config["volume"] is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
     # What is asked for, before anything that takes long.
-    by_hand = _landmarks(_pairs("landmarks", settings["landmarks"], str))
-    held = _pairs("held_out", settings["held_out"], float)
+    by_hand = _landmarks(_pairs("landmarks", settings.landmarks, str))
+    held = _pairs("held_out", settings.held_out, float)
     curve = _pressure_curve(settings)
-    thickness = _thickness(settings["thickness_mm"])
+    thickness = _thickness(settings.thickness_mm)
     volume = read_volume(
         Path(config["volume"]),
-        modality=_modality(settings["modality"]),
-        frame_interval_s=settings["frame_interval_s"],
-        time_unit=settings["time_unit"],
+        modality=_modality(settings.modality),
+        frame_interval_s=settings.frame_interval_s,
+        time_unit=settings.time_unit,
     )
     if len(volume.times) < 2:
         raise InputError(
             f"{volume.source}: one frame, expected two or more: the valve open and closed"
         )
-    if settings["model"] is None and volume.modality is not Modality.ULTRASOUND:
+    if settings.model is None and volume.modality is not Modality.ULTRASOUND:
         raise ConfigurationError(
             f"imaged.model is not given; for {volume.modality.value} no model comes with the "
             "package: expected a detection model's file"
         )
-    model = default_model() if settings["model"] is None else load_model(Path(settings["model"]))
+    model = default_model() if settings.model is None else load_model(Path(settings.model))
     if model.accuracy is None:
         raise InputError(
-            f"{settings['model'] or MODEL_FILE}: its accuracy was never measured, expected a model "
+            f"{settings.model or MODEL_FILE}: its accuracy was never measured, expected a model "
             "whose was"
         )
     if thickness is not None and set(thickness) != set(model.shape.layout.region_names):
@@ -127,7 +129,7 @@ def detect_in_volume(config: Values) -> DetectedValve:
             f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
             f"{', '.join(model.shape.layout.region_names)}"
         )
-    tracking = TrackingSettings(min_confidence=settings["valve_confidence"])
+    tracking = TrackingSettings(min_confidence=settings.valve_confidence)
     with PartBar("valve in the frames", len(volume.times), "frame") as bar:
         valve = detect_valve(
             volume,
@@ -139,17 +141,17 @@ def detect_in_volume(config: Values) -> DetectedValve:
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = _frames(settings, curve, held, valve, rows)
     texts = CaseTexts(
-        settings["name"] or Path(config["volume"]).name.partition(".")[0],
-        settings["description"],
-        settings["source"] or volume.source,
-        settings["licence"],
-        settings["simulated"],
+        settings.name or Path(config["volume"]).name.partition(".")[0],
+        settings.description,
+        settings.source or volume.source,
+        settings.licence,
+        settings.simulated,
     )
     accuracy = model.accuracy
     corrected, errors, tip_errors = without_mean_error(
         valve, frames, accuracy.samples, accuracy.tip_samples
     )
-    kept = _thinned(len(errors), settings["error_samples"])
+    kept = _thinned(len(errors), settings.error_samples)
     case = case_of_sequence(
         corrected,
         frames,
@@ -261,16 +263,16 @@ def _thickness(given: Sequence[float]) -> dict[str, float] | None:
     return dict(zip(names, given, strict=True)) if given else None
 
 
-def _pressure_curve(settings: Values) -> PressureCurve | None:
+def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
     """The configured curve, or None where the pressure in the closed frame is given."""
-    if (settings["pressure_mmHg"] is None) == (settings["pressure_curve"] is None):
+    if (settings.pressure_mmHg is None) == (settings.pressure_curve is None):
         raise ConfigurationError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
             "pressure on the closed valve"
         )
-    if settings["pressure_curve"] is None:
+    if settings.pressure_curve is None:
         return None
-    table = read_numbers(Path(settings["pressure_curve"]), ("time", "pressure"))
+    table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
     return PressureCurve(table[:, 0], table[:, 1])
 
 
@@ -309,14 +311,14 @@ def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | N
 
 
 def _frames(
-    settings: Values,
+    settings: ImagedSettings,
     curve: PressureCurve | None,
     held: Mapping[int, float],
     valve: ValveSequence,
     rows: list[Row],
 ) -> CaseFrames:
-    pressure, closed, count = settings["pressure_mmHg"], settings["closed_frame"], len(valve.times)
-    min_confidence = settings["min_confidence"]
+    pressure, closed, count = settings.pressure_mmHg, settings.closed_frame, len(valve.times)
+    min_confidence = settings.min_confidence
     if curve is not None:
         if closed is None:
             sure = [row for row in rows if (row["confidence"] or 0.0) >= min_confidence]
@@ -324,11 +326,12 @@ def _frames(
         if closed is None or not 0 <= closed < count:
             raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
         pressure = curve(float(valve.times[closed]))
+    assert pressure is not None
     return choose_frames(
         valve,
         rows,
-        float(pressure),
-        open_=settings["open_frame"],
+        pressure,
+        open_=settings.open_frame,
         closed=closed,
         held_out=held,
         min_confidence=min_confidence,

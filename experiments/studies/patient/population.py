@@ -18,7 +18,6 @@ from mvest.reporting.markup import MISSING
 __all__ = ["population_frame", "write_population_tables"]
 
 
-# -- the population -------------------------------------------------------------------------------
 def population_frame(records: Sequence[Record]) -> pd.DataFrame:
     """One row for each patient and unknown: truth, estimate and interval."""
     rows = []
@@ -107,7 +106,7 @@ def population_figure(table: pd.DataFrame) -> Figure:
             if part.empty:
                 axes.set_axis_off()
                 continue
-            truth, found = part["truth"].astype(float), part["estimate"].astype(float)
+            truth, estimate = part["truth"].astype(float), part["estimate"].astype(float)
             inside = part["inside"].astype(bool)
             for chosen, colour, words in (
                 (inside, "#2b6ca3", "contains the truth"),
@@ -115,12 +114,12 @@ def population_figure(table: pd.DataFrame) -> Figure:
             ):
                 reach = np.array(
                     [
-                        (found - part["low"].astype(float))[chosen],
-                        (part["high"].astype(float) - found)[chosen],
+                        (estimate - part["low"].astype(float))[chosen],
+                        (part["high"].astype(float) - estimate)[chosen],
                     ]
                 )
                 axes.errorbar(
-                    truth[chosen], found[chosen], yerr=reach, fmt="o", ms=3.5, lw=1.0,
+                    truth[chosen], estimate[chosen], yerr=reach, fmt="o", ms=3.5, lw=1.0,
                     color=colour, label=f"{words} ({int(chosen.sum())})",
                 )  # fmt: skip
             ends = np.array([truth.min() * 0.8, truth.max() * 1.25])

@@ -196,8 +196,8 @@ def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[st
     revealed["truth"] = [values[name] for name in record["parameters"]]
     if record["estimate"] is not None:
         revealed["relative_error"] = [
-            (found - true) / true
-            for found, true in zip(record["estimate"], revealed["truth"], strict=True)
+            (estimate - true) / true
+            for estimate, true in zip(record["estimate"], revealed["truth"], strict=True)
         ]
     if fields.is_file():
         _reveal_positions(revealed, positions, fields)

@@ -46,7 +46,6 @@ PATIENTS, POPULATION = "patients", "population"
 ORDER = ("normal_small", "normal_large", "functional_mr", "prolapse", "fibroelastic")
 """In which the five patients are listed; others follow by name."""
 
-
 WHICH = ("generic", "registered", "personalised")
 """The closed valves whose distances are listed; registered: generic, laid on the frame rigidly."""
 
