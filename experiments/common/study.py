@@ -62,12 +62,21 @@ class Section:
         Where the text brings no heading.
     validation : bool
         Whether it shows that the model and its numerics are right, rather than what a study found.
+    table : str
+        Of the kept records; empty: of this name.
+    answer : callable or None
+        Name -> kept record of the table -> what follows, in one line.
+    opens : str
+        The picture of it with which the page begins, above its answer; empty for most.
     """
 
     name: str
     pictures: Mapping[str, str] = field(default_factory=dict)
     title: str = ""
     validation: bool = False
+    table: str = ""
+    answer: Callable[[Mapping[str, Record[Any]]], str] | None = None
+    opens: str = ""
 
 
 def _nothing(*_: Any) -> None:

@@ -18,7 +18,7 @@ from experiments.common.study import Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 
-__all__ = ["FIELDS", "RECORDS", "arrays_of", "publish", "regenerate"]
+__all__ = ["FIELDS", "RECORDS", "arrays_of", "publish", "records_of", "regenerate"]
 
 RECORDS = "records"
 """Folder of the kept records within the results."""
@@ -90,6 +90,17 @@ def regenerate(results: Path) -> list[Path]:
         study = load_study(str(read_data(first).get("study")))
         written += study.write(results, _read(place, study.findings), _arrays(place))
     return written
+
+
+def records_of(results: Path, table: str, findings: type) -> dict[str, Record[Any]]:
+    """Name -> kept record of a table, the one of its name first; empty if there is none.
+
+    Raises
+    ------
+    InputError
+        If one is damaged.
+    """
+    return _read(results / RECORDS / table, findings)
 
 
 def _read(place: Path, findings: type) -> dict[str, Record[Any]]:

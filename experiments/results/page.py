@@ -16,7 +16,8 @@ from markdown_it import MarkdownIt
 from markupsafe import Markup
 
 import mvest
-from experiments.common.study import Section, load_study, study_names
+from experiments.common.study import Section, Study, load_study, study_names
+from experiments.results.keep import records_of
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.report import COST, pictures_of, read_sweeps
 from experiments.sweeps.rows import (
@@ -36,7 +37,7 @@ __all__ = ["REPORT", "write_report"]
 REPORT = "report.html"
 TEMPLATES = (Path(__file__).parent, Path(mvest.__file__).parent / "reporting" / "templates")
 
-MOST_FAILURES = 200
+MAX_FAILURES = 200
 """Listed one by one on the page; the tidy table has all."""
 
 ORDER = ("initial_guess", "noise", "covariance", "filter", "discrepancy")
@@ -71,13 +72,22 @@ def write_report(results: Path) -> Path:
         undefined=StrictUndefined,
         keep_trailing_newline=True,
     )
+    others = [
+        _other_section(results, section, study)
+        for section, study in _sections()
+        if (results / f"{section.name}.md").is_file()
+    ]
     page = environment.get_template("page.html.jinja").render(
         sweeps=[_sweep_section(results, sweep) for sweep in sweeps],
-        others=[
-            _other_section(results, section)
-            for section in _sections()
-            if (results / f"{section.name}.md").is_file()
+        parts=[
+            ("Validation", [section for section in others if section["validation"]]),
+            ("Studies", [section for section in others if not section["validation"]]),
         ],
+        # What failed stands beside what did not, also where it has no picture.
+        opening=sorted(
+            (section for section in others if section["answer"]),
+            key=lambda section: not section["validation"],
+        ),
     )
     return write_atomically(results / REPORT, page)
 
@@ -106,8 +116,8 @@ def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
         "table": summary(sweep)[1],
         "has_paper": bool(sweep.get("paper")),
         "note": table_note(sweep),
-        "failures": failures[:MOST_FAILURES],
-        "more_failures": max(len(failures) - MOST_FAILURES, 0),
+        "failures": failures[:MAX_FAILURES],
+        "more_failures": max(len(failures) - MAX_FAILURES, 0),
         "failed": sum(not run.converged for run in runs_of(sweep)),
         "runs": len(runs_of(sweep)),
         "factors": _factors(sweep),
@@ -160,13 +170,18 @@ def _cache(sweep: Sweep) -> str:
     return f"Of {hits + misses} requests for a simulated truth, {hits} were served from the store."
 
 
-def _sections() -> list[Section]:
-    """Sections of all studies, those that validate the model first."""
-    found = [section for name in study_names() for section in load_study(name).sections]
-    return sorted([*found, *OTHERS], key=lambda section: not section.validation)
+def _sections() -> list[tuple[Section, Study[Any, Any] | None]]:
+    """Sections of all studies, each with its study, and those that no study made."""
+    found: list[tuple[Section, Study[Any, Any] | None]] = []
+    for name in study_names():
+        study = load_study(name)
+        found += [(section, study) for section in study.sections]
+    return [*found, *((section, None) for section in OTHERS)]
 
 
-def _other_section(results: Path, section: Section) -> dict[str, Any]:
+def _other_section(
+    results: Path, section: Section, study: Study[Any, Any] | None
+) -> dict[str, Any]:
     title = section.title
     body = (results / f"{section.name}.md").read_text(encoding="utf-8")
     heading, _, rest = body.partition("\n")
@@ -184,5 +199,28 @@ def _other_section(results: Path, section: Section) -> dict[str, Any]:
         "anchor": section.name,
         "title": title,
         "body": Markup(html),
-        "pictures": [embedded(path, caption) for path, caption in found if path.is_file()],
+        "pictures": [
+            embedded(path, caption)
+            for path, caption in found
+            if path.is_file() and path.stem != section.opens
+        ],
+        "validation": section.validation,
+        "answer": _answer(results, section, study),
+        "opens": _opening(results, section),
     }
+
+
+def _answer(results: Path, section: Section, study: Study[Any, Any] | None) -> str:
+    """What follows from the kept records of a section's table, in one line."""
+    if section.answer is None or study is None:
+        return ""
+    records = records_of(results, section.table or section.name, study.findings)
+    return section.answer(records) if records else ""
+
+
+def _opening(results: Path, section: Section) -> Any:
+    """The picture of a section with which the page begins, if there is one."""
+    path = results / f"{section.opens}.png"
+    if not section.opens or not path.is_file():
+        return None
+    return embedded(path, section.pictures[section.opens])

@@ -6,13 +6,29 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from experiments.common.cases.skill import Answered, skill_words
 from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
 from experiments.studies.imaged_patient.tables import write_volume_tables
 
-__all__ = ["kept_of_volume", "write_volumes"]
+__all__ = ["kept_of_volume", "volumes_answer", "write_volumes"]
 
 KEPT = ("rows", "unknowns", "known_geometry", "image_errors")
+
+
+def volumes_answer(records: Mapping[str, Record[Plain]]) -> str:
+    """How good moduli from volumes are, in one line."""
+    answered = []
+    for record in records.values():
+        generic = {row["name"]: row["prior_mean"] for row in record.findings["unknowns"]}
+        answered += [
+            Answered(
+                row["truth"], row["estimate"], row["low"], row["high"],
+                generic[f"E_f.{row['modulus']}"],
+            )
+            for row in record.findings["rows"]
+        ]  # fmt: skip
+    return f"{len(records)} simulated volumes: {skill_words(answered)}"
 
 
 def kept_of_volume(record: Record[Plain]) -> Record[Plain]:

@@ -17,7 +17,7 @@ from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.schema import build
 from experiments.common.store import Store
 from experiments.common.study import Section, Study
-from experiments.studies.imaged_patient.report import kept_of_volume, write_volumes
+from experiments.studies.imaged_patient.report import kept_of_volume, volumes_answer, write_volumes
 from experiments.studies.imaged_patient.settings import Settings
 from mvest.cases.case import ValveCase
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
@@ -281,5 +281,5 @@ STUDY = Study(
     write_run=lambda folder, record: write_case_tables(folder, flat(record)),
     keep=kept_of_volume,
     keeps_failures=True,
-    sections=(Section("volume", title="Moduli from simulated volumes"),),
+    sections=(Section("volume", title="Moduli from simulated volumes", answer=volumes_answer),),
 )

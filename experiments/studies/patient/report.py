@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.cases.skill import Answered, skill_words
 from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
 
-__all__ = ["arrays_of_patient", "kept_of_patient", "write_patients"]
+__all__ = ["arrays_of_patient", "kept_of_patient", "patients_answer", "write_patients"]
 
 KEPT_ARRAYS = (
     "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
@@ -32,6 +33,17 @@ def write_patients(
     if next(iter(records.values())).table == POPULATION:
         return write_population_tables(folder, list(kept.values()))
     return write_patient_tables(folder, kept, arrays)
+
+
+def patients_answer(records: Mapping[str, Record[Plain]]) -> str:
+    """How good the moduli of the patients are, in one line."""
+    answered = [
+        Answered(row["truth"], row["estimate"], row["low"], row["high"], row["prior_mean"])
+        for record in records.values()
+        for row in record.findings["unknowns"]
+        if row["name"].startswith("E_f.")
+    ]
+    return f"{len(records)} simulated patients, known geometry: {skill_words(answered)}"
 
 
 def kept_of_patient(record: Record[Plain]) -> Record[Plain]:

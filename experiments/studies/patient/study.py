@@ -20,8 +20,14 @@ from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.schema import build
 from experiments.common.store import Store
 from experiments.common.study import Section, Study
-from experiments.studies.patient.report import arrays_of_patient, kept_of_patient, write_patients
+from experiments.studies.patient.report import (
+    arrays_of_patient,
+    kept_of_patient,
+    patients_answer,
+    write_patients,
+)
 from experiments.studies.patient.settings import Settings
+from experiments.studies.patient.tables import PATIENTS
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
@@ -268,6 +274,9 @@ STUDY = Study(
                 " is not yet a leak. Simulated."
             },
             "Table 3: distances of their closed valves (simulated)",
+            table=PATIENTS,
+            answer=patients_answer,
+            opens="figure3",
         ),
         Section(
             "population",
@@ -276,6 +285,8 @@ STUDY = Study(
                 "Simulated."
             },
             "Virtual patients drawn at random (simulated)",
+            answer=patients_answer,
+            opens="population",
         ),
     ),
 )

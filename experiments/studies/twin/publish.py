@@ -15,7 +15,7 @@ from experiments.studies.twin.tables import text_table, write_tables
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.noise import observation_noise
 
-__all__ = ["require_twin", "text_table_of", "write_twin", "write_twin_run"]
+__all__ = ["require_twin", "table1_answer", "text_table_of", "write_twin", "write_twin_run"]
 
 
 def text_table_of(record: Mapping[str, Any]) -> str:
@@ -37,6 +37,16 @@ def write_twin(
     if first == table and first in arrays:
         written += save_figure(folder / f"{table}_valve", valve_figure(arrays[first]), flat(main))
     return written
+
+
+def table1_answer(records: Mapping[str, Record[Plain]]) -> str:
+    """How far moduli are off, in one line: seen by the same model, and by others."""
+    sentences = []
+    for record in records.values():
+        error = record.findings["moduli_error_percent"]
+        off = f"{error['mean']:.2g} %" if record.converged and error else "no estimate"
+        sentences.append(f"{record.row} {off}")
+    return f"Mean error of all moduli by what was seen (simulated): {', '.join(sentences)}."
 
 
 def write_twin_run(folder: Path, record: Record[Plain]) -> list[Path]:

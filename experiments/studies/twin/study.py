@@ -22,7 +22,13 @@ from experiments.common.expectation import TwinExpectation
 from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.study import Section, Study
-from experiments.studies.twin.publish import require_twin, text_table_of, write_twin, write_twin_run
+from experiments.studies.twin.publish import (
+    require_twin,
+    table1_answer,
+    text_table_of,
+    write_twin,
+    write_twin_run,
+)
 from experiments.studies.twin.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.estimation.wrappers import SharedStart
@@ -162,6 +168,8 @@ STUDY = Study(
             },
             "Table 1",
             validation=True,
+            answer=table1_answer,
+            opens="table1_valve",
         ),
         Section("mesh_independence", title="Independence of the mesh", validation=True),
     ),
