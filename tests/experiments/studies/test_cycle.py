@@ -29,6 +29,8 @@ TINY = (
     "cycle.protocol.hold=0.05",
     "cycle.protocol.fall=0.1",
     "cycle.protocol.dt=0.05",
+    # The paper's damping: steps this long fail with less, and cost seconds until they are halved.
+    "mechanics.damping.beta=0.1",
     "cycle.protocol.times=[0.0,0.05,0.1,0.15,0.25]",
     "cycle.finer_columns=10",
     "cycle.finer_rows=1",
