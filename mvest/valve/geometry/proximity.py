@@ -18,26 +18,37 @@ from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import surface_edges
 
+Vector = tuple[float, float, float]
+"""A point or a vector in compiled code, where an array of three takes longer than its sums."""
+
 
 @njit(cache=True)
-def _dot(a: FloatArray, b: FloatArray) -> float:
-    # Faster on three numbers than the BLAS call behind `@`, and indifferent to memory layout.
+def row(points: FloatArray, i: int) -> Vector:
+    """``points[i]`` of ``(n, 3)`` as three numbers."""
+    return points[i, 0], points[i, 1], points[i, 2]
+
+
+@njit(cache=True)
+def _difference(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(cache=True)
+def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
-def closest_on_triangle(
-    p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray
-) -> tuple[float, float, float]:
+def closest_on_triangle(p: Vector, a: Vector, b: Vector, c: Vector) -> Vector:
     """Barycentric coordinates ``(u, v, w)`` of the point of triangle ``abc`` closest to `p`."""
-    ab = b - a
-    ac = c - a
-    ap = p - a
+    ab = _difference(b, a)
+    ac = _difference(c, a)
+    ap = _difference(p, a)
     d1 = _dot(ab, ap)
     d2 = _dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
         return 1.0, 0.0, 0.0
-    bp = p - b
+    bp = _difference(p, b)
     d3 = _dot(ab, bp)
     d4 = _dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
@@ -46,7 +57,7 @@ def closest_on_triangle(
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         v = d1 / (d1 - d3)
         return 1.0 - v, v, 0.0
-    cp = p - c
+    cp = _difference(p, c)
     d5 = _dot(ab, cp)
     d6 = _dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
@@ -67,7 +78,7 @@ def closest_on_triangle(
 
 @njit(cache=True)
 def distance_to_triangle(
-    p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray
+    p: Vector, a: Vector, b: Vector, c: Vector
 ) -> tuple[float, float, float, float]:
     """Distance (mm) of `p` to triangle ``abc``, and the barycentric coordinates of the foot."""
     u, v, w = closest_on_triangle(p, a, b, c)
@@ -87,7 +98,7 @@ def paired_distances(
     for i in range(points.shape[0]):
         t = triangles[triangle[i]]
         distance[i] = distance_to_triangle(
-            points[i], vertices[t[0]], vertices[t[1]], vertices[t[2]]
+            row(points, i), row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
         )[0]
     return distance
 
@@ -104,10 +115,11 @@ def _closest_of_candidates(
     barycentric: FloatArray,
 ) -> None:
     for i in range(points.shape[0]):
+        p = row(points, i)
         for k in range(offsets[i], offsets[i + 1]):
             t = triangles[candidates[k]]
             d, u, v, w = distance_to_triangle(
-                points[i], vertices[t[0]], vertices[t[1]], vertices[t[2]]
+                p, row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
             )
             if d < distance[i]:
                 distance[i] = d

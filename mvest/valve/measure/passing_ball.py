@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.proximity import distance_to_triangle, paired_distances
+from mvest.valve.geometry.proximity import distance_to_triangle, paired_distances, row
 from mvest.valve.measure.annulus import AnnulusPlane, checked_loop
 
 MAX_GRID_POINTS = 60_000_000
@@ -52,23 +52,23 @@ def _near_distances(
     owner: IntArray,
 ) -> None:
     """Exact distance and nearest triangle at grid points within one step of a triangle's box."""
-    x = np.empty(3)
     low = np.empty(3, dtype=np.int64)
     high = np.empty(3, dtype=np.int64)
     for t in range(triangles.shape[0]):
-        a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
+        a, b = row(points, triangles[t, 0]), row(points, triangles[t, 1])
+        c = row(points, triangles[t, 2])
         for k in range(3):
             first = (min(a[k], b[k], c[k]) - origin[k]) / step
             last = (max(a[k], b[k], c[k]) - origin[k]) / step
             low[k] = max(int(np.floor(first)) - 1, 0)
             high[k] = min(int(np.ceil(last)) + 1, distance.shape[k] - 1)
         for i in range(low[0], high[0] + 1):
-            x[0] = origin[0] + i * step
+            x = origin[0] + i * step
             for j in range(low[1], high[1] + 1):
-                x[1] = origin[1] + j * step
+                y = origin[1] + j * step
                 for k in range(low[2], high[2] + 1):
-                    x[2] = origin[2] + k * step
-                    d = distance_to_triangle(x, a, b, c)[0]
+                    z = origin[2] + k * step
+                    d = distance_to_triangle((x, y, z), a, b, c)[0]
                     if d < distance[i, j, k]:
                         distance[i, j, k] = d
                         owner[i, j, k] = t
