@@ -13,7 +13,7 @@ from experiments.common.record import Record
 from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure_with
 
-__all__ = ["parameter_label", "percent", "write_each", "write_report"]
+__all__ = ["axis_label", "parameter_label", "percent", "write_each", "write_report"]
 
 F = TypeVar("F")
 
@@ -22,6 +22,19 @@ WORDS = {
     "chord_stiffness": "chordal stiffness",
     "chord_rest_length": "chordal length",
 }
+
+
+AXES = {
+    "chord_rest_length": "rest length of chordae",
+    "chord_stiffness": "stiffness of chordae",
+    "pressure_scale": "pressure",
+}
+
+
+def axis_label(name: str) -> str:
+    """A parameter in a figure: ``E_f (anterior)``."""
+    kind, _, part = name.partition(".")
+    return AXES.get(kind, kind) + (f" ({part})" if part else "")
 
 
 def parameter_label(name: str) -> str:

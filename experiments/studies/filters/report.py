@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
 
+from experiments.common.report import axis_label
 from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure
 from mvest.reporting.files import provenance_line
-from mvest.typing import FloatArray
+from mvest.reporting.style import BAD, GOOD, SMALL, headline, panels
 
 __all__ = [
     "REFERENCE",
@@ -35,17 +35,6 @@ TARGET = 0.1
 
 NEAR_NORMAL = 0.25
 """Largest skewness of the draws of a posterior that is near normal."""
-
-STYLES = {
-    "paper": ("#999999", (0, (1, 1))),
-    "extended": ("#E69F00", "--"),
-    "iterated": ("#0072B2", "-"),
-    "unscented": ("#D55E00", (0, (5, 2))),
-    "ensemble": ("#CC79A7", "-."),
-    "perturbed": ("#56B4E9", (0, (3, 1, 1, 1))),
-    "smoother": ("#009E73", (0, (2, 1))),
-}
-"""Colour and line of each filter; colours of Okabe and Ito, and no two lines alike."""
 
 LABELS = {
     "paper": "paper's (cycled)",
@@ -216,68 +205,63 @@ def _notes(record: Record) -> str:
 
 
 def filters_figure(record: Record) -> Figure:
-    """Monte Carlo posterior of every unknown, with the density that each filter gives it."""
-    problems = record["problems"]
-    columns = max(len(problem["parameters"]) for problem in problems)
-    figure = Figure(figsize=(3.9 * columns, 2.7 * len(problems) + 0.8), layout="constrained")
-    every = figure.subplots(len(problems), columns, squeeze=False)
-    handles: dict[str, Any] = {}
-    for row, problem in zip(every, problems, strict=True):
-        for axes in row[len(problem["parameters"]) :]:
-            axes.set_visible(False)
-        for k, axes in enumerate(row[: len(problem["parameters"])]):
-            _posterior(axes, problem, k, handles)
-        row[0].set_ylabel("density of the logarithm")
-        row[0].set_title(problem["title"], loc="left", fontsize=9)
-    figure.legend(
-        list(handles.values()), list(handles), loc="outside upper center", ncols=5, fontsize=8
+    """95 % interval that each filter gives each unknown, on that of Monte Carlo."""
+    unknowns = [(p, k) for p in record["problems"] for k in range(len(p["parameters"]))]
+    methods = list(
+        dict.fromkeys(m for p in record["problems"] for m in p["filters"] if m != REFERENCE)
+    )
+    figure, grid = panels(1, len(unknowns), 0.32 * len(methods) + 2.7, sharey=True)
+    right = dict.fromkeys(methods, 0)
+    for axes, (problem, k) in zip(grid[0], unknowns, strict=True):
+        reference = _in_std(problem, REFERENCE, k)
+        axes.axvspan(*reference, color="0.88")
+        truth = np.log(problem["truth"][k]) - problem["filters"][REFERENCE]["log_mean"][k]
+        truth /= problem["filters"][REFERENCE]["log_std"][k]
+        axes.axvline(truth, color="black", linewidth=1.0)
+        for row, method in enumerate(methods):
+            if method not in problem["filters"]:
+                continue
+            low, high = _in_std(problem, method, k)
+            off = (high - low) / (reference[1] - reference[0]) - 1
+            is_right = abs(off) <= TARGET
+            right[method] += is_right
+            colour = GOOD if is_right else BAD
+            axes.plot([low, high], [row, row], color=colour, linewidth=2.2)
+            axes.plot((low + high) / 2, row, marker="o", markersize=4, color=colour)
+            if not is_right:
+                axes.annotate(
+                    f"{100 * off:+.0f} %", ((low + high) / 2, row), (0, 4), ha="center",
+                    textcoords="offset points", fontsize=SMALL - 1.5, color=colour,
+                )  # fmt: skip
+        axes.set_xlim(min(-4.2, truth - 0.5), max(4.2, truth + 0.5))
+        axes.set_xticks([-2, 0, 2])
+        axes.grid(visible=False, axis="y")
+        name = problem["parameters"][k]
+        axes.set_title(textwrap.fill(axis_label(name), 14), fontsize=SMALL)
+        axes.set_xlabel(textwrap.fill(problem["title"], 14), fontsize=SMALL - 0.5)
+    counted = [sum(m in p["filters"] for p, _ in unknowns) for m in methods]
+    labels = [f"{_label(m)}, {right[m]} of {n}" for m, n in zip(methods, counted, strict=True)]
+    grid[0, 0].set_yticks(range(len(methods)), labels)
+    grid[0, 0].set_ylim(len(methods) - 0.4, -0.7)
+    best = [_label(m) for m, n in zip(methods, counted, strict=True) if right[m] == n]
+    headline(
+        figure,
+        f"As wide as Monte Carlo everywhere: {' and '.join(best) or 'no filter'}",
+        f"95 % intervals in standard deviations from the mean of Monte Carlo (grey: its own). "
+        f"Blue: width within {100 * TARGET:.0f} %;\norange: not, with the difference. Black: "
+        "truth. Names: number of unknowns within. Simulated.",
     )
     return figure
 
 
-def _posterior(axes: Axes, problem: Record, k: int, handles: dict[str, Any]) -> None:
-    """One unknown of one problem, on a logarithmic axis."""
-    histogram = problem["filters"][REFERENCE]["histogram"][k]
-    edges, density = np.array(histogram["edges"]), np.array(histogram["density"])
-    handles["Monte Carlo"] = axes.stairs(density, np.exp(edges), fill=True, color="0.85")
-    # A few draws far out need not be seen.
-    share = np.cumsum(density) * np.diff(edges)
-    shown = edges[:-1][(share > 5e-4) & (share < 1 - 5e-4)]
-    low, high = shown[0], shown[-1]
-    low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
-    z = np.linspace(low, high, 400)
-    for method, (colour, line) in STYLES.items():
-        found = problem["filters"].get(method)
-        if found is None:
-            continue
-        curve = _normal(z, found["log_mean"][k], found["log_std"][k])
-        handles[_label(method)] = axes.plot(
-            np.exp(z), curve, color=colour, linestyle=line, linewidth=1.4
-        )[0]
-    prior = problem["log_prior"]
-    curve = _normal(z, prior["mean"][k], prior["std"][k])
-    handles["prior"] = axes.plot(np.exp(z), curve, color="0.4", linestyle=":", linewidth=1.0)[0]
-    handles["truth"] = axes.axvline(problem["truth"][k], color="black", linewidth=1.0)
-    axes.set_xscale("log")
-    axes.set_xlim(np.exp(low), np.exp(high))
-    axes.set_ylim(0.0, 1.6 * density.max())
-    name = problem["parameters"][k]
-    axes.set_xlabel(f"{name} [MPa]" if name.startswith("E_f.") else name)
-    axes.xaxis.set_major_formatter(ScalarFormatter())
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    ticks = _ticks(np.exp(low), np.exp(high))
-    axes.set_xticks(ticks)
-
-
-def _normal(z: FloatArray, mean: float, std: float) -> FloatArray:
-    return np.exp(-0.5 * ((z - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi))
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """About four round numbers, evenly on a logarithmic axis."""
-    digits = 3 if high / low < 1.2 else 2
-    inside = np.exp(np.linspace(np.log(low), np.log(high), 6)[1:-1])
-    return [float(f"{value:.{digits}g}") for value in inside]
+def _in_std(problem: Record, method: str, k: int) -> tuple[float, float]:
+    """Ends of an interval of the logarithm, in deviations of Monte Carlo from its mean."""
+    reference, own = problem["filters"][REFERENCE], problem["filters"][method]
+    low, high = (
+        (np.log(own[end][k]) - reference["log_mean"][k]) / reference["log_std"][k]
+        for end in ("low", "high")
+    )
+    return float(low), float(high)
 
 
 def filters_text(record: Record) -> str:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from experiments.common.report import axis_label
 from mvest.reporting.figures import COLOURS, MARKERS, save_figure
+from mvest.reporting.style import SMALL, headline, panels, plain_number
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -23,13 +28,11 @@ __all__ = [
 
 Record = Mapping[str, Any]
 
-LABELS = {
-    "chord_rest_length": "rest length of chordae",
-    "pressure_scale": "pressure",
-    "chord_stiffness": "stiffness of chordae",
-}
-MOST_PERCENT = 300.0
-"""Deviations beyond this are drawn at the edge: nothing is known there."""
+MULTIPLES = (1.0, 2.0, 6.0)
+"""Of the target: where a deviation's colour changes."""
+
+SHADES = ("#0072B2", "#9ECAE1", "#F6E3C5", "#E8A87C")
+"""From within the target to far from it; blue is what all figures show as good."""
 
 
 def write_identifiability_figures(folder: Path, record: Record) -> list[Path]:
@@ -43,57 +46,73 @@ def write_identifiability_figures(folder: Path, record: Record) -> list[Path]:
     return written
 
 
-def label(name: str) -> str:
-    """A parameter's name for readers."""
-    kind, _, region = name.partition(".")
-    return LABELS.get(name, f"E_f {region}" if kind == "E_f" else name)
-
-
 def designs_figure(record: Record) -> Figure:
-    """Deviation of the first modulus with each design, one panel for each knowledge."""
-    told = record["settings"]
+    """Deviation of the first modulus as a table in colours, one panel for each knowledge."""
+    settings = record["settings"]
     modulus = next(row["parameter"] for row in record["designs"])
-    typical = f"{told['typical_mm']:g}"
-    own = [row for row in record["designs"] if row["parameter"] == modulus]
-    panels = list(dict.fromkeys(row["knowledge"] for row in own))
-    frames = list(dict.fromkeys(row["frames"] for row in own))
-    lines = list(dict.fromkeys((row["vertices_words"], row["errors"]) for row in own))
-    figure = Figure(figsize=(2.5 * len(panels) + 2.4, 0.36 * len(lines) + 1.8))
-    figure.set_layout_engine("constrained")
-    grid = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
-    for axes, knowledge in zip(grid, panels, strict=True):
-        for k, some in enumerate(frames):
-            chosen = [r for r in own if r["knowledge"] == knowledge and r["frames"] == some]
-            std = [_shown(row["std"][typical]) for row in chosen]
-            place = [lines.index((row["vertices_words"], row["errors"])) for row in chosen]
-            # Open and closed lies on closed: drawn as a ring around it.
-            ring = some == "open and closed"
-            axes.plot(
-                std, place, linestyle="none", marker=MARKERS[k % len(MARKERS)],
-                color=COLOURS[k % len(COLOURS)], label=some, markersize=9 if ring else 5,
-                fillstyle="none" if ring else "full",
+    typical, target = f"{settings['typical_mm']:g}", 100 * settings["target"]
+    table = pd.DataFrame(
+        {
+            "knowledge": row["knowledge"],
+            "seen": f"{row['vertices_words']}, {row['errors']}",
+            "frames": row["frames"],
+            "percent": np.inf if row["std"][typical] is None else 100 * row["std"][typical],
+        }
+        for row in record["designs"]
+        if row["parameter"] == modulus
+    )
+    shown, knowledges = _without_twins(table), list(table["knowledge"].unique())
+    seen, frames = list(shown["seen"].unique()), list(shown["frames"].unique())
+    figure, grid = panels(1, len(knowledges), 0.3 * len(seen) + 2.6, sharey=True)
+    colours = ListedColormap(SHADES)
+    norm = BoundaryNorm([0.0, *(m * target for m in MULTIPLES), np.inf], len(SHADES))
+    for axes, knowledge in zip(grid[0], knowledges, strict=True):
+        own = shown[shown["knowledge"] == knowledge].pivot(
+            index="seen", columns="frames", values="percent"
+        )
+        values = own.loc[seen, frames].to_numpy()
+        axes.imshow(values, cmap=colours, norm=norm, aspect="auto")
+        for (row, column), value in np.ndenumerate(values):
+            axes.text(
+                column, row, plain_number(value) if np.isfinite(value) else "∞", ha="center",
+                va="center", fontsize=SMALL - 1, color="white" if value <= target else "black",
             )  # fmt: skip
-        axes.axvline(100 * told["target"], color="black", linewidth=1, linestyle="--")
-        axes.set_xscale("log")
-        axes.set_xlim(0.3, 1.3 * MOST_PERCENT)
-        axes.set_title(knowledge, fontsize=9)
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_xlabel("standard deviation [%]", fontsize=8)
-        axes.tick_params(labelsize=8)
-    grid[0].set_yticks(range(len(lines)), [f"{v}, {e}" for v, e in lines])
-    grid[0].invert_yaxis()
-    _titled_legend(
+        reached = int((values <= target).sum())
+        title = textwrap.fill(knowledge, 18)
+        axes.set_title(f"{title}\n{reached} of {values.size}", fontsize=SMALL)
+        axes.set_xticks(range(len(frames)), [textwrap.fill(f, 24) for f in frames], rotation=90)
+        axes.grid(visible=False)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0, labelsize=SMALL - 1)
+    grid[0, 0].set_yticks(range(len(seen)), seen)
+    within = shown[shown["percent"] <= target]
+    never = [k for k in knowledges if k not in set(within["knowledge"])]
+    text = f"{len(within)} of {len(shown)} designs would tell {axis_label(modulus)} to "
+    text += f"{target:g} %" + (f"; none with {' or '.join(never)}" if never else "")
+    headline(
         figure,
-        axes,
-        f"How well {label(modulus)} would be known with {typical} mm of noise "
-        f"(dashed: {100 * told['target']:g} %; simulated)",
+        text,
+        f"Standard deviation expected [%] with {typical} mm of noise; dark: at most {target:g} %. "
+        f"Simulated.",
     )
     return figure
 
 
-def _shown(std: float | None) -> float:
-    return MOST_PERCENT if std is None else min(100 * std, MOST_PERCENT)
+def _without_twins(table: pd.DataFrame) -> pd.DataFrame:
+    """Frames that tell the same as earlier ones everywhere are shown together with these."""
+    names: list[str] = []
+    kept: list[FloatArray] = []
+    for name, rows in table.groupby("frames", sort=False):
+        values = rows["percent"].to_numpy()
+        twin = next((k for k, v in enumerate(kept) if np.allclose(v, values, rtol=1e-3)), None)
+        if twin is None:
+            names.append(str(name))
+            kept.append(values)
+        else:
+            table = table[table["frames"] != name]
+            table = table.replace({"frames": {names[twin]: f"{names[twin]} = {name}"}})
+            names[twin] = f"{names[twin]} = {name}"
+    return table
 
 
 def profiles_figure(record: Record) -> Figure:
@@ -113,9 +132,9 @@ def profiles_figure(record: Record) -> Figure:
             upper.plot(path[:, at], one["deviance"], label=text, linewidth=1, **style)
         upper.axhline(one["threshold"], color="black", linestyle="--", linewidth=1)
         upper.set_ylim(-0.3, 10)
-        upper.set_title(label(name), fontsize=10)
+        upper.set_title(axis_label(name), fontsize=10)
         _draw_followers(lower, record, _first_of(found, name), name)
-        lower.set_xlabel(label(name) + (" [MPa]" if name.startswith("E_f.") else " [factor]"))
+        lower.set_xlabel(axis_label(name) + (" [MPa]" if name.startswith("E_f.") else " [factor]"))
         for axes in (upper, lower):
             axes.grid(alpha=0.3)
             axes.spines[["top", "right"]].set_visible(False)
@@ -158,7 +177,7 @@ def _draw_followers(axes: Any, record: Record, one: Mapping[str, Any], name: str
             100 * (path[:, k] / start - 1),
             color=COLOURS[which % len(COLOURS)],
             linestyle=("-", "--", ":", "-.")[which % 4],
-            label=label(other),
+            label=axis_label(other),
         )
     axes.legend(frameon=False, fontsize=7)
 
@@ -184,8 +203,8 @@ def valley_figure(record: Record) -> Figure:
                 path[:, i], path[:, j], color="black", marker=".", linewidth=1,
                 label=f"floor of the valley, {first['label']}",
             )  # fmt: skip
-        axes.set_xlabel(f"{label(nuisance)} [%]")
-        axes.set_ylabel(f"{label(modulus)} [%]")
+        axes.set_xlabel(f"{axis_label(nuisance)} [%]")
+        axes.set_ylabel(f"{axis_label(modulus)} [%]")
         axes.autoscale_view()
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)

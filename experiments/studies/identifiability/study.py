@@ -336,10 +336,9 @@ STUDY = Study(
         Section(
             "identifiability",
             {
-                "identifiability_designs": "Expected standard deviation of a modulus with "
-                "each design: which vertices "
-                "are seen, with which errors, in which frames, and what is known of the "
-                "nuisances. Simulated.",
+                "identifiability_designs": "Expected standard deviation of a modulus with each "
+                "design: which vertices are seen, with which errors, in which frames, and what is "
+                "known of the nuisances; dark where the target is met. Simulated.",
                 "identifiability_profiles": "Profile likelihoods: the least misfit with one "
                 "parameter held, and how the "
                 "others then make up for it. Simulated.",

@@ -1,9 +1,12 @@
 """Table and figure of the filters from a made-up record."""
 
+import math
+
 import pandas as pd
 import pytest
 
 from experiments.studies.filters.report import filters_figure, filters_text, write_filter_study
+from mvest.reporting.style import BAD, GOOD
 from tests.reporting.records import record
 
 
@@ -101,12 +104,24 @@ def test_files_are_written_and_hold_all_numbers(tmp_path) -> None:
     assert table["width_ratio"].tolist() == pytest.approx([1.0, 1.0])
 
 
-def test_every_filter_has_a_curve_beside_the_draws() -> None:
-    figure = filters_figure(study(0.0, 0.4))
+@pytest.mark.parametrize(("width", "colour", "words"), [(0.42, GOOD, []), (0.48, BAD, ["+20 %"])])
+def test_every_filter_has_an_interval_on_that_of_the_draws(width, colour, words) -> None:
+    figure = filters_figure(study(0.0, width))
     (axes,) = figure.axes
-    # The filter, the prior and the truth.
-    assert len(axes.lines) == 3
-    assert "E_f.anterior" in axes.get_xlabel()
-    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
-        "Monte Carlo", "iterated extended", "prior", "truth"
-    }  # fmt: skip
+    # The truth, and the filter's interval and mean.
+    truth, interval, mean = axes.lines
+    std = 0.4 / 3.92
+    centre = (math.log(4.0) - 1.386) / std
+    assert truth.get_xdata()[0] == pytest.approx((math.log(5.0) - 1.386) / std)
+    half = width / 2 / std
+    assert list(interval.get_xdata()) == pytest.approx([centre - half, centre + half])
+    assert mean.get_xdata()[0] == pytest.approx(centre)
+    assert {interval.get_color(), mean.get_color()} == {colour}
+    assert [text.get_text() for text in axes.texts] == words
+    (band,) = axes.patches
+    assert band.get_x() == pytest.approx(centre - 1.96)
+    assert band.get_width() == pytest.approx(3.92)
+    assert axes.get_title() == "E_f (anterior)"
+    assert axes.get_yticklabels()[0].get_text() == (
+        "iterated extended, " + ("0 of 1" if words else "1 of 1")
+    )

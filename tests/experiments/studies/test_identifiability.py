@@ -11,6 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.plain import flat
 from experiments.run import main
+from experiments.studies.identifiability.figures import designs_figure
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
 from experiments.studies.identifiability.report import write_identifiability_study
 from mvest.closure.model import ClosureModel
@@ -137,6 +138,20 @@ def test_tables_and_figures_come_from_the_record_alone(made, tmp_path):
     text = (tmp_path / "identifiability.md").read_text()
     assert "How well the pressure must be known" in text
     assert "nan" not in text.lower().replace("annulus", "")
+
+
+def test_the_figure_of_designs_shows_each_deviation_and_counts_those_within_the_target(made):
+    record, _, _ = made
+    figure = designs_figure(record)
+    rows = [r for r in record["designs"] if r["parameter"] == "E_f.anterior"]
+    # The open frame adds nothing: it is shown together with the closed one.
+    rows = [r for r in rows if r["frames"] != "open and closed"]
+    assert sum(len(axes.texts) for axes in figure.axes) == len(rows)
+    for axes in figure.axes:
+        *words, counted = axes.get_title().split("\n")
+        own = [r["std"]["0.5"] for r in rows if r["knowledge"] == " ".join(words)]
+        within = sum(std is not None and std <= record["settings"]["target"] for std in own)
+        assert counted == f"{within} of {len(own)}"
 
 
 def test_a_valve_that_does_not_close_is_a_failed_record(tmp_path, monkeypatch, capsys):
