@@ -29,7 +29,6 @@ from experiments.studies.filters.problem import (
 )
 from experiments.studies.filters.report import (
     REFERENCE,
-    filters_figure,
     filters_text,
     write_filter_study,
 )
@@ -42,7 +41,6 @@ from mvest.estimation.filters.sampler import SamplerSettings, draw
 from mvest.estimation.noise import observation_noise
 from mvest.kept import Entry
 from mvest.provenance import provenance, write_json
-from mvest.reporting.figures import save_figure
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_filter_study"]
@@ -66,7 +64,7 @@ def run_filter_study(
         raise ConfigurationError(f"filters.methods needs {REFERENCE}, to compare the others with")
     problems = [_solve(config, name) for name in settings["problems"]]
     record = _record(config, config_hash, problems, started)
-    return record, save_figure(folder / "filters", filters_figure(record), record)
+    return record, []
 
 
 def _entry(config: Values, name: str, part: str, decisive: Any, made_by: tuple[Any, ...]) -> _Kept:

@@ -17,7 +17,6 @@ from experiments.common.forward import forward_record
 from experiments.common.plain import Plain, each, flat, plain_run
 from experiments.common.progress import SolveBar
 from experiments.common.study import Section, Study
-from experiments.studies.identifiability.figures import write_identifiability_figures
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
 from experiments.studies.identifiability.report import (
     identifiability_text,
@@ -95,9 +94,7 @@ def run_identifiability(
         "forward_solves": len(closures) + len(cycle),
     }
     record["seconds"] = record["seconds_total"] = time.time() - started
-    if not config["figures"]:
-        return record, []
-    return record, write_identifiability_figures(folder, record)
+    return record, []
 
 
 def _closure(config: Values, names: tuple[str, ...], pressure: float) -> ClosureModel:
