@@ -64,7 +64,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
 ]
-MADE = ("tenting", "NAME", "HASH", "*")
+MADE = ("tenting", "NAME", "HASH", "_build", "*")
 """Parts of paths that stand for another, or that a page says how to make."""
 
 
