@@ -23,7 +23,7 @@ SMALL = (
     "models.refinements=[[2,2,1]]",
     "observation.noise_mm=0.001",
     "filter.R=1e-6",
-    "filter.initial=[3.8,1.6]",
+    "filter.initial=[3.5,2.0]",
     "tracking.enabled=false",
     "hydra.run.dir=here",
 )
