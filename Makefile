@@ -15,20 +15,33 @@ TEST_PROCESSES ?= 2
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+DEVELOP := .venv/.develop
 
 .PHONY: help install reproduce tables test test-all docs bench lint format dashboard sync screenshot slurm-check lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
+UV := $(BIN)/uv pip install --quiet --python .venv
+
 $(INSTALLED): requirements.lock pyproject.toml
 	@if [ -z "$(PYTHON)" ]; then echo "mvest needs Python 3.11 or newer; name one with make PYTHON=..." >&2; exit 1; fi
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --disable-pip-version-check --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@echo "installing what mvest needs into .venv, versions and hashes of requirements.lock ..."
+	@$(PYTHON) -m venv .venv
+	@awk '/^uv==/ {p = 1} p {print} p && !/\\$$/ {exit}' requirements.lock > .venv/uv.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r .venv/uv.lock
+	@$(UV) --require-hashes --constraint requirements.lock -r pyproject.toml
+	@$(UV) --no-deps --build-constraint requirements.lock -e .
 	@touch $@
 
-install: $(INSTALLED) ## create .venv with the locked packages (every other target does so too)
+# What only developers need comes when a target asks for it.
+$(DEVELOP): $(INSTALLED)
+	@echo "installing what tests, documentation and 3D pictures need ..."
+	@$(UV) --require-hashes --constraint requirements.lock -r pyproject.toml \
+		--extra dev --extra docs --extra viz
+	@touch $@
+
+install: $(DEVELOP) ## create .venv with all locked packages (every other target installs what it needs)
 
 reproduce: $(INSTALLED) ## Table 1 and its figure
 	$(BIN)/python -m experiments.run experiment=table1
@@ -36,18 +49,18 @@ reproduce: $(INSTALLED) ## Table 1 and its figure
 tables: $(INSTALLED) ## everything in results/
 	$(BIN)/python -m experiments.tables
 
-test: $(INSTALLED) ## the tests that finish in minutes
+test: $(DEVELOP) ## the tests that finish in minutes
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile -m "not slow"
 
-test-all: $(INSTALLED) ## every test
+test-all: $(DEVELOP) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
-docs: $(INSTALLED) ## the documentation site, in docs/_build/html; warnings are errors
+docs: $(DEVELOP) ## the documentation site, in docs/_build/html; warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 BENCH := $(BIN)/python -m pytest tests/benchmark -p no:xdist -o python_files='bench_*.py'
 BENCH_OF ?= not tet4-25k
-bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (BENCH_OF=tet4-25k: the largest of tetrahedra, an hour)
+bench: $(DEVELOP) ## how fast: kernels, closures, Table 1, other libraries (BENCH_OF=tet4-25k: the largest of tetrahedra, an hour)
 	@mkdir -p outputs
 	$(BENCH) --benchmark-timer=time.process_time -k "not batch and ($(BENCH_OF))" \
 		--benchmark-json=outputs/benchmark.json
@@ -61,12 +74,12 @@ bench: $(INSTALLED) ## how fast: kernels, closures, Table 1, other libraries (BE
 		outputs/benchmark_2_threads.json outputs/peers.json outputs/profile.json \
 		outputs/startup.json
 
-lint: $(INSTALLED) ## style and types
+lint: $(DEVELOP) ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(INSTALLED) ## rewrite the code in the house format
+format: $(DEVELOP) ## rewrite the code in the house format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -79,11 +92,11 @@ sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
 screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
 	$(BIN)/python -m experiments.runner.screenshot
 
-slurm-check: $(INSTALLED) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e .[cluster]
+slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
+	$(UV) --constraint requirements.lock -r pyproject.toml --extra cluster
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
-lock: $(INSTALLED) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
+lock: $(DEVELOP) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)
 	$(BIN)/uv pip compile pyproject.toml --universal --python-version 3.11 --extra dev --extra docs --extra viz \
 		--generate-hashes --no-annotate --custom-compile-command "make lock" $(UPGRADE) \
 		--quiet --output-file requirements.lock
