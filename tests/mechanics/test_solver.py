@@ -7,7 +7,10 @@ import pytest
 from scipy import sparse
 
 from mvest.errors import InputError
+from mvest.mechanics import BiotLaw, Loads, System, TransverselyIsotropic, box
+from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import LinearSolver, SuperLUSolver, linear_solver
+from mvest.valve.mesh.solid_mesh import SolidMesh
 from tests.mechanics.bodies import sandwich
 
 
@@ -118,6 +121,64 @@ def test_all_solvers_agree(tangent):
         results.append(solver.solve(right))
     for other in results[1:]:
         np.testing.assert_allclose(other, results[0], atol=1e-9 * np.abs(results[0]).max())
+
+
+@pytest.fixture(scope="module")
+def thin():
+    """Tangent of a clamped sheet 2000 times as long as thick, and a load across it."""
+    nodes, elements = box("hex18", (40, 2, 1), (60.0, 2.0, 0.03))
+    fibre = np.broadcast_to([1.0, 0.0, 0.0], nodes.shape)
+    mesh = SolidMesh(
+        nodes, elements, "hex18", np.zeros(80, int), ("sheet",), fibre, np.zeros((0, 9), int)
+    )
+    solid = Solid(mesh, BiotLaw.of((TransverselyIsotropic.isotropic(2e7, 0.0),)))
+    system = System(solid, fixed_nodes=np.flatnonzero(nodes[:, 0] == 0))
+    blocks = system.evaluate(
+        nodes, Loads(fixed=nodes[system.fixed_nodes]), None, solid.initial_strain(), 0.0,
+        tangent=True,
+    ).blocks  # fmt: skip
+    right = np.zeros_like(nodes)
+    right[nodes[:, 0] == 60.0, 2] = 0.01
+    return system.matrix(blocks, 0.0), right.ravel()
+
+
+@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-9, 1e-13])
+def test_a_thin_sheet_is_solved_as_well_as_its_condition_allows(thin, name, tolerance):
+    """Round-off over a condition beyond 1e13 leaves no residual below 1e-6 of the load."""
+    matrix, right = thin
+    exact = sparse.linalg.splu(matrix.tocsc())
+    inverse = sparse.linalg.LinearOperator(
+        matrix.shape, matvec=exact.solve, rmatvec=lambda v: exact.solve(v, "T")
+    )
+    condition = sparse.linalg.onenormest(inverse) * abs(matrix).sum(axis=0).max()
+    assert condition > 1e13
+    solver = linear_solver(name)
+    solver.factorize(matrix)
+    solution = solver.solve(right, tolerance)
+    assert solver.name == name  # nothing else had to take its place
+    residual = np.abs(matrix @ solution - right).max()
+    assert residual < 1e-14 * np.abs(matrix.data).max() * np.abs(solution).max()
+    # The beam's answer, P L^3 / (3 E I), which nothing but a good solution comes near.
+    assert solution[2::3].max() == pytest.approx(
+        right.sum() * 60.0**3 / (3 * 2e7 * 2.0 * 0.03**3 / 12), rel=0.01
+    )
+
+
+def test_superlu_takes_the_place_of_pardiso_where_the_symmetric_part_says_nothing(tangent):
+    if "pardiso" not in available():
+        pytest.skip("PARDISO is not installed")
+    matrix, right = tangent
+    noise = np.random.default_rng(2).normal(size=(300, 300))
+    other = sparse.bsr_matrix(noise - noise.T + 1e-6 * np.eye(300), blocksize=(3, 3))
+    solver = linear_solver("pardiso")
+    solver.factorize(other)
+    one = np.ones((300, 2))
+    np.testing.assert_allclose(other @ solver.solve(one), one, atol=1e-9)
+    assert solver.name == "pardiso, superlu for 1 matrix"
+    solver.factorize(matrix)  # for which PARDISO is good again
+    np.testing.assert_allclose(matrix @ solver.solve(right), right, atol=1e-9)
+    assert solver.name == "pardiso, superlu for 1 matrix"
 
 
 @pytest.mark.parametrize("name", available())
