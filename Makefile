@@ -22,7 +22,7 @@ DEVELOP := .venv/.develop
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-UV := $(BIN)/uv pip install --quiet --python .venv
+UV := $(BIN)/uv pip install --quiet --compile-bytecode --python .venv
 
 $(INSTALLED): requirements.lock pyproject.toml
 	@if [ -z "$(PYTHON)" ]; then echo "mvest needs Python 3.11 or newer; name one with make PYTHON=..." >&2; exit 1; fi
