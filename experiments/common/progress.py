@@ -17,7 +17,14 @@ from tqdm import tqdm
 from mvest.mechanics.solid import kernels_are_compiled
 from mvest.typing import FloatArray
 
-__all__ = ["TYPICAL_SOLVES", "PartBar", "SolveBar", "announce_compilation", "duration"]
+__all__ = [
+    "TYPICAL_SOLVES",
+    "PartBar",
+    "SolveBar",
+    "announce_compilation",
+    "duration",
+    "say",
+]
 
 SAY = 30.0
 """Seconds between two lines about the pieces of a part where no terminal shows its bar."""
@@ -33,7 +40,7 @@ QUICK = 1.0
 def announce_compilation(following: str = "the computation") -> None:
     """Say once that the first run after an installation takes longer, why, and what follows."""
     if not kernels_are_compiled():
-        _say(f"compiling on first use; this takes about a minute once, then {following} goes on")
+        say(f"compiling on first use; this takes about a minute once, then {following} goes on")
 
 
 def duration(seconds: float) -> str:
@@ -101,7 +108,7 @@ class SolveBar:
         if self._compiling:
             self._compiling = False
             spent = duration(self._now - self._began)
-            _say(f"compiled after {spent}; {self._title}, forward solve 1 is under way")
+            say(f"compiled after {spent}; {self._title}, forward solve 1 is under way")
         if self._bar.total is not None and self._bar.n >= self._bar.total:
             self._bar.total += self._steps
         self._bar.set_description(f"{self._title}, forward solve {self._solve}", refresh=False)
@@ -120,7 +127,7 @@ class SolveBar:
             name = self._names[k] if len(self._names) == len(m) else f"m[{k}]"
             moved = "" if before is None else f" ({value - before[0][k]:+.2g})"
             values.append(f"{name} {value:.4g}{moved}")
-        _say(
+        say(
             f"{self._title}, step {number} of the filter: objective {objective:.4g}{change}; "
             f"{', '.join(values)}; {self._left()}"
         )
@@ -133,7 +140,7 @@ class SolveBar:
         self._solving += spent
         if self._now - self._said >= QUICK:
             self._said = self._now
-            _say(
+            say(
                 f"{self._title}, forward solve {self._solve}: {self._steps_made} time steps in "
                 f"{spent:.1f} s; {self._left()}"
             )
@@ -181,7 +188,7 @@ class PartBar:
     ) -> None:
         self._bar.close()
         if kind is None:
-            _say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
+            say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
 
     def step(self) -> None:
         """One more piece is done."""
@@ -192,12 +199,13 @@ class PartBar:
             self._said = now
             spent = now - self._began
             left = duration(spent / self._done * (self._total - self._done))
-            _say(
+            say(
                 f"{self._title}: {self._done} of {self._total} {self._unit}s, "
                 f"{duration(spent)} elapsed, about {left} left"
             )
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """Write a line to standard error, above a bar if there is one."""
     tqdm.write(text, file=sys.stderr)
     sys.stderr.flush()

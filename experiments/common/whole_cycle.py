@@ -2,40 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from experiments.common.build import closure_model
+from experiments.common.build import build_filter, closure_model
 from experiments.common.cycle_settings import CycleSettings
+from experiments.common.findings import finite, vector
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.store import Store, StoredModel
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Estimate
+from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import identifiability
 from mvest.estimation.information.model_error import shift_by_model_error
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
-from mvest.estimation.transform import to_filter
+from mvest.estimation.transform import Transform, to_filter
 from mvest.typing import FloatArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = [
     "Bound",
+    "CycleEstimator",
     "MeshShift",
+    "TrueCycle",
     "closed_frame",
     "cycle_model",
     "finer_steps",
     "frames_on_mesh",
+    "iterated_from",
     "shift_by_check_mesh",
     "stored_cycle",
     "stored_frames",
+    "true_cycle",
 ]
 
 Values = Mapping[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +82,9 @@ class Bound:
         return cls(
             label,
             len(frames),
-            tuple(map(_finite, bound.std / bound.scale)),
-            tuple(tuple(map(_finite, row)) for row in bound.correlation),
-            _finite(bound.condition_number),
+            tuple(map(finite, bound.std / bound.scale)),
+            tuple(tuple(map(finite, row)) for row in bound.correlation),
+            finite(bound.condition_number),
             tuple(bound.flat(0.05)),
         )
 
@@ -85,16 +94,103 @@ def cycle_model(config: Values, protocol: CycleProtocol) -> CycleModel:
     return CycleModel(closure_model(config), protocol)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueCycle:
+    """What a model of its own, of which no estimator sees anything, says of the truth.
+
+    Attributes
+    ----------
+    frames : (f, n, 3)
+        mm.
+    jacobian : (f, n, 3, p)
+    mesh : SolidMesh
+    """
+
+    frames: FloatArray
+    jacobian: FloatArray
+    mesh: SolidMesh
+
+
+def true_cycle(config: Values, protocol: CycleProtocol, truth: FloatArray) -> TrueCycle:
+    """The cycle of the true parameters ``(p,)``.
+
+    Raises
+    ------
+    ConfigurationError
+        If the cycle cannot be followed to its end.
+    """
+    model = cycle_model(config, protocol)
+    with SolveBar("true cycle", len(protocol.steps()), 1) as bar:
+        model.closure.on_step = bar.step
+        found = stored_cycle(config, model)(truth)
+    if not found.converged:
+        raise ConfigurationError(f"the truth has no cycle: {found.reason}")
+    frames = found.y.reshape(len(protocol.times), -1, 3)
+    jacobian = found.jacobian.reshape(*frames.shape, len(truth))
+    return TrueCycle(frames, jacobian, model.closure.mesh)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleEstimator:
+    """Estimates with one model, which says how far each is.
+
+    Attributes
+    ----------
+    model : CycleModel
+    parameters : tuple of str, (p,)
+    transform : Transform
+    prior : Gaussian
+        Of the parameters.
+    """
+
+    model: CycleModel
+    parameters: tuple[str, ...]
+    transform: Transform
+    prior: Gaussian
+
+    @classmethod
+    def of(cls, config: Values, protocol: CycleProtocol) -> CycleEstimator:
+        """As it is configured."""
+        parameters = tuple(config["parameters"])
+        _, transform, prior = build_filter(config["filter"], parameters)
+        return cls(cycle_model(config, protocol), parameters, transform, prior)
+
+    def __call__(
+        self,
+        label: str,
+        filter_: Callable[..., T],
+        seen: ObservationModel,
+        observation: CycleObservation,
+    ) -> T:
+        """What a filter makes of an observation that ``seen`` predicts."""
+        steps = len(self.model.protocol.steps())
+        with SolveBar(label, steps, TYPICAL_SOLVES, self.parameters) as bar:
+            self.model.closure.on_step = bar.step
+            return filter_(
+                seen,
+                self.prior,
+                observation.y,
+                observation.R,
+                names=self.parameters,
+                transform=self.transform,
+                on_iterate=bar.iterate,
+            )
+
+
+def iterated_from(config: Values, start: FloatArray) -> IteratedFilter:
+    """The configured iterated filter, whose search begins at parameters ``start (p,)``."""
+    settings = config["filter"]
+    return IteratedFilter(
+        settings["tolerance"], max_iterations=settings["max_iterations"], start=vector(start)
+    )
+
+
 def closed_frame(protocol: CycleProtocol) -> int:
     """The last frame in which the valve is held closed."""
     held = [k for k, t in enumerate(protocol.times) if protocol.phase(t) > 1 - 1e-9]
     if not held:
         raise ConfigurationError("cycle.protocol.times has no frame on the plateau of the pressure")
     return held[-1]
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def stored_cycle(config: Values, model: CycleModel) -> StoredModel:

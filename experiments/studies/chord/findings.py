@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.common.findings import Rows, Vector, rows, vector
 from experiments.common.record import Status
 from experiments.common.whole_cycle import Bound
 from mvest.estimation.estimate import Estimate
@@ -14,8 +15,6 @@ from mvest.estimation.information.consistency import nees
 from mvest.typing import FloatArray
 
 __all__ = ["Findings", "Fit"]
-
-Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,7 @@ class Fit:
     estimate: Vector
     error: Vector
     std: Vector
-    correlation: tuple[Vector, ...]
+    correlation: Rows
     nees: float
     runs: int
 
@@ -63,10 +62,10 @@ class Fit:
             seed,
             "converged" if found.converged else "failed",
             found.reason.value,
-            tuple(found.mean.tolist()),
-            tuple((found.mean / truth - 1).tolist()),
-            tuple(std.tolist()),
-            tuple(map(tuple, (covariance / np.outer(std, std)).tolist())),
+            vector(found.mean),
+            vector(found.mean / truth - 1),
+            vector(std),
+            rows(covariance / np.outer(std, std)),
             nees(offset, covariance),
             found.forward_solves,
         )

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
-from experiments.common.build import build_filter
 from experiments.common.expectation import expect_cycle
+from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import say
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
-from experiments.common.whole_cycle import Bound, closed_frame, cycle_model
+from experiments.common.whole_cycle import (
+    Bound,
+    CycleEstimator,
+    closed_frame,
+    iterated_from,
+    true_cycle,
+)
 from experiments.studies.chord.findings import Findings, Fit
 from experiments.studies.chord.report import chord_figure, chord_table, chord_words
 from experiments.studies.chord.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
-from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
-from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.transform import to_filter
 from mvest.typing import FloatArray
 
@@ -36,16 +38,12 @@ def run_chord(job: Job[Settings]) -> Outcome[Findings]:
         If the truth has no cycle.
     """
     values, settings = job.values, job.settings.cycle
-    parameters, protocol, noise = tuple(values["parameters"]), settings.protocol, settings.noise_mm
-    _, transform, prior = build_filter(values["filter"], parameters)
+    protocol, noise = settings.protocol, settings.noise_mm
     truth = np.array(values["truth"]["values"], dtype=float)
-    # The truth is made by an object of its own; the estimator gets the observation alone.
-    maker, model = (cycle_model(values, protocol) for _ in range(2))
-    at_truth = maker(truth)
-    if not at_truth.converged:
-        raise ConfigurationError(f"the truth has no cycle: {at_truth.reason}")
-    frames = at_truth.y.reshape(len(protocol.times), -1, 3)
-    jacobian = at_truth.jacobian.reshape(*frames.shape, -1)
+    true = true_cycle(values, protocol, truth)
+    frames, jacobian = true.frames, true.jacobian
+    estimator = CycleEstimator.of(values, protocol)
+    prior = estimator.prior
     sets = {
         "open and closed": [0, closed_frame(protocol)],
         "whole cycle": list(range(len(frames))),
@@ -56,27 +54,13 @@ def run_chord(job: Job[Settings]) -> Outcome[Findings]:
         return CycleObservation.simulated(frames, noise, rng)
 
     # Both sets are predicted from the same runs.
-    whole = observed(0).of(model)
+    whole = observed(0).of(estimator.model)
 
     def fit(label: str, observation: CycleObservation, start: FloatArray) -> Estimate:
-        filter_ = IteratedFilter(
-            values["filter"]["tolerance"],
-            max_iterations=values["filter"]["max_iterations"],
-            start=tuple(map(float, start)),
-        )
-        with SolveBar(label, len(model.protocol.steps()), TYPICAL_SOLVES, parameters) as bar:
-            model.closure.on_step = bar.step
-            found = filter_(
-                observation.of(whole),
-                prior,
-                observation.y,
-                observation.R,
-                names=parameters,
-                transform=transform,
-                on_iterate=bar.iterate,
-            )
+        filter_ = iterated_from(values, start)
+        found = estimator(label, filter_, observation.of(whole), observation)
         errors = ", ".join(f"{100 * e:+.1f} %" for e in found.mean / truth - 1)
-        print(f"{label}: {errors} ({found.reason.value})", file=sys.stderr, flush=True)
+        say(f"{label}: {errors} ({found.reason.value})")
         return found
 
     results, bounds = [], []
@@ -90,9 +74,9 @@ def run_chord(job: Job[Settings]) -> Outcome[Findings]:
         found = fit(f"seed {seed}", observed(seed), start)
         results.append(Fit.of("whole cycle", seed, found, truth))
     findings = Findings(
-        truth=tuple(truth.tolist()),
-        start=tuple(prior.mean.tolist()),
-        prior_std=tuple(to_filter(transform, prior).std.tolist()),
+        truth=vector(truth),
+        start=vector(prior.mean),
+        prior_std=vector(to_filter(estimator.transform, prior).std),
         noise_mm=noise,
         times=protocol.times,
         vertices=frames.shape[1],
@@ -101,12 +85,12 @@ def run_chord(job: Job[Settings]) -> Outcome[Findings]:
         measures={
             f"{what}.{name}": value
             for what, shares in (("error", results[1].error), ("std", results[1].std))
-            for name, value in zip(parameters, shares, strict=True)
+            for name, value in zip(estimator.parameters, shares, strict=True)
         },
     )
     return outcome_of(
         findings,
-        model.closure.mesh,
+        true.mesh,
         sum(entry.runs for entry in results),
         (entry.reason for entry in results if entry.status != "converged"),
     )

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from experiments.common.findings import Rows, Vector
 from experiments.common.whole_cycle import Bound
 
 __all__ = ["Along", "Band", "Curve", "Drift", "Findings", "Frame", "Steps"]
 
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
+Rows = Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Steps:
     dt: Vector
     rms_mm: tuple[float | None, ...]
     order: tuple[float | None, ...]
-    path: Matrix
+    path: Rows
     along: tuple[Along, ...]
     runs: int
 
@@ -106,9 +106,9 @@ class Band:
         Share of the beats in which the truth lies within the band.
     """
 
-    mean: Matrix
-    low: Matrix
-    high: Matrix
+    mean: Rows
+    low: Rows
+    high: Rows
     rms_error: Vector
     mean_std: Vector
     coverage: Vector
@@ -135,7 +135,7 @@ class Drift:
     runs: int
     parameters: tuple[str, ...]
     times: Vector
-    truth: Matrix
+    truth: Rows
     assumed_std: float
     filter: Band
     smoother: Band

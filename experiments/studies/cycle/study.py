@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -13,8 +12,9 @@ import numpy as np
 from experiments.common.build import build_filter
 from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import expect_cycle
+from experiments.common.findings import finite, rows, vector
 from experiments.common.forward import outcome_of
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
@@ -24,6 +24,7 @@ from experiments.common.whole_cycle import (
     cycle_model,
     stored_cycle,
     stored_frames,
+    true_cycle,
 )
 from experiments.studies.cycle.findings import Along, Band, Curve, Drift, Findings, Frame, Steps
 from experiments.studies.cycle.report import cycle_figure, cycle_table, cycle_words
@@ -61,14 +62,8 @@ def run_cycle(job: Job[Settings]) -> Outcome[Findings]:
     """
     values, settings = job.values, job.settings.cycle
     truth, protocol = np.array(values["truth"]["values"], dtype=float), settings.protocol
-    model = cycle_model(values, protocol)
-    with SolveBar("cycle", len(protocol.steps()), 1) as bar:
-        model.closure.on_step = bar.step
-        prediction = stored_cycle(values, model)(truth)
-    if not prediction.converged:
-        raise ConfigurationError(f"the truth has no cycle: {prediction.reason}")
-    frames = prediction.y.reshape(len(protocol.times), -1, 3)
-    H = prediction.jacobian.reshape(*frames.shape, len(truth))
+    true = true_cycle(values, protocol, truth)
+    frames, H = true.frames, true.jacobian
     closed = closed_frame(protocol)
 
     def bound(label: str, wanted: list[int]) -> Bound:
@@ -87,7 +82,7 @@ def run_cycle(job: Job[Settings]) -> Outcome[Findings]:
     steps = _time_steps(values, settings, truth)
     drift, runs = _drift(values, settings, truth)
     findings = Findings(
-        truth=_of(truth),
+        truth=vector(truth),
         noise_mm=settings.noise_mm,
         vertices=frames.shape[1],
         frames=tuple(
@@ -106,15 +101,7 @@ def run_cycle(job: Job[Settings]) -> Outcome[Findings]:
         },
     )
     failed = (drift,) if isinstance(drift, str) else ()
-    return outcome_of(findings, model.closure.mesh, 1 + steps.runs + runs, failed)
-
-
-def _of(values: FloatArray) -> tuple[float, ...]:
-    return tuple(values.tolist())
-
-
-def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(_of, values))
+    return outcome_of(findings, true.mesh, 1 + steps.runs + runs, failed)
 
 
 def _frame(
@@ -134,13 +121,13 @@ def _frame(
         time,
         protocol.pressure_mmHg * protocol.phase(time),
         float(np.linalg.norm(frames[k] - frames[0], axis=1).mean()),
-        tuple(float(v) if np.isfinite(v) else None for v in std),
+        tuple(map(finite, std)),
     )
 
 
 def _curve(protocol: CycleProtocol) -> Curve:
     t = np.linspace(0.0, protocol.times[-1], 141)
-    return Curve(_of(t), tuple(protocol.pressure_mmHg * protocol.phase(v) for v in t))
+    return Curve(vector(t), tuple(protocol.pressure_mmHg * protocol.phase(v) for v in t))
 
 
 def _time_steps(values: Values, settings: CycleSettings, truth: FloatArray) -> Steps:
@@ -162,10 +149,10 @@ def _time_steps(values: Values, settings: CycleSettings, truth: FloatArray) -> S
         changes = tuple(_rms(b - a) for a, b in pairwise(frames))
         along.append(Along(changes, reason))
         said = reason or f"unevenness {max(changes) / np.median(changes):.1f}"
-        print(f"time step {dt:g} s: {said}", file=sys.stderr, flush=True)
+        say(f"time step {dt:g} s: {said}")
     whole = tuple(None if a is None or b is None else _rms(b - a) for a, b in pairwise(found))
     order = tuple(None if not (a and b) else float(np.log2(a / b)) for a, b in pairwise(whole))
-    return Steps(dts, whole, order, _rows(path), tuple(along), len(dts) * len(path))
+    return Steps(dts, whole, order, rows(path), tuple(along), len(dts) * len(path))
 
 
 def _followed(config: Values, model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], str]:
@@ -209,7 +196,7 @@ def _drift(values: Values, settings: CycleSettings, truth: FloatArray) -> tuple[
     with SolveBar("drift", len(protocol.steps()), beats * TYPICAL_SOLVES) as bar:
         model.closure.on_step = bar.step
         found = smoother(Beats(stored_cycle(changed, model)), initial, y, R, transform=Log())
-    print(f"drift: {found.reason.value}, {found.forward_solves} runs", file=sys.stderr, flush=True)
+    say(f"drift: {found.reason.value}, {found.forward_solves} runs")
     if found.smoothed is None:
         return found.detail, found.forward_solves
     runs = found.forward_solves + beats
@@ -223,7 +210,7 @@ def _drift(values: Values, settings: CycleSettings, truth: FloatArray) -> tuple[
         runs,
         parameters,
         settings.beat_times,
-        _rows(path),
+        rows(path),
         settings.drift_std,
         _band(filtered, path),
         _band(found.smoothed, path),
@@ -235,12 +222,12 @@ def _band(trajectory: Trajectory, path: FloatArray) -> Band:
     error = trajectory.mean - np.log(path)
     low, high = (np.exp(trajectory.mean + s * 1.96 * trajectory.std) for s in (-1, 1))
     return Band(
-        _rows(np.exp(trajectory.mean)),
-        _rows(low),
-        _rows(high),
-        _of(np.sqrt(np.mean(error**2, axis=0))),
-        _of(trajectory.std.mean(axis=0)),
-        _of(np.mean(np.abs(error) <= 1.96 * trajectory.std, axis=0)),
+        rows(np.exp(trajectory.mean)),
+        rows(low),
+        rows(high),
+        vector(np.sqrt(np.mean(error**2, axis=0))),
+        vector(trajectory.std.mean(axis=0)),
+        vector(np.mean(np.abs(error) <= 1.96 * trajectory.std, axis=0)),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
 
 __all__ = [
@@ -18,8 +19,6 @@ __all__ = [
     "Spread",
     "Summary",
 ]
-
-Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +213,8 @@ class Findings:
 
     estimate: Vector | None
     std: Vector | None
-    iterates: tuple[Vector, ...] | None
-    iterate_std: tuple[Vector, ...] | None
+    iterates: Rows | None
+    iterate_std: Rows | None
     moduli: tuple[Modulus, ...]
     distance_mm: Spread | None
     innovation: Innovation | None

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of
+from experiments.common.findings import finite, vector
 from experiments.common.progress import SolveBar
 from experiments.common.record import Mesh, Outcome
 from experiments.common.study import Job, Section, Study
@@ -213,10 +214,10 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
     recording = donor_file(job.values["paths"]["donor"]).read_bytes()
     filtered = first.filtered
     findings = Findings(
-        estimate=_of(first.estimate),
-        std=_of(first.std),
-        iterates=None if filtered is None else _rows(filtered.iterates),
-        iterate_std=None if filtered is None else _rows(filtered.iterate_std),
+        estimate=None if first.estimate is None else vector(first.estimate),
+        std=None if first.std is None else vector(first.std),
+        iterates=None if filtered is None else tuple(map(vector, filtered.iterates)),
+        iterate_std=None if filtered is None else tuple(map(vector, filtered.iterate_std)),
         moduli=tuple(Modulus(m.region, m.name, m.estimate, m.std) for m in first.moduli),
         distance_mm=_spread(first),
         innovation=_innovation(first),
@@ -241,14 +242,6 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
     )
 
 
-def _of(values: FloatArray | None) -> tuple[float, ...] | None:
-    return None if values is None else tuple(values.tolist())
-
-
-def _rows(values: FloatArray) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, np.asarray(values).tolist()))
-
-
 def _spread(result: StudyResult) -> Spread | None:
     d = result.distance
     return None if d is None else Spread(float(d.mean()), float(d.std()), float(d.max()))
@@ -265,10 +258,9 @@ def _identified(result: StudyResult) -> Identified | None:
     found = result.identifiability
     if found is None:
         return None
-    condition = found.condition_number
     return Identified(
-        tuple(float(v) if np.isfinite(v) else None for v in found.std),
-        float(condition) if np.isfinite(condition) else None,
+        tuple(map(finite, found.std)),
+        finite(found.condition_number),
         tuple(found.flat()),
     )
 
@@ -356,7 +348,7 @@ def _generic_row(study: DonorStudy, fits: Fits) -> Row:
         closure="generic",
         status="converged" if closed.converged else "failed",
         reason="closed" if closed.converged else closed.reason,
-        start=tuple(study.prior.mean.tolist()),
+        start=vector(study.prior.mean),
         estimate=None,
         std=None,
         distance_mm=_distances(study, _closed(closed)) if closed.converged else None,
@@ -375,9 +367,9 @@ def _fit_row(
         closure=name,
         status="converged" if result.converged else "failed",
         reason=result.reason,
-        start=tuple(start.tolist()),
-        estimate=_of(result.estimate),
-        std=_of(result.std),
+        start=vector(start),
+        estimate=None if result.estimate is None else vector(result.estimate),
+        std=None if result.std is None else vector(result.std),
         distance_mm=None if fitted is None else _distances(study, fitted[-1]),
         iterations=0 if filtered is None else filtered.iterations,
         forward_solves=0 if filtered is None else filtered.forward_solves,

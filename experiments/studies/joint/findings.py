@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from experiments.common.findings import Vector, vector
 from experiments.common.record import Status
 from experiments.common.whole_cycle import Bound
 from mvest.closure.cycle.observation import CycleObservation
@@ -13,8 +14,6 @@ from mvest.estimation.information.consistency import nees
 from mvest.typing import FloatArray
 
 __all__ = ["Findings", "Fit", "Frame", "MeshError", "OtherMesh", "Pass", "measures_of"]
-
-Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +52,9 @@ class Fit:
         return cls(
             "converged" if found.converged else "failed",
             found.reason.value,
-            tuple(found.mean.tolist()),
-            tuple((error / truth).tolist()),
-            tuple((found.std / truth).tolist()),
+            vector(found.mean),
+            vector(error / truth),
+            vector(found.std / truth),
             nees(error, found.covariance),
             found.iterations,
             found.forward_solves,

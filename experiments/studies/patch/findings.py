@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from experiments.common.findings import Vector
 from experiments.common.record import Status
 from mvest.mechanics.settings import ModulusField, StiffPatch
 
 __all__ = ["Compared", "Findings", "Fit", "Places"]
-
-Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)

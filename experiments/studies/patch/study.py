@@ -7,24 +7,26 @@ shows there is what the other mesh and the noise alone leave behind.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from experiments.common.build import build_filter, mechanics_of, template_of
+from experiments.common.build import mechanics_of, template_of
 from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import expect_cycle
+from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import say
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
+    CycleEstimator,
     cycle_model,
     finer_steps,
+    iterated_from,
     shift_by_check_mesh,
     stored_cycle,
 )
@@ -34,7 +36,6 @@ from experiments.studies.patch.settings import PatchSettings, Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate
-from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.prediction import ObservationModel
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.law.field import FieldBasis
@@ -57,11 +58,10 @@ def run_patch(job: Job[Settings]) -> Outcome[Findings]:
         If the truth has no cycle.
     """
     values, settings = job.values, job.settings.cycle
-    parameters = tuple(values["parameters"])
-    _, transform, prior = build_filter(values["filter"], parameters)
+    estimator = CycleEstimator.of(values, settings.protocol)
+    model, prior = estimator.model, estimator.prior
     patch = _patch(values, job.settings.patch)
-    model = cycle_model(values, settings.protocol)
-    leaflet = _Leaflet(values, parameters, patch, job.settings.patch.angle_deg)
+    leaflet = _Leaflet(values, estimator.parameters, patch, job.settings.patch.angle_deg)
     start, results = prior.mean, {}
     seen: ObservationModel | None = None
     valves: dict[str, dict[str, StiffPatch]] = {"patch": {"patch": patch}}
@@ -72,30 +72,15 @@ def run_patch(job: Job[Settings]) -> Outcome[Findings]:
         rng = np.random.default_rng(values["seed"])
         observation = CycleObservation.simulated(frames, settings.noise_mm, rng)
         seen = seen or observation.of(stored_cycle(values, model))
-        filter_ = IteratedFilter(
-            values["filter"]["tolerance"],
-            max_iterations=values["filter"]["max_iterations"],
-            start=tuple(map(float, start)),
-        )
-        with SolveBar(label, len(model.protocol.steps()), TYPICAL_SOLVES, parameters) as bar:
-            model.closure.on_step = bar.step
-            found = filter_(
-                seen,
-                prior,
-                observation.y,
-                observation.R,
-                names=parameters,
-                transform=transform,
-                on_iterate=bar.iterate,
-            )
-        print(f"{label}: {found.reason.value}, {found.detail}", file=sys.stderr, flush=True)
+        found = estimator(label, iterated_from(values, start), seen, observation)
+        say(f"{label}: {found.reason.value}, {found.detail}")
         by = shift_by_check_mesh(values, settings, found, seen, prior, observation)
         shift = None if isinstance(by, str) else by.shift
         results[label] = Fit(
             "converged" if found.converged else "failed",
             found.reason.value,
-            tuple(found.mean.tolist()),
-            tuple(found.transformed.std.tolist()),
+            vector(found.mean),
+            vector(found.transformed.std),
             found.forward_solves,
             found.residual_rms(observation.y),
             leaflet.compared(found, shift, bool(patches)),
@@ -112,7 +97,7 @@ def run_patch(job: Job[Settings]) -> Outcome[Findings]:
         times=settings.protocol.times,
         vertices=len(model.closure.valve.surface.vertices),
         cells_of_truth=(settings.finer_columns, settings.finer_rows),
-        prior_std=tuple(to_filter(transform, prior).std.tolist()),
+        prior_std=vector(to_filter(estimator.transform, prior).std),
         map=leaflet.places(),
         results=results,
         measures={
@@ -204,8 +189,8 @@ class _Leaflet:
     def places(self) -> Places:
         """Where the points are on the unrolled leaflet, and their triangles."""
         return Places(
-            tuple(np.round(self.along, 3).tolist()),
-            tuple(np.round(self.down, 3).tolist()),
+            vector(np.round(self.along, 3)),
+            vector(np.round(self.down, 3)),
             tuple(map(tuple, self.triangles.tolist())),
         )
 
@@ -225,9 +210,9 @@ class _Leaflet:
         error = log - truth
         moved = None if shift is None else self.rows @ shift
         return Compared(
-            truth=tuple(np.exp(truth).tolist()),
-            modulus=tuple(np.exp(log).tolist()),
-            log_std=tuple(std.tolist()),
+            truth=vector(np.exp(truth)),
+            modulus=vector(np.exp(log)),
+            log_std=vector(std),
             at_centre=float(np.exp(log[middle])),
             true_at_centre=float(np.exp(truth[middle])),
             log_std_at_centre=float(std[middle]),
