@@ -13,7 +13,14 @@ from experiments.common.record import Record
 from mvest.files import write_atomically
 from mvest.reporting.figures import save_figure_with
 
-__all__ = ["axis_label", "parameter_label", "percent", "write_each", "write_report"]
+__all__ = [
+    "answer_of_main",
+    "axis_label",
+    "parameter_label",
+    "percent",
+    "write_each",
+    "write_report",
+]
 
 F = TypeVar("F")
 
@@ -46,6 +53,11 @@ def parameter_label(name: str) -> str:
 def percent(value: float | None, form: str, missing: str) -> str:
     """A share in percent, or what is said where there is none."""
     return missing if value is None else f"{100 * value:{form}} %"
+
+
+def answer_of_main(answer: Callable[[Record[F]], str]) -> Callable[[Mapping[str, Record[F]]], str]:
+    """The answer of a section whose table has one record, or is answered by its main one."""
+    return lambda records: answer(next(iter(records.values())))
 
 
 def write_report(

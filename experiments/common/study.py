@@ -66,8 +66,10 @@ class Section:
         Of the kept records; empty: of this name.
     answer : callable or None
         Name -> kept record of the table -> what follows, in one line.
+    headline : bool
+        Whether the page begins with its answer.
     opens : str
-        The picture of it with which the page begins, above its answer; empty for most.
+        The picture of it that stands there too, above its answer; empty for most.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Section:
     validation: bool = False
     table: str = ""
     answer: Callable[[Mapping[str, Record[Any]]], str] | None = None
+    headline: bool = False
     opens: str = ""
 
 

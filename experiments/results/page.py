@@ -85,7 +85,7 @@ def write_report(results: Path) -> Path:
         ],
         # What failed stands beside what did not, also where it has no picture.
         opening=sorted(
-            (section for section in others if section["answer"]),
+            (section for section in others if section["headline"] and section["answer"]),
             key=lambda section: not section["validation"],
         ),
     )
@@ -206,6 +206,7 @@ def _other_section(
         ],
         "validation": section.validation,
         "answer": _answer(results, section, study),
+        "headline": section.headline,
         "opens": _opening(results, section),
     }
 

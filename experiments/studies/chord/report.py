@@ -12,7 +12,7 @@ from experiments.common.report import parameter_label, percent
 from experiments.studies.chord.findings import Findings, Fit
 from mvest.reporting.figures import COLOURS, MARKERS
 
-__all__ = ["chord_figure", "chord_table", "chord_words"]
+__all__ = ["chord_answer", "chord_figure", "chord_table", "chord_words"]
 
 IDENTIFIED = 0.5
 """A parameter counts as identified whose standard deviation is below this share of its prior's."""
@@ -97,6 +97,25 @@ def chord_words(record: Record[Findings]) -> str:
         if fit.status != "converged"
     ]
     return "\n".join(lines)
+
+
+def chord_answer(record: Record[Findings]) -> str:
+    """Which parameters the data determine, and which they do not."""
+    found = record.findings
+    whole = _first(found)[-1]
+    known = [
+        std < IDENTIFIED * prior for std, prior in zip(whole.std, found.prior_std, strict=True)
+    ]
+    rest = [
+        parameter_label(name)
+        for name, is_known in zip(record.parameters, known, strict=True)
+        if not is_known
+    ]
+    besides = f", not {' and '.join(rest)}" if rest else ""
+    return (
+        f"A whole simulated cycle halves what is unknown of {sum(known)} of {len(known)} "
+        f"parameters of leaflets and chordae{besides}."
+    )
 
 
 def _pairs(parameters: tuple[str, ...], fit: Fit) -> str:

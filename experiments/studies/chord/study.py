@@ -9,7 +9,7 @@ from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
     Bound,
@@ -19,7 +19,7 @@ from experiments.common.whole_cycle import (
     true_cycle,
 )
 from experiments.studies.chord.findings import Findings, Fit
-from experiments.studies.chord.report import chord_figure, chord_table, chord_words
+from experiments.studies.chord.report import chord_answer, chord_figure, chord_table, chord_words
 from experiments.studies.chord.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.estimation.estimate import Estimate
@@ -111,6 +111,7 @@ STUDY = Study(
                 "chord": "What is known of chordae and leaflets before and after the data."
                 " Simulated."
             },
+            answer=answer_of_main(chord_answer),
         ),
     ),
 )

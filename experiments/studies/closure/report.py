@@ -30,7 +30,14 @@ from mvest.typing import FloatArray
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.gap import Gap, find_gap
 
-__all__ = ["Findings", "closure_figure", "closure_table", "closure_words", "write_closure"]
+__all__ = [
+    "Findings",
+    "closure_answer",
+    "closure_figure",
+    "closure_table",
+    "closure_words",
+    "write_closure",
+]
 
 POSTERIOR = View("seen from the posterior side", 8.0, -90.0)
 CURVES = (
@@ -174,6 +181,17 @@ def _draw_curves(part: Any, found: Findings, moments: list[int]) -> None:
             ticks = [t for t in axes.get_xticks() if 0 <= t <= 0.9 * end]
             axes.set_xticks([*ticks, place[-1]], [*(f"{t:g}" for t in ticks), "at rest"])
             axes.set_xlim(-0.03 * end, 1.22 * end)
+
+
+def closure_answer(record: Record[Findings]) -> str:
+    """How well the simulated valve closes."""
+    rows = record.findings.rows
+    first, last = rows[0], rows[-1]
+    return (
+        f"The simulated valve closes from {first.orifice_mm2:.0f} to {last.orifice_mm2:.1f} mm² "
+        f"of orifice, {sum(row.intersections for row in rows)} intersecting faces in "
+        f"{len(rows)} stored steps."
+    )
 
 
 def closure_words(record: Record[Findings]) -> str:

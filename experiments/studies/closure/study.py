@@ -12,8 +12,14 @@ from experiments.common.build import closure_model, template_of
 from experiments.common.forward import outcome_of
 from experiments.common.progress import SolveBar
 from experiments.common.record import Outcome
+from experiments.common.report import answer_of_main
 from experiments.common.study import Job, Section, Study
-from experiments.studies.closure.report import Findings, closure_words, write_closure
+from experiments.studies.closure.report import (
+    Findings,
+    closure_answer,
+    closure_words,
+    write_closure,
+)
 from experiments.studies.closure.settings import Settings
 from mvest.closure.measures import measure_steps
 from mvest.closure.model import ClosureModel, ClosureResult
@@ -87,5 +93,12 @@ STUDY = Study(
     run=run_closure,
     words=closure_words,
     write=write_closure,
-    sections=(Section("closure", {"closure": "A valve closing. Simulated."}, validation=True),),
+    sections=(
+        Section(
+            "closure",
+            {"closure": "A valve closing. Simulated."},
+            validation=True,
+            answer=answer_of_main(closure_answer),
+        ),
+    ),
 )

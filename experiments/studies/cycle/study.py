@@ -16,7 +16,7 @@ from experiments.common.findings import finite, rows, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
     Bound,
@@ -27,7 +27,7 @@ from experiments.common.whole_cycle import (
     true_cycle,
 )
 from experiments.studies.cycle.findings import Along, Band, Curve, Drift, Findings, Frame, Steps
-from experiments.studies.cycle.report import cycle_figure, cycle_table, cycle_words
+from experiments.studies.cycle.report import cycle_answer, cycle_figure, cycle_table, cycle_words
 from experiments.studies.cycle.settings import Settings
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import Beats, CycleObservation
@@ -246,6 +246,7 @@ STUDY = Study(
                 "cycle": "The cycle and its frames, what they tell of each parameter, and a"
                 " modulus that drifts over beats, filtered and smoothed. Simulated."
             },
+            answer=answer_of_main(cycle_answer),
         ),
     ),
 )

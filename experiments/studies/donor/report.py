@@ -20,7 +20,7 @@ from mvest.files import write_atomically
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure_with
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["donor_figure", "donor_table", "donor_words", "write_donor"]
+__all__ = ["donor_answer", "donor_figure", "donor_table", "donor_words", "write_donor"]
 
 PLAIN = np.array([0.82, 0.80, 0.76])
 """Colour of the recorded valve, which has no distance from itself."""
@@ -135,6 +135,18 @@ def _whole(distance: Distances | None) -> dict[str, float]:
         return {}
     values = (distance.mean, distance.median, distance.rms, distance.max, distance.surface)
     return dict(zip(WHOLE, values, strict=True))
+
+
+def donor_answer(record: Record[Findings]) -> str:
+    """How near a recorded valve the model comes."""
+    summary = record.findings.summary
+    generic, fitted = summary.generic_mean_mm, summary.fitted_mean_mm
+    if generic is None or fitted is None:
+        return "A recorded donor tricuspid valve: no closed state of the model."
+    return (
+        f"A recorded donor tricuspid valve: the fitted model closes {fitted:.2f} mm from the "
+        f"recording on average, the generic one {generic:.2f} mm."
+    )
 
 
 def donor_words(record: Record[Findings]) -> str:

@@ -21,6 +21,7 @@ from experiments.common.build import build_filter, mechanics_of
 from experiments.common.findings import finite, vector
 from experiments.common.progress import SolveBar
 from experiments.common.record import Mesh, Outcome
+from experiments.common.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.donor.findings import (
     Data,
@@ -33,7 +34,7 @@ from experiments.studies.donor.findings import (
     Spread,
     Summary,
 )
-from experiments.studies.donor.report import donor_words, write_donor
+from experiments.studies.donor.report import donor_answer, donor_words, write_donor
 from experiments.studies.donor.settings import DonorSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -410,6 +411,10 @@ STUDY = Study(
     words=donor_words,
     write=write_donor,
     sections=(
-        Section("donor", {"donor": "A recorded donor tricuspid valve and closures of its model."}),
+        Section(
+            "donor",
+            {"donor": "A recorded donor tricuspid valve and closures of its model."},
+            answer=answer_of_main(donor_answer),
+        ),
     ),
 )

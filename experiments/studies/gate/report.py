@@ -9,12 +9,24 @@ import pandas as pd
 from experiments.common.record import Record
 from experiments.studies.gate.findings import Findings
 
-__all__ = ["gate_table", "gate_words"]
+__all__ = ["gate_answer", "gate_table", "gate_words"]
 
 
 def gate_table(record: Record[Findings]) -> pd.DataFrame:
     """One row per variation."""
     return pd.DataFrame(map(asdict, record.findings.rows))
+
+
+def gate_answer(record: Record[Findings]) -> str:
+    """Whether the closed valve depends on how it was computed."""
+    found = record.findings
+    failed = [row.case for row in found.rows if not row.passed]
+    largest = max((row.max_mm for row in found.rows if row.max_mm is not None), default=0.0)
+    return (
+        f"The closed state of the default valve under {len(found.rows) - 1} variations of numerics "
+        f"and moduli: no vertex more than {largest:.2g} mm from where it should be; gate "
+        + ("passed." if found.passed else f"NOT passed ({', '.join(failed) or 'slope'}).")
+    )
 
 
 def gate_words(record: Record[Findings]) -> str:

@@ -9,10 +9,10 @@ import numpy as np
 from experiments.common.build import closure_model
 from experiments.common.forward import outcome_of
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.gate.findings import Findings, Limits, Row
-from experiments.studies.gate.report import gate_table, gate_words
+from experiments.studies.gate.report import gate_answer, gate_table, gate_words
 from experiments.studies.gate.settings import Settings
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateRow, run_gate
 
@@ -58,5 +58,5 @@ STUDY = Study(
     run=run_gate_study,
     words=lambda record: gate_words(record).replace("**", ""),
     write=write_each(gate_table, gate_words),
-    sections=(Section("gate", validation=True),),
+    sections=(Section("gate", validation=True, answer=answer_of_main(gate_answer)),),
 )

@@ -281,5 +281,9 @@ STUDY = Study(
     write_run=lambda folder, record: write_case_tables(folder, flat(record)),
     keep=kept_of_volume,
     keeps_failures=True,
-    sections=(Section("volume", title="Moduli from simulated volumes", answer=volumes_answer),),
+    sections=(
+        Section(
+            "volume", title="Moduli from simulated volumes", answer=volumes_answer, headline=True
+        ),
+    ),
 )

@@ -15,7 +15,7 @@ from experiments.studies.joint.findings import Findings, Fit, Frame, MeshError, 
 from mvest.estimation.information.consistency import chi_square_band
 from mvest.reporting.figures import COLOURS, MARKERS
 
-__all__ = ["joint_figure", "joint_table", "joint_words"]
+__all__ = ["joint_answer", "joint_figure", "joint_table", "joint_words"]
 
 EXACT_LIMIT = 0.01
 """Relative error to be reached without noise."""
@@ -94,6 +94,25 @@ def joint_words(record: Record[Findings]) -> str:
     return "\n".join(lines)
 
 
+def joint_answer(record: Record[Findings]) -> str:
+    """How far all parameters are off together, by the estimator's mesh and by another."""
+    found = record.findings
+    count = len(found.truth)
+    own = max(abs(error) for error in found.exact.error)
+    other = found.finer.fit
+    beside = (
+        ""
+        if isinstance(found.mesh_error, str)
+        else f", {_worst_in_std(other, found.mesh_error.std):.1f} with the mesh's own error added"
+    )
+    return (
+        f"Errors of {count} parameters from a whole simulated cycle: up to {100 * own:.2g} % "
+        "without noise; where the truth comes from another mesh up to "
+        f"{100 * max(abs(error) for error in other.error):.2g} %, "
+        f"{_worst_in_std(other, other.std):.1f} stated standard deviations{beside}."
+    )
+
+
 def _mesh_rows(error: MeshError | str) -> list[str]:
     if isinstance(error, str):
         return []
@@ -126,6 +145,10 @@ def _other_mesh(found: Findings) -> str:
 
 def _in_std(fit: Fit, std: Sequence[float]) -> str:
     return ", ".join(f"{e / s:+.1f}" for e, s in zip(fit.error, std, strict=True))
+
+
+def _worst_in_std(fit: Fit, std: Sequence[float]) -> float:
+    return max(abs(e) / s for e, s in zip(fit.error, std, strict=True))
 
 
 def _band_words(n: int) -> str:

@@ -12,7 +12,7 @@ from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
     Bound,
@@ -33,7 +33,7 @@ from experiments.studies.joint.findings import (
     Pass,
     measures_of,
 )
-from experiments.studies.joint.report import joint_figure, joint_table, joint_words
+from experiments.studies.joint.report import joint_answer, joint_figure, joint_table, joint_words
 from experiments.studies.joint.settings import Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.estimation.estimate import Estimate
@@ -209,10 +209,12 @@ STUDY = Study(
                 "joint": "Estimates as frames come in, errors over seeds, and what two frames and"
                 " a whole cycle could tell. Simulated."
             },
+            answer=answer_of_main(joint_answer),
         ),
         Section(
             "joint_open",
             {"joint_open": "As the figure before, of a valve that opens fully. Simulated."},
+            answer=answer_of_main(joint_answer),
         ),
     ),
 )

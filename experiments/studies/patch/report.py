@@ -14,7 +14,7 @@ from matplotlib.tri import Triangulation
 from experiments.common.record import Record
 from experiments.studies.patch.findings import Findings
 
-__all__ = ["patch_figure", "patch_table", "patch_words"]
+__all__ = ["patch_answer", "patch_figure", "patch_table", "patch_words"]
 
 STIFFNESS_LIMIT = 0.2
 """Relative error of the peak that is to be met."""
@@ -51,6 +51,17 @@ def _verdict(found: Findings) -> str:
         f"Stiffness of the peak {100 * error:+.0f} % off, target {100 * STIFFNESS_LIMIT:g} %: "
         f"{'met' if stiff else 'missed'}. Place {entry.peak_distance_mm:.1f} mm off, target "
         f"{PLACE_LIMIT * radius:g} mm (half the patch's radius): {'met' if place else 'missed'}."
+    )
+
+
+def patch_answer(record: Record[Findings]) -> str:
+    """Whether the patch is seen."""
+    entry = record.findings.results["patch"].compared
+    return (
+        f"A simulated stiff patch of the anterior leaflet: peak "
+        f"{100 * (entry.peak / entry.true_at_centre - 1):+.0f} % off, "
+        f"{entry.peak_distance_mm:.1f} mm from its place; {100 * entry.within_two_std:.0f} % of "
+        "the leaflet within two stated standard deviations (95 % expected)."
     )
 
 

@@ -20,7 +20,7 @@ from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.common.whole_cycle import (
     CycleEstimator,
@@ -31,7 +31,7 @@ from experiments.common.whole_cycle import (
     stored_cycle,
 )
 from experiments.studies.patch.findings import Compared, Findings, Fit, Places
-from experiments.studies.patch.report import patch_figure, patch_table, patch_words
+from experiments.studies.patch.report import patch_answer, patch_figure, patch_table, patch_words
 from experiments.studies.patch.settings import PatchSettings, Settings
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.errors import ConfigurationError
@@ -247,6 +247,7 @@ STUDY = Study(
                 "patch": "True and estimated modulus of the unrolled anterior leaflet, and how"
                 " sure. Simulated."
             },
+            answer=answer_of_main(patch_answer),
         ),
     ),
 )

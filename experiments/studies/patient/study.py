@@ -276,6 +276,7 @@ STUDY = Study(
             "Table 3: distances of their closed valves (simulated)",
             table=PATIENTS,
             answer=patients_answer,
+            headline=True,
             opens="figure3",
         ),
         Section(
@@ -286,6 +287,7 @@ STUDY = Study(
             },
             "Virtual patients drawn at random (simulated)",
             answer=patients_answer,
+            headline=True,
             opens="population",
         ),
     ),

@@ -169,6 +169,7 @@ STUDY = Study(
             "Table 1",
             validation=True,
             answer=table1_answer,
+            headline=True,
             opens="table1_valve",
         ),
         Section("mesh_independence", title="Independence of the mesh", validation=True),
