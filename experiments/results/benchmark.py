@@ -217,9 +217,10 @@ def _profile(entry: Mapping[str, Any]) -> str:
     )
     return "\n\n".join(
         [
-            f"## Where the time of a guided closure goes: {entry['nodes']} nodes",
+            f"## Where the time of a {entry['closure']} closure goes: {entry['nodes']} nodes",
             f"{total:.1f} s of the CPU with two derivatives, guides included; "
-            f"{entry['iterations on the finest mesh']} Newton iterations on the finest mesh.",
+            f"{entry['iterations on the finest mesh']} Newton iterations on the finest mesh, "
+            f"{entry['factorisations']} factorisations and {entry['evaluations']} evaluations.",
             _readable(parts),
             "What bounds its parts, one thread (dense products for arithmetic, a long vector sum "
             "for memory):",

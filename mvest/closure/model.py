@@ -63,11 +63,14 @@ class ClosedState:
         Of the mesh's nodes.
     guide : ClosedState or None
         That of the model's guide.
+    slopes : (p, n, 3) mm or None
+        Derivatives of the positions by the parameters, if they are known.
     """
 
     at: FloatArray
     positions: FloatArray
     guide: ClosedState | None = None
+    slopes: FloatArray | None = None
 
 
 @dataclass(eq=False)
@@ -87,8 +90,9 @@ class ClosureModel:
     fixed : dict
         Values of the parameters that are not estimated.
     continuation : bool
-        Whether closures after the first start from the last closed state and go straight to the new
-        equilibrium (where the protocol ends in one), instead of closing the open valve again. The
+        Whether closures after the first start from the last closed state (where its derivatives
+        expect the next one, if it has been differentiated) and go straight to the new equilibrium
+        (where the protocol ends in one), instead of closing the open valve again. The
         closed state is the same as long as there is one only, which the gate
         (:mod:`mvest.closure.robustness`) examines.
     reach : float
@@ -200,6 +204,22 @@ class ClosureModel:
         change[positive] = np.log(end[positive] / start[positive])
         return change
 
+    def _expected_move(self, m: FloatArray) -> FloatArray | None:
+        """By how much ``(n, 3)`` mm the last closed state is expected to move; None if unknown.
+
+        Linear in the logarithms, by which the state changes more evenly than by the parameters.
+        """
+        closed = self._closed
+        if closed is None or closed.slopes is None:
+            return None
+        change = self._change(closed.at, m)
+        if change is None:
+            return None
+        # dx/dlog m = m dx/dm; a field's coefficient changes by its change over its unit.
+        positive = self._units == 0
+        by_change = np.where(positive, closed.at, 1 / np.where(positive, 1.0, self._units))
+        return np.tensordot(by_change * change, closed.slopes, 1)
+
     def _way_to(self, m: FloatArray) -> list[FloatArray]:
         """Parameters between the last closed state and ``m``, where that is continued from."""
         if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
@@ -236,7 +256,7 @@ class ClosureModel:
         """
         if not every_frame:
             for between in self._way_to(m):
-                result = self.close(between, sensitivities=False)
+                result = self.close(between)
                 if not result.simulation.converged:
                     return result
         self.closures += 1
@@ -245,7 +265,10 @@ class ClosureModel:
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
 
         def run(
-            steps: Sequence[Step], start: FloatArray | None = None, time: float = 0.0
+            steps: Sequence[Step],
+            start: FloatArray | None = None,
+            time: float = 0.0,
+            move: FloatArray | None = None,
         ) -> Simulation:
             return simulate(
                 system,
@@ -257,6 +280,7 @@ class ClosureModel:
                 final_only=not every_frame,
                 solver=self._solver,
                 initial_positions=start,
+                initial_move=move,
                 initial_time=time,
                 on_step=self.on_step,
             )
@@ -265,7 +289,10 @@ class ClosureModel:
         if steps[-1].static and not every_frame:
             end, last = self.settings.protocol.end, steps[-1]
             if self._closed is not None and self._near(m):
-                simulation = run([last], self._closed.positions, end)
+                move = self._expected_move(m)
+                simulation = run([last], self._closed.positions, end, move)
+                if move is not None and not simulation.converged:
+                    simulation = run([last], self._closed.positions, end)
             if self.guide is not None and (
                 simulation is None or (self.repeat and not simulation.converged)
             ):
@@ -278,7 +305,11 @@ class ClosureModel:
         if simulation is None or (self.repeat and not simulation.converged):
             simulation = run(steps)
         if simulation.converged:
-            self._closed = ClosedState(np.array(m, dtype=np.float64), simulation.frames[-1])
+            self._closed = ClosedState(
+                np.array(m, dtype=np.float64),
+                simulation.frames[-1],
+                slopes=simulation.sensitivities[-1] if sensitivities else None,
+            )
         return ClosureResult(system, simulation)
 
     def _values(self, m: FloatArray) -> dict[str, float]:

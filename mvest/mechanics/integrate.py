@@ -61,6 +61,7 @@ class _State:
     dv: FloatArray
     d_strain: FloatArray  # (p, e, q, 6)
     dt: float = 0.0  # of the step of time that led here, 0 at rest
+    move: FloatArray | None = None  # that is expected of the next step, if not by the velocity
 
 
 @dataclass(slots=True, eq=False)
@@ -88,6 +89,7 @@ def simulate(
     solver: LinearSolver | None = None,
     initial_velocity: FloatArray | None = None,
     initial_positions: FloatArray | None = None,
+    initial_move: FloatArray | None = None,
     initial_time: float = 0.0,
     on_step: Callable[[float, int], None] | None = None,
 ) -> Simulation:
@@ -112,6 +114,9 @@ def simulate(
         ``(n, 3)`` mm/s.
     initial_positions : ndarray, optional
         ``(n, 3)`` mm, where the body is at the beginning; default the reference positions.
+    initial_move : ndarray, optional
+        ``(n, 3)`` mm, what the first step is expected to move the body by. Its solution is looked
+        for from there, or from as far on the way as contact admits.
     initial_time : float
         s, of the beginning.
     on_step : callable, optional
@@ -151,6 +156,7 @@ def simulate(
         np.zeros((n_p, n, 3)),
         np.zeros((n_p, n, 3)),
         np.zeros((n_p, *strain0.shape)),
+        move=initial_move,
     )
     stepper = _Stepper(system, loading, damping, newton, tuple(parameters), solver)
     stepper.last_only = final_only and steps[-1].static
@@ -269,9 +275,11 @@ class _Stepper:
         push = inertia * mass * (state.x / dt + state.v) / dt + (
             inertia * self.damping.alpha * mass * state.x / dt
         )
-        # The first guess continues the motion, but no farther than the last step went.
-        advance = 0.0 if static else min(dt, state.dt)
-        solved = self._newton(state, loads, rate, mass_factor, push, advance)
+        move = state.move
+        if move is None and not static and state.dt:
+            # The first guess continues the motion, but no farther than the last step went.
+            move = min(dt, state.dt) * state.v
+        solved = self._newton(state, loads, rate, mass_factor, push, move)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
             raise _StepError(StepReason.INTERSECTION)
@@ -290,7 +298,7 @@ class _Stepper:
         rate: float,
         mass_factor: float,
         push: FloatArray,
-        advance: float,
+        move: FloatArray | None,
     ) -> _Solved:
         system, newton = self.system, self.newton
         tolerance = max(newton.path_tolerance if self.passing else 0.0, newton.tolerance)
@@ -298,8 +306,7 @@ class _Stepper:
         fixed = system.fixed_nodes
         x = state.x.copy()
         pairs = self._candidates(x)
-        if advance:
-            move = advance * state.v
+        if move is not None:
             factor = min(1.0, newton.largest_move / max(float(np.abs(move).max()), 1e-300))
             if system.contact is not None and pairs is not None:
                 y, dy = system.contact.points(x), system.contact.points(factor * move)

@@ -10,7 +10,8 @@ from mvest.mechanics.steps import Step
 from mvest.mechanics.valve_system import boundary_loading
 from tests.benchmark.valves import CELLS, VALUES, Closed, close, closed, parameters
 
-ROUNDS = {"2k": 5, "3k": 5, "7k": 3, "25k": 2}
+ROUNDS = {"2k": 5, "default": 5, "3k": 5, "7k": 3, "25k": 2}
+FARTHER = VALUES * [1.3, 1 / 1.3]
 
 
 @pytest.fixture(scope="module", params=[f"{e}-{s}" for e, s in CELLS])
@@ -103,18 +104,26 @@ def test_guided_closure(case, measure):
             valve._closed = None
             valve = valve.guide
 
-    result = measure(
-        lambda: model.close(VALUES),
-        setup=forget,
-        **about | {"rounds": 1, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb},
-    )
+    about = about | {"rounds": 1, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}
+    result = measure(lambda: model.close(VALUES), setup=forget, **about)
     np.testing.assert_allclose(result.simulation.frames[-1], c.x, atol=1e-6)
+
+
+def test_continued_closure(case, measure):
+    c, about = case
+    model = c.model.fresh()
+    assert model.close(VALUES).simulation.converged
+    model.continuation, start = True, model.closed
+    about = about | {"rounds": 3, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}
+    result = measure(lambda: model.close(FARTHER), setup=lambda: model.restart(start), **about)
+    assert result.simulation.converged
+    assert len(result.simulation.times) == 2
 
 
 @pytest.mark.parametrize("count", [0, 2, 6, 20])
 def test_closure(case, measure, count):
     c, about = case
-    if about["size"] in ("2k", "25k") or (about["size"] == "7k" and count in (6, 20)):
+    if about["size"] in ("2k", "default", "25k") or (about["size"] == "7k" and count in (6, 20)):
         pytest.skip(
             "from the open valve in two sizes only, the larger with two derivatives at most"
         )

@@ -1,6 +1,6 @@
-"""Where the time of a guided closure goes, and what bounds its parts.
+"""Where the time of a closure goes, guided and continued, and what bounds its parts.
 
-``python -m tests.benchmark.profile OUT.json`` closes the default valve in two sizes under Python's
+``python -m tests.benchmark.profile OUT.json [SIZE ...]`` closes the default valve under Python's
 profiler, whose cost is small here since a closure makes few calls, and sets the work that the
 largest parts do per second beside what this machine can do: products of dense matrices for
 arithmetic, a long vector sum for memory. CPU seconds of one thread.
@@ -24,9 +24,12 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import PardisoSolver
 from mvest.mechanics.system import System
+from mvest.typing import FloatArray
 from tests.benchmark.valves import VALUES, Closed, closed, model
 
-SIZES = ("3k", "25k")
+SIZES = ("default", "25k")
+CLOSURES = {"guided": VALUES, "continued": VALUES * [1.3, 1 / 1.3]}
+"""What is closed, one after another: first from the open valve, then from where that ended."""
 
 PARTS: dict[str, tuple[Callable[..., Any], ...]] = {
     "factorisation": (PardisoSolver.factorize,),
@@ -65,28 +68,39 @@ def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
     return float(np.median(taken))
 
 
-def shares(valve: ClosureModel) -> dict[str, Any]:
-    """Seconds of each part of one closure, on the finest mesh and on its guides."""
-    valve.close(1.01 * VALUES)  # builds the mechanics, which later closures find there
+def shares(valve: ClosureModel) -> list[dict[str, Any]]:
+    """Iterations and seconds of each part of a closure, on the finest mesh and on its guides."""
+    assert valve.close(1.01 * VALUES).simulation.converged  # builds the mechanics
+    valve.restart(None)
+    valve.continuation = True
+    return [{"closure": kind, **_shares(valve, m)} for kind, m in CLOSURES.items()]
+
+
+def _shares(valve: ClosureModel, m: FloatArray) -> dict[str, Any]:
     profiler = cProfile.Profile(time.process_time)
     start = time.process_time()
     profiler.enable()
-    result = valve.close(VALUES).simulation
+    result = valve.close(m).simulation
     profiler.disable()
     total = time.process_time() - start
     assert result.converged, result.reason.value
     stats = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
 
-    def spent(functions: tuple[Callable[..., Any], ...]) -> float:
+    def of(functions: tuple[Callable[..., Any], ...], column: int) -> float:
         codes = [f.__code__ for f in functions]
         keys = [(c.co_filename, c.co_firstlineno, c.co_name) for c in codes]
-        return sum(stats[key][3] for key in keys if key in stats)
+        return sum(stats[key][column] for key in keys if key in stats)
 
-    seconds = {name: spent(functions) for name, functions in PARTS.items()}
+    seconds = {name: of(functions, 3) for name, functions in PARTS.items()}
     seconds["assembly, other forces"] -= sum(seconds[name] for name in INSIDE)
     seconds["rest"] = total - sum(seconds.values())
-    iterations = sum(len(r.residuals) - 1 for r in result.records)
-    return {"seconds": total, "iterations on the finest mesh": iterations, "parts": seconds}
+    return {
+        "seconds": total,
+        "iterations on the finest mesh": result.iterations,
+        "factorisations": of((PardisoSolver.factorize,), 0),
+        "evaluations": of((System.evaluate,), 0),
+        "parts": seconds,
+    }
 
 
 def bounds(case: Closed) -> list[dict[str, Any]]:
@@ -136,13 +150,12 @@ def main(arguments: list[str]) -> None:
     """Measure, and write the record where told."""
     limits = machine()
     found = []
-    for size in SIZES:
+    for size in arguments[1:] or SIZES:
         case = closed("hex18", size)  # compiles, and builds what the bounds are measured on
-        valve = model("hex18", size).fresh()
-        entry = {"size": size, "nodes": case.nodes, **shares(valve), "bounds": bounds(case)}
-        for row in entry["bounds"]:
-            row["machine"] = limits[row["bound by"]]
-        found.append(entry)
+        rows = [row | {"machine": limits[row["bound by"]]} for row in bounds(case)]
+        for entry in shares(model("hex18", size).fresh()):
+            found.append({"size": size, "nodes": case.nodes, **entry, "bounds": rows})
+            print(json.dumps({key: found[-1][key] for key in entry}, indent=1))
     Path(arguments[0]).write_text(json.dumps({"profile": found}, indent=2) + "\n", encoding="utf-8")
 
 

@@ -27,6 +27,7 @@ OBSERVED, CONTACT = (112, 29), (144, 32)
 
 CELLS = {
     ("hex18", "2k"): (40, 5),
+    ("hex18", "default"): (54, 6),
     ("hex18", "3k"): (62, 6),
     ("hex18", "7k"): (84, 10),
     ("hex18", "25k"): (160, 19),
@@ -35,7 +36,7 @@ CELLS = {
     ("tet4", "25k"): (320, 38),
 }
 """Cells around and along the leaflets for about 3.2, 7 and 25 thousand nodes, one layer; and the
-coarsest mesh whose moduli are within 5 % of a fine mesh's (``mesh=quick``)."""
+coarsest mesh whose moduli are within 5 % of a fine mesh's (``mesh=quick``) and the default one."""
 
 ALL = (
     *(Parameter(name, value) for name, value in zip(MODULI, VALUES, strict=True)),

@@ -640,6 +640,59 @@ def test_fixed_values_are_used_and_estimated_ones_go_before_them():
     assert np.abs(usual.frames[-1] - both.frames[-1]).max() > 0.1
 
 
+def test_a_closed_state_tells_where_its_neighbours_are(closed):
+    # The logarithm's curvature is left: over half the way a fourth of the error. With slopes by the
+    # parameters taken for those by their logarithms it would be half.
+    model, simulation = closed
+    state = ClosedState(AT, simulation.frames[-1], slopes=simulation.sensitivities[-1])
+    errors = []
+    for share in (0.01, 0.005):
+        m = AT * np.exp(share * np.array([1.0, -0.7]))
+        true = continued(model, state.positions, m).frames[-1] - state.positions
+        model.restart(state)
+        expected = model._expected_move(m)
+        assert np.abs(true).max() > 1e-3
+        errors.append(np.abs(expected - true).max())
+    assert errors[0] < 0.1 * np.abs(true).max()
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
+    # A state whose slopes are not known tells nothing.
+    model.restart(replace(state, slopes=None))
+    assert model._expected_move(m) is None
+
+
+def test_a_continued_closure_starts_where_it_is_expected_to_end(closed):
+    model, simulation = closed
+    m = AT * np.array([1.25, 0.85])
+    plain = continued(model, simulation.frames[-1], m, sensitivities=True)
+    model.restart(ClosedState(AT, simulation.frames[-1], slopes=simulation.sensitivities[-1]))
+    expected = model.close(m).simulation
+    assert len(expected.times) == 2
+    assert expected.iterations < plain.iterations
+    np.testing.assert_allclose(expected.frames[-1], plain.frames[-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(expected.sensitivities[-1], plain.sensitivities[-1], atol=1e-7)
+    # And so does the next one: the new state has its own slopes.
+    np.testing.assert_array_equal(model.closed.slopes, expected.sensitivities[-1])
+
+
+def test_a_closure_that_fails_from_where_it_is_expected_starts_from_the_last_state(monkeypatch):
+    model = replace(model_of(GENTLE, **SMALL), continuation=True, repeat=False)
+    first = model.close(AT).simulation
+    true_simulate, moves = mvest.closure.model.simulate, []
+
+    def simulate(*arguments, **options):
+        moves.append(options["initial_move"])
+        result = true_simulate(*arguments, **options)
+        if moves[-1] is not None:
+            result = replace(result, reason=StepReason.NO_CONVERGENCE)
+        return result
+
+    monkeypatch.setattr(mvest.closure.model, "simulate", simulate)
+    again = model.close(1.1 * AT, sensitivities=False).simulation
+    assert again.converged
+    assert [move is None for move in moves] == [False, True]
+    np.testing.assert_array_equal(again.frames[0], first.frames[-1])
+
+
 def test_a_far_continuation_goes_through_equilibria_between(closed):
     # In one step Newton's method would be asked for an equilibrium 0.11 away in the logarithm.
     model, simulation = closed

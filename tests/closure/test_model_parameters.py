@@ -172,3 +172,14 @@ def test_the_way_to_other_coefficients_is_measured_in_the_logarithm_of_the_modul
     # 0.4 x 1.5 = 0.6 is beyond the reach.
     assert not model._near(np.array([6.0, 4.0, 1.0]))
     assert model._near(np.array([6.6, 4.0, 0.5]))
+
+
+def test_the_expected_move_is_the_derivative_times_a_small_change_of_every_kind():
+    model = model_of(OPEN, NAMES, **TINY, continuation=True, settings=FIELDS)
+    m, random = np.array(list(VALUES.values())), np.random.default_rng(3)
+    slopes = random.normal(size=(len(m), len(model.mesh.nodes), 3))
+    model.restart(ClosedState(m, model.mesh.nodes, slopes=slopes))
+    for k, name in enumerate(NAMES):
+        change = 1e-7 * m[k] * np.eye(len(m))[k]
+        expected = slopes[k] * change[k]
+        np.testing.assert_allclose(model._expected_move(m + change), expected, 1e-6, err_msg=name)

@@ -76,6 +76,24 @@ def test_newton_converges_quadratically_with_contact():
     assert sum(assert_quadratic(record.residuals) for record in result.records) >= 4
 
 
+def test_an_expected_move_is_followed_as_far_as_contact_admits():
+    # Expected five millimetres below the other sheet, the upper one stops on it.
+    system, loading = sandwich(cells=2, samples=11)
+    closed = simulate(system, loading, [Step(0.06), Step(1.0, static=True)], final_only=True)
+    move = np.zeros_like(closed.frames[-1])
+    move[closed.frames[0][:, 2] > 1.5] = [0.0, 0.0, -5.0]
+    start = {"initial_positions": closed.frames[-1], "initial_time": 1.0}
+    seen = []
+    true_evaluate = system.evaluate
+    system.evaluate = lambda x, *a, **k: seen.append(x) or true_evaluate(x, *a, **k)
+    again = simulate(system, loading, [Step(2.0, static=True)], initial_move=move, **start)
+    assert again.converged
+    expected = (seen[0] - closed.frames[-1])[move[:, 2] < 0, 2]
+    assert -5.0 < expected.min() < -1e-3
+    np.testing.assert_allclose(expected[expected < -1e-12], expected.min(), rtol=1e-9)
+    np.testing.assert_allclose(again.frames[-1], closed.frames[-1], rtol=0, atol=1e-8)
+
+
 def test_a_run_that_cannot_converge_is_a_value():
     result = sheet(
         newton=NewtonSettings(max_iterations=1, max_halvings=0),

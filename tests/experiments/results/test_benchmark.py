@@ -69,13 +69,16 @@ def test_the_report_is_written_with_the_peers(tmp_path):
     peers.write_text(json.dumps({"rows": rows}))
     bound = {"what": "factorisation", "bound by": "GFlop/s", "reached": 12.0, "machine": 50.0}
     parts = {"solves": 1.0, "factorisation": 3.0}
-    entry = {"nodes": 9, "seconds": 4.0, "iterations on the finest mesh": 5, "parts": parts}
+    counts = {"iterations on the finest mesh": 5, "factorisations": 6, "evaluations": 7}
+    entry = {"closure": "continued", "nodes": 9, "seconds": 4.0, **counts, "parts": parts}
     profile.write_text(json.dumps({"profile": [entry | {"bounds": [bound]}]}))
     assert main([str(run), str(peers), str(profile), str(startup)], tmp_path) == 0
     text = (tmp_path / "benchmark.md").read_text()
     assert "closure" in text
     assert "| mvest list | 0.07 |" in text
     assert "| other | 3362 | 0.1 |" in text
+    assert "## Where the time of a continued closure goes: 9 nodes" in text
+    assert "5 Newton iterations on the finest mesh, 6 factorisations and 7 evaluations." in text
     # The largest part first, with its share.
     assert "| factorisation | 3 | 75 |\n| solves | 1 | 25 |" in text
     assert "| factorisation | 12 | 50 | GFlop/s |" in text
