@@ -15,7 +15,7 @@ What is here, in the order data flows:
 * ``pressure``, ``cables`` (chordae, annular hinge), ``ties``, ``contact``: what acts on the solid;
 * ``assembly``, ``system``: everything together as residual, tangent and partial derivatives;
 * ``solver``: sparse direct solvers; ``steps``, ``integrate``: what is asked for and given back,
-  time steps, Newton's method, sensitivities;
+  time steps, Newton's method, sensitivities; ``approach``: the way to a far equilibrium;
 * ``blocks``: boxes of cells and outer faces; ``body``: all of it without a valve.
 
 A body from plain arrays (here a sheet of tetrahedra, six to a cell, clamped at its rim):

@@ -6,9 +6,10 @@ Backward Euler: with :math:`v_{n+1} = (x_{n+1} - x_n)/\Delta t` each step solves
           + f_{int}(x_{n+1}; \epsilon_n) - f_{ext}(x_{n+1}, t_{n+1}) = 0
 
 by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step
-that fails (no convergence, leaflets through each other) is halved, a static one is tried again
-after the body has had more time to come to rest; nothing is ever accepted unconverged, except in
-the single-solve mode, which takes one linearised solve per step by definition.
+that fails (no convergence, leaflets through each other) is halved; a static one with contact, or
+from a moving body, is tried again after the body has had more time to come to rest. Nothing is ever
+accepted unconverged, except in the single-solve mode, which takes one linearised solve per step by
+definition.
 
 Sensitivities differentiate these discrete equations (Michaleris, Tortorelli and Vidal 1994, Int. J.
 Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for each parameter m,
@@ -25,6 +26,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact, ContactPairs
 from mvest.mechanics.solver import LinearSolver, linear_solver
@@ -205,14 +207,14 @@ class _Stepper:
 
     def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
         """State at ``step.time``; halves the step where it fails."""
-        if step.static:
+        if step.static and (state.dt or self.system.contact is not None):
             return self._settle(state, start, step.time, records)
         pending = [(step.time, 0)]
         time = start
         while pending:
             end, level = pending[-1]
             try:
-                state = self._try(state, end, end - time, False, level, records)
+                state = self._try(state, end, end - time, step.static, level, records)
             except _StepError:
                 if level >= self.newton.max_halvings:
                     raise
@@ -315,18 +317,25 @@ class _Stepper:
         if fixed.size:
             x[fixed] = loads.fixed
 
-        def evaluate(at: FloatArray, tangent: bool) -> Evaluation:
+        def evaluate(at: FloatArray, tangent: bool, stress: FloatArray | None = None) -> Evaluation:
             nonlocal pairs
             pairs = self._candidates(at)
-            result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=tangent)
+            result = system.evaluate(
+                at, loads, pairs, state.strain, rate, tangent=tangent, stress=stress
+            )
             inertial = mass_factor * mass * at - push
             result.residual += inertial
             result.scale = max(result.scale, float(np.linalg.norm(inertial)), 1e-12)
             result.residual[fixed] = 0.0
             return result
 
+        residuals: list[float] = []
+        if not mass_factor and system.contact is None and not newton.single_solve:
+            x, residuals = approach(
+                system, self.solver, lambda at, s: evaluate(at, True, s), x, self._far
+            )
         current = evaluate(x, True)
-        residuals = [float(np.linalg.norm(current.residual)) / current.scale]
+        residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
         for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(StepReason.NO_CONVERGENCE)

@@ -180,6 +180,11 @@ class Solid:
             self.gradients, self.volumes, state.deformation, state.stress, state.tangent, self.modes
         )
 
+    def extrapolated_stress(self, state: SolidState, dx: FloatArray) -> FloatArray:
+        """Stress S ``(e, q, 6)`` MPa that a move by ``dx (n, 3)`` mm leads to, to first order."""
+        change = self.green_change(state, dx, np.zeros_like(state.stress))
+        return state.stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
+
     def condensed_forces(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
         """Nodal forces ``(e, k, 3)`` of a partial change of stress, alpha re-equilibrated.
 

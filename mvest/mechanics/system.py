@@ -7,7 +7,7 @@ inertia and mass-proportional damping. The tangent is dr/dx, exact in every term
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
@@ -211,8 +211,12 @@ class System:
         rate: float,
         *,
         tangent: bool,
+        stress: FloatArray | None = None,
     ) -> Evaluation:
-        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm."""
+        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm.
+
+        With ``stress (e, q, 6)`` MPa the geometric part of the tangent is that of this stress.
+        """
         state = self.solid.evaluate(x, previous, rate)
         residual = np.zeros((self.n, 3))
         add_forces(residual, self.solid.mesh.elements, self.solid.forces(state))
@@ -223,7 +227,8 @@ class System:
             if self.contact is not None and pairs is not None:
                 slots = self._contact_slots(self.contact, pairs, self.contact.points(x))
             blocks = self.pattern.zeros()
-            scatter_matrices(blocks, self._at_elements, self.solid.tangents(state))
+            carrying = state if stress is None else replace(state, stress=stress)
+            scatter_matrices(blocks, self._at_elements, self.solid.tangents(carrying))
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0:
             external = np.zeros((self.n, 3))

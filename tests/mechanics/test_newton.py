@@ -22,6 +22,7 @@ from mvest.mechanics import (
     simulate_body,
 )
 from mvest.mechanics.forces.pressure import PressureLoad
+from mvest.mechanics.law.biot import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Simulation, StepRecord
 from tests.mechanics.bodies import MATERIALS, block, sandwich
@@ -65,6 +66,50 @@ def test_newton_converges_quadratically(element_type, static):
     assert result.converged
     assert all(len(record.residuals) <= 7 for record in result.records)
     assert sum(assert_quadratic(record.residuals) for record in result.records) >= 2
+
+
+def strip(element_type, length, steps, *, load=4.0, newton=None):
+    """A cantilever 0.1 mm thick and 1 mm wide under a shear force at its end, in static steps."""
+    mesh = block(element_type, (int(length), 1, 1), (length, 1.0, 0.1))
+    nodes = mesh.nodes
+    law = BiotLaw.of((TransverselyIsotropic.isotropic(1.2e6, 0.0),))
+    system = System(Solid(mesh, law), fixed_nodes=np.flatnonzero(nodes[:, 0] == 0))
+    tip = nodes[:, 0] == length
+    push = np.zeros_like(nodes)
+    push[tip, 2] = load / np.count_nonzero(tip)
+    held = nodes[system.fixed_nodes]
+    times = np.linspace(0, 1, steps + 1)[1:]
+    result = simulate(
+        system,
+        lambda t: Loads(fixed=held, body_force=t * push),
+        [Step(t, static=True) for t in times],
+        newton=newton,
+    )
+    assert result.converged
+    return result, (result.frames[-1] - nodes)[tip].mean(axis=0)
+
+
+@pytest.mark.parametrize("element_type", ["hex18", "tet10"])
+def test_a_thin_strip_rolls_up_in_one_step(element_type):
+    # The tip rises by two thirds of the length. A line search on the forces keeps each of the
+    # straight steps of Newton's method as short as the strip is thin: hundreds of iterations.
+    one, tip = strip(element_type, 10.0, 1)
+    assert one.iterations <= 15
+    assert tip[2] > 6
+    many, expected = strip(element_type, 10.0, 8)
+    assert all(len(record.residuals) <= 8 for record in many.records)
+    np.testing.assert_allclose(tip, expected, atol=1e-8)
+
+
+def test_a_static_step_that_is_too_long_is_halved(monkeypatch):
+    whole, expected = strip("hex18", 10.0, 1)
+    assert [record.halvings for record in whole.records] == [0]
+    monkeypatch.setattr("mvest.mechanics.approach.ITERATIONS", 6)
+    parts, tip = strip("hex18", 10.0, 1, newton=NewtonSettings(max_iterations=3))
+    assert len(parts.records) > 1
+    assert max(record.halvings for record in parts.records) >= 1
+    assert parts.records[-1].time == 1
+    np.testing.assert_allclose(tip, expected, atol=1e-8)
 
 
 def test_newton_converges_quadratically_with_contact():
@@ -127,7 +172,8 @@ def test_loads_that_are_not_numbers_end_the_run_with_a_reason():
 
 def test_a_body_without_support_has_no_static_equilibrium():
     # Six rigid motions without stiffness: the loads are not in balance, so there is no solution.
-    result = sheet(static=True, fixed_nodes=[], newton=NewtonSettings(max_iterations=5))
+    newton = NewtonSettings(max_iterations=5, max_halvings=2)
+    result = sheet(static=True, fixed_nodes=[], newton=newton)
     assert not result.converged
     assert len(result.frames) == 1
 
