@@ -7,6 +7,7 @@ from .law.biot import PoissonReading as PoissonReading
 from .law.biot import TransverselyIsotropic as TransverselyIsotropic
 from .settings import ModulusField as ModulusField
 from .settings import StiffPatch as StiffPatch
+from .solid import Law as Law
 from .steps import Damping as Damping
 from .steps import NewtonSettings as NewtonSettings
 from .steps import Simulation as Simulation

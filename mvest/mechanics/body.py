@@ -1,4 +1,4 @@
-"""Mechanics without a valve: any clamped solid body under pressure, from plain arrays."""
+"""Mechanics without a valve: any solid body under pressure and forces, from plain arrays."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
-from mvest.mechanics.solid import Solid
+from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
 from mvest.mechanics.system import Loads, Parameter, System
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["simulate_body"]
@@ -27,11 +27,13 @@ def simulate_body(
     elements: ArrayLike,
     element_type: str,
     *,
-    material: TransverselyIsotropic | Sequence[TransverselyIsotropic],
-    fixed_nodes: ArrayLike,
+    material: TransverselyIsotropic | Sequence[TransverselyIsotropic] | Law,
     times: ArrayLike,
+    fixed_nodes: ArrayLike = (),
+    fixed_components: ArrayLike | None = None,
     pressure_faces: ArrayLike | None = None,
     pressure: Callable[[float], float] | ArrayLike = 0.0,
+    forces: Callable[[float], ArrayLike] | ArrayLike | None = None,
     fibre: ArrayLike | None = None,
     region: ArrayLike | None = None,
     static: bool = False,
@@ -41,7 +43,7 @@ def simulate_body(
     parameters: Sequence[Parameter] = (),
     solver: str = "auto",
 ) -> Simulation:
-    """Simulate a body that is held at some nodes and pressed on some faces.
+    """Simulate a body that is held at some nodes, pressed on some faces and pulled at some nodes.
 
     Parameters
     ----------
@@ -52,25 +54,33 @@ def simulate_body(
     element_type : str
         ``tet4``, ``tet10``, ``hex18``, ``hex27``, ``wedge12`` or ``wedge18``. One layer of ``tet4``
         is up to thirty times too stiff in bending; prefer the others.
-    material : TransverselyIsotropic or sequence of them
-        One, or one per region.
-    fixed_nodes : array_like
-        ``(h,)`` nodes that do not move.
+    material : TransverselyIsotropic, sequence of them, or Law
+        One, or one per region; or a law of one's own, which has what
+        :class:`mvest.mechanics.solid.Law` asks for, for all regions.
     times : array_like
         ``(s,)`` s, end times of the steps, increasing, > 0.
+    fixed_nodes : array_like
+        ``(h,)`` nodes that do not move.
+    fixed_components : array_like, optional
+        ``(n, 3)`` bool, coordinates x, y, z of single nodes that do not change. Nodes on a plane of
+        symmetry normal to x have their first one fixed.
     pressure_faces : array_like, optional
         ``(f, kf)`` nodes of the faces pressed on, normals out of the solid
         (:func:`mvest.mechanics.blocks.outer_faces` finds all faces).
     pressure : float, callable or array_like
         MPa, positive pushes against the normal: a constant, a function of the time (s), or a table
         ``(t, 2)`` of times and pressures, linear between its rows and constant outside.
+    forces : array_like or callable, optional
+        ``(n, 3)`` N on the nodes, which keep their direction: constant, or a function of the time
+        (s). A force on an edge or face of a quadratic element is not shared equally by its nodes.
     fibre : array_like, optional
         Direction of the fibre: one ``(3,)``, per node ``(n, 3)`` or per element and node
-        ``(m, k, 3)``. May be left out if all materials are isotropic.
+        ``(m, k, 3)``. May be left out if all materials are isotropic; of a law that is not known.
     region : array_like, optional
         ``(m,)`` material of each element; regions are called ``"0"``, ``"1"``, ...
     static : bool
-        Equilibrium at each time, without inertia and damping.
+        Equilibrium at each time, without inertia and damping. The load of a step that is too long
+        is halved; it should therefore grow with the time.
     density : float
         t/mm^3.
     damping, newton : optional
@@ -79,7 +89,7 @@ def simulate_body(
         To differentiate by, for example ``Parameter("E_f.0", 6.23)`` or
         ``Parameter("pressure_scale", 1.0)``.
     solver : str
-        ``auto``, ``pardiso`` or ``superlu``.
+        ``auto``, ``pardiso`` or ``superlu``. What has solved stands in the result.
 
     Returns
     -------
@@ -92,7 +102,8 @@ def simulate_body(
     InputError, GeometryError, MaterialError
         If an array has a wrong shape, an index out of range or a value that is not finite; if times
         do not increase; if an element is inverted, or a pressure face belongs to no element or
-        points into the solid; if a material needs a fibre that is not given.
+        points into the solid; if a material needs a fibre that is not given, or is neither a
+        material nor a law.
 
     Examples
     --------
@@ -112,23 +123,31 @@ def simulate_body(
     (True, (11, 338, 3))
     """
     points, cells = np.asarray(nodes, dtype=float), np.asarray(elements)
-    materials = _materials(material)
-    mesh = _mesh(points, cells, element_type, materials, fibre, region, pressure_faces)
+    law: Law
+    if isinstance(material, Law):
+        n_regions = 1 if region is None else int(np.max(np.asarray(region), initial=0)) + 1
+        law, directed = material, True
+    else:
+        materials = _materials(material)
+        n_regions, law = len(materials), BiotLaw.of(materials)
+        directed = not all(_is_isotropic(m) for m in materials)
+    mesh = _mesh(points, cells, element_type, n_regions, directed, fibre, region, pressure_faces)
     _check_pressure_faces(mesh)
     fixed = _fixed(fixed_nodes, len(mesh.nodes))
     system = System(
-        Solid(mesh, BiotLaw.of(materials), density=density),
+        Solid(mesh, law, density=density),
         pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
         fixed_nodes=fixed,
+        fixed_components=_components(fixed_components, len(mesh.nodes)),
     )
-    curve = _pressure_curve(pressure)
+    curve, pull = _pressure_curve(pressure), _force_curve(forces, len(mesh.nodes))
     held = mesh.nodes[fixed]
     ends = np.asarray(times, dtype=float)
     if ends.ndim != 1:
         raise InputError(f"times: shape {ends.shape}, expected (s,)")
     return simulate(
         system,
-        lambda t: Loads(pressure=curve(t), fixed=held),
+        lambda t: Loads(pressure=curve(t), fixed=held, body_force=pull(t)),
         [Step(float(t), static) for t in ends],
         damping=damping,
         newton=newton,
@@ -141,7 +160,8 @@ def _mesh(
     nodes: FloatArray,
     elements: IntArray,
     element_type: str,
-    materials: tuple[TransverselyIsotropic, ...],
+    n_regions: int,
+    directed: bool,
     fibre: ArrayLike | None,
     region: ArrayLike | None,
     pressure_faces: ArrayLike | None,
@@ -155,11 +175,11 @@ def _mesh(
         )
     if not np.issubdtype(elements.dtype, np.integer):
         raise InputError(f"elements: {elements.dtype}, expected integers")
-    if region is None and len(materials) > 1:
-        raise InputError(f"{len(materials)} materials need the region (m,) of each element")
+    if region is None and n_regions > 1:
+        raise InputError(f"{n_regions} materials need the region (m,) of each element")
     if fibre is None:
-        if not all(_is_isotropic(m) for m in materials):
-            raise InputError("fibre is needed: a material is not isotropic")
+        if directed:
+            raise InputError("fibre is needed: a material is not isotropic, or a law of one's own")
         direction = _any_fibre(nodes, elements, element_type)
     else:
         direction = _unit(np.asarray(fibre, dtype=float))
@@ -171,7 +191,7 @@ def _mesh(
         elements,
         element_type,
         np.zeros(len(elements), dtype=np.int64) if region is None else np.asarray(region),
-        tuple(str(k) for k in range(len(materials))),
+        tuple(map(str, range(n_regions))),
         direction,
         np.zeros((0, width), dtype=np.int64)
         if pressure_faces is None
@@ -184,7 +204,10 @@ def _materials(
 ) -> tuple[TransverselyIsotropic, ...]:
     given = tuple(material) if isinstance(material, Sequence) else (material,)
     if not given or not all(isinstance(m, TransverselyIsotropic) for m in given):
-        raise MaterialError("material must be a TransverselyIsotropic or a sequence of them")
+        raise MaterialError(
+            "material must be a TransverselyIsotropic, a sequence of them, or a law "
+            "(mvest.mechanics.Law)"
+        )
     return given
 
 
@@ -221,6 +244,34 @@ def _fixed(fixed_nodes: ArrayLike, n: int) -> IntArray:
     if fixed.min() < 0 or fixed.max() >= n:
         raise InputError(f"fixed_nodes must lie between 0 and {n - 1}")
     return np.unique(fixed)
+
+
+def _components(fixed_components: ArrayLike | None, n: int) -> BoolArray:
+    if fixed_components is None:
+        return np.zeros((n, 3), dtype=bool)
+    fixed = np.asarray(fixed_components)
+    if fixed.shape != (n, 3) or fixed.dtype != np.bool_:
+        raise InputError(
+            f"fixed_components: shape {fixed.shape} of {fixed.dtype}, expected ({n}, 3) of bool"
+        )
+    return fixed
+
+
+def _force_curve(
+    forces: Callable[[float], ArrayLike] | ArrayLike | None, n: int
+) -> Callable[[float], FloatArray | None]:
+    def checked(value: ArrayLike, when: str) -> FloatArray:
+        array = np.asarray(value, dtype=float)
+        if array.shape != (n, 3) or not np.isfinite(array).all():
+            raise InputError(f"forces{when}: shape {array.shape}, expected finite ({n}, 3) N")
+        return array
+
+    if forces is None:
+        return lambda t: None
+    if callable(forces):
+        return lambda t: checked(forces(t), f" at t = {t:g} s")
+    constant = checked(forces, "")
+    return lambda t: constant
 
 
 def _pressure_curve(

@@ -178,7 +178,12 @@ def simulate(
         if on_step is not None:
             on_step(step.time, sum(len(r.residuals) - 1 for r in records))
     return Simulation(
-        np.array(done), np.array(frames), np.array(sensitivities), reason, tuple(records)
+        np.array(done),
+        np.array(frames),
+        np.array(sensitivities),
+        reason,
+        tuple(records),
+        solver.name,
     )
 
 
@@ -326,7 +331,7 @@ class _Stepper:
             inertial = mass_factor * mass * at - push
             result.residual += inertial
             result.scale = max(result.scale, float(np.linalg.norm(inertial)), 1e-12)
-            result.residual[fixed] = 0.0
+            result.residual[system.held] = 0.0
             return result
 
         residuals: list[float] = []
@@ -447,7 +452,7 @@ class _Stepper:
             if not static:
                 r -= mass * (old.dx[k] / dt + old.dv[k]) / dt
                 r -= self.damping.alpha * mass * old.dx[k] / dt
-            r[system.fixed_nodes] = 0.0
+            r[system.held] = 0.0
             right[:, k] = -r.ravel()
         dx = self.solver.solve(right).T.reshape(-1, system.n, 3)
         new.dx = dx

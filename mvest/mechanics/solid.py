@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numba as nb
 import numpy as np
@@ -39,8 +39,14 @@ ENHANCED_TOLERANCE = 1e-11
 """Relative size of the last alpha correction (strain) at which the elimination stops."""
 
 
+@runtime_checkable
 class Law(Protocol):
-    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`)."""
+    """What the solid needs from a material law (see :class:`mvest.mechanics.law.biot.BiotLaw`).
+
+    Arrays of points have the axes (element, quadrature point, component). Strain and stress are
+    six-vectors 11, 22, 33, 23, 13, 12 in the fibre frame of the point, strain with engineering
+    shear, stress the second Piola-Kirchhoff one in MPa; ``region (e,)`` counts from 0.
+    """
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Strain measure ``(e, q, 6)`` whose rate is damped."""
@@ -48,7 +54,11 @@ class Law(Protocol):
     def response(
         self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``."""
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)``, its derivative by ``green``.
+
+        ``previous (e, q, 6)`` is the strain measure at the start of the step and ``rate`` the
+        stiffness-proportional damping over the step, 0 in an equilibrium.
+        """
 
     @property
     def kinds(self) -> tuple[str, ...]:

@@ -128,6 +128,8 @@ class Simulation:
         ``(f, p, n, 3)`` mm per unit of each parameter.
     reason : StepReason
     records : tuple of StepRecord
+    solver : str
+        What solved the linear systems, and what took its place where that failed.
     """
 
     times: FloatArray
@@ -135,13 +137,14 @@ class Simulation:
     sensitivities: FloatArray
     reason: StepReason
     records: tuple[StepRecord, ...]
+    solver: str = ""
 
     def __str__(self) -> str:
         n, p = self.frames.shape[1], self.sensitivities.shape[1]
         return (
             f"{self.reason.value} at t = {self.times[-1]:.4g} s: {len(self.frames)} frames of "
             f"{n} nodes, {p} sensitivities; {len(self.records)} steps, {self.iterations} Newton "
-            f"iterations"
+            f"iterations{', solved by ' + self.solver if self.solver else ''}"
         )
 
     @property

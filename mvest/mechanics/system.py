@@ -27,7 +27,7 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
 from mvest.mechanics.solid import Law, Solid, SolidState
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
 
@@ -104,6 +104,8 @@ class System:
     fixed_nodes : ndarray
         Nodes whose positions are prescribed.
     ties : Ties or None
+    fixed_components : ndarray or None
+        ``(n, 3)`` bool, single coordinates that keep the value they begin with.
     """
 
     def __init__(
@@ -117,6 +119,7 @@ class System:
         fixed_nodes: IntArray = _NO_NODES,
         factors: Factors | None = None,
         ties: Ties | None = None,
+        fixed_components: BoolArray | None = None,
     ) -> None:
         self.solid = solid
         self.pressure = pressure
@@ -131,6 +134,10 @@ class System:
             self.fixed_nodes.min() < 0 or self.fixed_nodes.max() >= self.n
         ):
             raise InputError(f"fixed_nodes must lie between 0 and {self.n - 1}")
+        self.held = np.zeros((self.n, 3), dtype=bool)
+        self.held[self.fixed_nodes] = True
+        if fixed_components is not None:
+            self.held |= fixed_components
         self._static = adjacency(self.n, self._static_groups())
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
@@ -179,9 +186,8 @@ class System:
         self._forward = self.pattern.positions(first, second)
         self._backward = self.pattern.positions(second, first)
         self._at_diagonal = self.pattern.diagonal
-        fixed = np.zeros(self.n, dtype=bool)
-        fixed[self.fixed_nodes] = True
-        self._at_fixed = fixed[self.pattern.rows] | fixed[self.pattern.columns]
+        some: BoolArray = np.any(self.held, axis=1)
+        self._at_held = np.flatnonzero(some[self.pattern.rows] | some[self.pattern.columns])
 
     def search_contact(self, x: FloatArray) -> ContactPairs | None:
         """Candidate pairs at nodal positions ``x``."""
@@ -277,15 +283,18 @@ class System:
         )
 
     def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.bsr_matrix:
-        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; fixed rows are identity.
+        """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; held rows are identity.
 
         Overwrites ``blocks`` and refers to them.
         """
         for i in range(3):
             blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
-        if self.fixed_nodes.size:
-            blocks[self._at_fixed] = 0.0
-            blocks[self._at_diagonal[self.fixed_nodes]] = np.eye(3)
+        if self._at_held.size:
+            free, at = ~self.held, self._at_held
+            rows, columns = self.pattern.rows[at], self.pattern.columns[at]
+            blocks[at] *= free[rows][:, :, None] & free[columns][:, None, :]
+            nodes, axes = np.nonzero(self.held)
+            blocks[self._at_diagonal[nodes], axes, axes] = 1.0
         return self.pattern.matrix(blocks)
 
     # -- partial derivatives ----------------------------------------------------------------------

@@ -9,6 +9,7 @@ import mvest.mechanics
 import mvest.mechanics.body
 from mvest.errors import GeometryError, InputError, MaterialError, MvestError
 from mvest.mechanics import Parameter, TransverselyIsotropic, box, outer_faces, simulate_body
+from mvest.mechanics.solver import linear_solver
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS
 
 RUBBER = TransverselyIsotropic.isotropic(2.0, 0.45)
@@ -88,6 +89,120 @@ def test_pressure_as_number_table_and_function_agree():
     np.testing.assert_array_equal(number, function)
 
 
+def test_forces_as_numbers_and_as_a_function_agree_and_are_borne_by_what_is_held():
+    given = arguments() | {"pressure_faces": None, "static": True, "times": [1.0]}
+    push = np.zeros_like(given["nodes"])
+    push[np.all(np.abs(given["nodes"] - [4.5, 4.5, 1.0]) < 0.1, axis=1)] = (0.01, 0.02, 0.05)
+    assert np.count_nonzero(push) == 3
+    number = simulate_body(**given, forces=push).frames
+    function = simulate_body(**given, forces=lambda t: t * push).frames
+    np.testing.assert_allclose(number[-1], function[-1], atol=1e-9)
+    assert number[-1, :, 2].max() > 1.1
+    # Twice the force in two steps, the first of which is the one above.
+    twice = simulate_body(**given | {"times": [1.0, 2.0]}, forces=lambda t: t * push).frames
+    np.testing.assert_allclose(twice[1], number[-1], atol=1e-9)
+    assert twice[2, :, 2].max() > number[-1, :, 2].max()
+
+
+@pytest.mark.parametrize("static", [True, False])
+def test_half_a_sheet_with_a_plane_of_symmetry_does_what_the_whole_does(static):
+    # Pressed and pulled symmetrically; the plane x = 4.5 keeps its first coordinate only.
+    nodes, elements = box("hex18", (4, 3, 1), (9.0, 9.0, 1.0))
+    half, cells = box("hex18", (2, 3, 1), (4.5, 9.0, 1.0))
+    results = []
+    for x, e in ((nodes, elements), (half, cells)):
+        faces = outer_faces(e, "hex18")
+        pull = np.zeros_like(x)
+        # A node on the plane has half of its force in each half.
+        pull[(x[:, 0] == 4.5) & (x[:, 1] == 4.5), 2] = 0.04 if x is nodes else 0.02
+        fixed = np.zeros(x.shape, dtype=bool)
+        fixed[:, 0] = (x[:, 0] == 4.5) & (x is half)
+        results.append(
+            simulate_body(
+                x,
+                e,
+                "hex18",
+                material=RUBBER,
+                fixed_nodes=np.flatnonzero(np.any((x[:, :2] == 0) | (x[:, :2] == 9), axis=1)),
+                fixed_components=fixed,
+                pressure_faces=faces[np.all(x[faces][:, :, 2] == 0, axis=1)],
+                pressure=0.01,
+                forces=pull,
+                times=[0.05, 0.1],
+                static=static,
+                parameters=[Parameter("E_f.0", 2.0), Parameter("pressure_scale", 1.0)],
+            )
+        )
+    whole, part = results
+    assert whole.converged
+    assert part.converged
+    shared = [int(np.argmin(np.linalg.norm(nodes - x, axis=1))) for x in half]
+    np.testing.assert_allclose(part.frames, whole.frames[:, shared], atol=1e-8)
+    np.testing.assert_allclose(part.sensitivities, whole.sensitivities[:, :, shared], atol=1e-7)
+    on_plane = half[:, 0] == 4.5
+    np.testing.assert_array_equal(part.frames[:, on_plane, 0], 4.5)
+    assert np.abs(part.sensitivities[-1]).max() > 1e-3
+
+
+class SaintVenantKirchhoff:
+    """A law of a user's own: ``S = lambda tr(E) I + 2 mu E``, damped as the strain E."""
+
+    kinds = ("E_f",)
+
+    def __init__(self, young, nu):
+        lame, mu = young * nu / ((1 + nu) * (1 - 2 * nu)), young / (2 * (1 + nu))
+        self.young, self.stiffness = young, np.zeros((6, 6))
+        self.stiffness[:3, :3] = lame
+        self.stiffness += mu * np.diag([2.0, 2, 2, 1, 1, 1])
+
+    def strain(self, green):
+        return green
+
+    def response(self, green, region, previous, rate):
+        stress = (green + rate * (green - previous)) @ self.stiffness
+        tangent = np.broadcast_to((1 + rate) * self.stiffness, (*green.shape, 6))
+        return stress, np.ascontiguousarray(tangent)
+
+    def partial_stress(self, parameter, green, region, previous, rate, *, which, stress):
+        return np.where((region == which)[:, None, None], stress, 0.0) / parameter.value
+
+    def history_stress(self, green, region, d_previous, rate):
+        return -rate * d_previous @ self.stiffness
+
+    def strain_change(self, green, d_green):
+        return d_green
+
+
+@pytest.mark.parametrize("static", [True, False])
+def test_a_law_of_ones_own_takes_the_place_of_the_material(static):
+    given = arguments() | {"fibre": (1.0, 0.0, 0.0), "static": static}
+    known = simulate_body(**given)
+    law = SaintVenantKirchhoff(2.0, 0.45)
+    parameter = [Parameter("E_f.0", 2.0)]
+    own = simulate_body(**given | {"material": law}, parameters=parameter)
+    assert own.converged
+    # Strains of some per cent: the two laws agree to their order, and are not the same.
+    lift = known.frames[-1, :, 2].max() - 1.0
+    difference = np.abs(own.frames[-1] - known.frames[-1]).max()
+    assert 1e-5 * lift < difference < 0.05 * lift
+    # Its derivative is that of its differences.
+    moved = [
+        simulate_body(**given | {"material": SaintVenantKirchhoff(e, 0.45)}).frames[-1]
+        for e in (1.999, 2.001)
+    ]
+    np.testing.assert_allclose(own.sensitivities[-1, 0], (moved[1] - moved[0]) / 0.002, atol=2e-6)
+    assert np.abs(own.sensitivities[-1]).max() > 1e-2
+
+
+def test_the_result_says_what_has_solved():
+    for solver in ("pardiso", "superlu"):
+        if solver == "pardiso" and linear_solver().name != "pardiso":
+            continue
+        result = simulate_body(**arguments(), solver=solver)
+        assert result.solver == solver
+        assert f"solved by {solver}" in str(result)
+
+
 def broken(name):
     """The good arguments with one thing wrong."""
     good = arguments()
@@ -118,6 +233,11 @@ def broken(name):
         "pressure not finite": {"pressure": float("nan")},
         "pressure table of a wrong shape": {"pressure": [0.0, 0.1, 0.2]},
         "pressure table not increasing": {"pressure": [(0.1, 0.0), (0.0, 0.1)]},
+        "fixed component of a wrong shape": {"fixed_components": np.zeros((3, 3), dtype=bool)},
+        "fixed component not bool": {"fixed_components": np.zeros(nodes.shape)},
+        "force of a wrong shape": {"forces": (0.0, 0.0, 1.0)},
+        "force not finite": {"forces": lambda t: np.full(nodes.shape, np.inf)},
+        "fibre of a law missing": {"material": SaintVenantKirchhoff(2.0, 0.45)},
         "fibre missing": {"material": fibre},
         "fibre zero": {"material": fibre, "fibre": (0, 0, 0)},
         "fibre across the layer": {"material": fibre, "fibre": (0, 0, 1)},
@@ -155,6 +275,11 @@ MESSAGES = {
     "pressure not finite": (InputError, "pressure is not finite"),
     "pressure table of a wrong shape": (InputError, r"pressure table: shape \(3,\)"),
     "pressure table not increasing": (InputError, "increasing times"),
+    "fixed component of a wrong shape": (InputError, r"fixed_components: shape \(3, 3\)"),
+    "fixed component not bool": (InputError, "fixed_components.* of bool"),
+    "force of a wrong shape": (InputError, r"forces: shape \(3,\), expected finite \(98, 3\) N"),
+    "force not finite": (InputError, r"forces at t = 0.05 s"),
+    "fibre of a law missing": (InputError, "fibre is needed"),
     "fibre missing": (InputError, "fibre is needed"),
     "fibre zero": (InputError, "fibre has a length of zero"),
     "fibre across the layer": (InputError, "no direction within the leaflet"),
