@@ -43,6 +43,7 @@ from dataclasses import dataclass
 import ipctk
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.mechanics.forces.pair_search import search_pairs
@@ -141,22 +142,20 @@ class Contact:
             ``(k, 3)`` current positions of the points.
         """
         longest = self.settings.activation_distance * float(self.thickness.max())
-        first, second, reach, reference = search_pairs(
-            y,
-            self.rest,
-            self.thickness,
-            self._by_host,
-            self.points.host,
-            self.settings.activation_distance,
-            self.settings.reference_distance,
-            longest + self.skin,
-            self.skin,
+        return ContactPairs(
+            *search_pairs(
+                y,
+                self.rest,
+                self.thickness,
+                self._by_host,
+                self.points.host,
+                self.settings.activation_distance,
+                self.settings.reference_distance,
+                longest + self.skin,
+                self.skin,
+            ),
+            y.copy(),
         )
-        hosts = np.column_stack([self.points.host[first], self.points.host[second]])
-        change = np.flatnonzero(np.any(np.diff(hosts, axis=0) != 0, axis=1)) + 1
-        ends = np.concatenate([change, [len(first)]]) if len(first) else np.zeros(0)
-        start = np.concatenate([[0], ends]).astype(np.int64)
-        return ContactPairs(first, second, reach, reference, start, hosts[start[:-1]], y.copy())
 
     def stale(self, pairs: ContactPairs, y: FloatArray) -> bool:
         """Whether a point has moved so far that the search must be repeated."""
@@ -221,6 +220,7 @@ class Contact:
             self.settings.reference_pressure,
             self.points.weights,
             self.points.host,
+            self._by_host,
             data,
             slot,
             forward,
@@ -241,8 +241,7 @@ class Contact:
 
     def active(self, pairs: ContactPairs, y: FloatArray) -> int:
         """Number of pairs within their reach."""
-        r = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
-        return int(np.count_nonzero(r < pairs.reach))
+        return int(_active(y, pairs.first, pairs.second, pairs.reach))
 
     def intersects(self, y: FloatArray) -> bool:
         """Whether triangles of the sampled midsurface intersect at ``y (k, 3)``."""
@@ -269,8 +268,8 @@ def _kernel(r: float, h: float, r0: float, p0: float) -> tuple[float, float]:
 @nb.njit(cache=True)
 def _forces(
     y: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
     reach: FloatArray,
     reference: FloatArray,
     areas: FloatArray,
@@ -280,9 +279,10 @@ def _forces(
     for k in range(len(first)):
         i, j = first[k], second[k]
         d0, d1, d2 = y[i, 0] - y[j, 0], y[i, 1] - y[j, 1], y[i, 2] - y[j, 2]
-        r = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        if r >= reach[k]:
+        rr = d0 * d0 + d1 * d1 + d2 * d2
+        if rr >= reach[k] * reach[k]:
             continue
+        r = np.sqrt(rr)
         f, _ = _kernel(r, reach[k], reference[k], p0)
         f *= areas[i] * areas[j] / r
         out[i, 0] += f * d0
@@ -297,8 +297,8 @@ def _forces(
 @nb.njit(cache=True)
 def _add_tangent(
     y: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
     reach: FloatArray,
     reference: FloatArray,
     start: IntArray,
@@ -306,23 +306,24 @@ def _add_tangent(
     p0: float,
     weights: FloatArray,
     host: IntArray,
+    by_host: IntArray,
     data: FloatArray,
     slot: IntArray,
     forward: IntArray,
     backward: IntArray,
     own: IntArray,
 ) -> None:
-    n_w = weights.shape[1]
-    own_block = np.zeros((y.shape[0], 3, 3))
-    touched = np.zeros(y.shape[0], dtype=np.bool_)
-    row = np.zeros((n_w, 3, 3))
-    block = np.zeros((n_w, n_w, 3, 3))
-    k3 = np.empty((3, 3))
-    d = np.empty(3)
+    n, n_w = weights.shape
+    # The 3x3 block of a pair is symmetric: 00, 11, 22, 12, 02, 01. Components come first, so that
+    # the innermost loops run along the nodes.
+    at_point = np.zeros((n, 6))
+    stiffness = np.empty(6)
+    row = np.empty((6, n_w))
+    block = np.empty((6, n_w, n_w))
     for g in range(len(start) - 1):
         if slot[g] < 0:
             continue
-        used = False
+        block[:] = 0.0
         k = start[g]
         while k < start[g + 1]:
             # All pairs of one first point: collect sum_j K_ij w_j, then expand by w_i once.
@@ -330,63 +331,84 @@ def _add_tangent(
             any_active = False
             while k < start[g + 1] and first[k] == i:
                 j = second[k]
-                for c in range(3):
-                    d[c] = y[i, c] - y[j, c]
-                r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-                if r < reach[k]:
+                d0, d1, d2 = y[i, 0] - y[j, 0], y[i, 1] - y[j, 1], y[i, 2] - y[j, 2]
+                rr = d0 * d0 + d1 * d1 + d2 * d2
+                if rr < reach[k] * reach[k]:
+                    r = np.sqrt(rr)
                     f1, f2 = _kernel(r, reach[k], reference[k], p0)
                     a = areas[i] * areas[j]
                     across = a * f1 / r
-                    along = (a * f2 - across) / (r * r)
-                    for m in range(3):
-                        for n in range(3):
-                            k3[m, n] = along * d[m] * d[n]
-                        k3[m, m] += across
+                    along = (a * f2 - across) / rr
+                    stiffness[0] = along * d0 * d0 + across
+                    stiffness[1] = along * d1 * d1 + across
+                    stiffness[2] = along * d2 * d2 + across
+                    stiffness[3] = along * d1 * d2
+                    stiffness[4] = along * d0 * d2
+                    stiffness[5] = along * d0 * d1
                     if not any_active:
-                        row[:, :, :] = 0.0
+                        row[:] = 0.0
                         any_active = True
-                    for m in range(3):
-                        for n in range(3):
-                            own_block[i, m, n] += k3[m, n]
-                            own_block[j, m, n] += k3[m, n]
-                    touched[i] = True
-                    touched[j] = True
-                    for b in range(n_w):
-                        w = weights[j, b]
-                        for m in range(3):
-                            for n in range(3):
-                                row[b, m, n] -= w * k3[m, n]
+                    for c in range(6):
+                        at_point[i, c] += stiffness[c]
+                        at_point[j, c] += stiffness[c]
+                        for b in range(n_w):
+                            row[c, b] -= stiffness[c] * weights[j, b]
                 k += 1
             if any_active:
-                if not used:
-                    block[:, :, :, :] = 0.0
-                    used = True
-                for a_ in range(n_w):
-                    w = weights[i, a_]
-                    if w == 0.0:
-                        continue
-                    for b in range(n_w):
-                        for m in range(3):
-                            for n in range(3):
-                                block[a_, b, m, n] += w * row[b, m, n]
-        if used:
-            for a_ in range(n_w):
-                for b in range(n_w):
-                    to, fro = data[forward[slot[g], a_, b]], data[backward[slot[g], b, a_]]
-                    for m in range(3):
-                        for n in range(3):
-                            to[m, n] += block[a_, b, m, n]
-                            fro[n, m] += block[a_, b, m, n]
-    for i in range(y.shape[0]):
-        if not touched[i]:
-            continue
+                for c in range(6):
+                    for a_ in range(n_w):
+                        w = weights[i, a_]
+                        for b in range(n_w):
+                            block[c, a_, b] += w * row[c, b]
         for a_ in range(n_w):
             for b in range(n_w):
-                w = weights[i, a_] * weights[i, b]
-                target = data[own[host[i], a_, b]]
-                for m in range(3):
-                    for n in range(3):
-                        target[m, n] += w * own_block[i, m, n]
+                _add_symmetric(data[forward[slot[g], a_, b]], block[:, a_, b])
+                _add_symmetric(data[backward[slot[g], b, a_]], block[:, a_, b])
+    p = 0
+    while p < n:
+        h, any_active = host[by_host[p]], False
+        block[:] = 0.0
+        while p < n and host[by_host[p]] == h:
+            i = by_host[p]
+            p += 1
+            if not np.any(at_point[i] != 0.0):
+                continue
+            any_active = True
+            for c in range(6):
+                for a_ in range(n_w):
+                    w = at_point[i, c] * weights[i, a_]
+                    for b in range(n_w):
+                        block[c, a_, b] += w * weights[i, b]
+        if any_active:
+            for a_ in range(n_w):
+                for b in range(n_w):
+                    _add_symmetric(data[own[h, a_, b]], block[:, a_, b])
+
+
+@nb.njit(cache=True, inline="always")
+def _add_symmetric(target: FloatArray, six: FloatArray) -> None:
+    """Add the symmetric matrix with the components 00, 11, 22, 12, 02, 01."""
+    target[0, 0] += six[0]
+    target[1, 1] += six[1]
+    target[2, 2] += six[2]
+    target[1, 2] += six[3]
+    target[2, 1] += six[3]
+    target[0, 2] += six[4]
+    target[2, 0] += six[4]
+    target[0, 1] += six[5]
+    target[1, 0] += six[5]
+
+
+@nb.njit(cache=True)
+def _active(
+    y: FloatArray, first: NDArray[np.int32], second: NDArray[np.int32], reach: FloatArray
+) -> int:
+    count = 0
+    for k in range(len(first)):
+        i, j = first[k], second[k]
+        rr = (y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2 + (y[i, 2] - y[j, 2]) ** 2
+        count += int(rr < reach[k] * reach[k])
+    return count
 
 
 @nb.njit(cache=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.typing import FloatArray, IntArray
 
@@ -11,31 +12,12 @@ __all__ = ["NEIGHBOUR", "search_pairs"]
 
 NEIGHBOUR = 0.8
 """Reach of a pair over its rest distance, at most: a sheet touches itself from 20 % compression."""
+FINENESS = 2
+"""Cubes along the search radius: smaller ones enclose the sphere of that radius more closely."""
+EXPECTED = 72
+"""Pairs of a point for which there is room at first."""
 
 
-@nb.njit(cache=True)
-def _cells(y: FloatArray, size: float) -> tuple[IntArray, IntArray, IntArray]:
-    """Points sorted into cubes of the given size: cube of each point, first of each, members."""
-    n = len(y)
-    low = np.array([y[:, c].min() for c in range(3)])
-    counts = np.array([int((y[:, c].max() - low[c]) / size) + 1 for c in range(3)])
-    place = np.empty((n, 3), dtype=np.int64)
-    start = np.zeros(counts[0] * counts[1] * counts[2] + 1, dtype=np.int64)
-    for i in range(n):
-        for c in range(3):
-            place[i, c] = min(int((y[i, c] - low[c]) / size), counts[c] - 1)
-        start[(place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2] + 1] += 1
-    start = np.cumsum(start)
-    filled = start.copy()
-    members = np.empty(n, dtype=np.int64)
-    for i in range(n):
-        k = (place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2]
-        members[filled[k]] = i
-        filled[k] += 1
-    return np.concatenate((counts, place.ravel())), start, members
-
-
-@nb.njit(cache=True)
 def search_pairs(
     y: FloatArray,
     rest: FloatArray,
@@ -46,79 +28,201 @@ def search_pairs(
     distance: float,
     radius: float,
     skin: float,
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Candidate pairs (first, second, reach, reference) in the order of their hosts."""
+) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray, FloatArray, IntArray, IntArray]:
+    """Candidate pairs in the order of their hosts, grouped by them.
+
+    Parameters
+    ----------
+    y, rest : ndarray
+        ``(k, 3)`` mm, points now and at rest.
+    thickness : ndarray
+        ``(k,)`` mm.
+    by_host, host : ndarray
+        ``(k,)`` points in the order of their hosts, and the host of each.
+    activation, distance : float
+        Activation and reference distance over the thickness.
+    radius : float
+        mm, largest reach of all plus ``skin``.
+    skin : float
+        mm by which the search exceeds the reach of a pair.
+
+    Returns
+    -------
+    first, second : ndarray
+        ``(p,)`` points; the host of ``first`` is not behind that of ``second``.
+    reach, reference : ndarray
+        ``(p,)`` mm, activation and reference distance of each pair.
+    start : ndarray
+        ``(g + 1,)`` where each group of equal hosts starts.
+    hosts : ndarray
+        ``(g, 2)``.
+    """
     n = len(y)
-    grid, start, members = _cells(y, radius)
-    n0, n1, n2 = grid[0], grid[1], grid[2]
-    place = grid[3:].reshape(n, 3)
-    size = 64 * n
-    first, second = np.empty(size, dtype=np.int64), np.empty(size, dtype=np.int64)
-    reach, reference = np.empty(size), np.empty(size)
-    count = 0
+    grid = _cells(y, by_host, radius / FINENESS)
+    rules = (thickness, activation, distance, radius, skin)
+    ends = np.zeros(n + 1, dtype=np.int64)
+    # Large arrays are made here and not in the kernels: numpy has them on huge pages, and their
+    # first use would otherwise take longer than the search.
+    second = np.empty(EXPECTED * n, dtype=np.int32)
+    count = _candidates(y, rest, by_host, host, *grid, *rules, ends, second)
+    if count > len(second):
+        second = np.empty(count, dtype=np.int32)
+        _candidates(y, rest, by_host, host, *grid, *rules, ends, second)
+    points = np.empty((2, count), dtype=np.int32)
+    lengths = np.empty((2, count))
+    start, hosts = _grouped(
+        rest, thickness, by_host, host, activation, distance, ends, second, points, lengths
+    )
+    return points[0], points[1], lengths[0], lengths[1], start, hosts
+
+
+@nb.njit(cache=True)
+def _cells(
+    y: FloatArray, by_host: IntArray, size: float
+) -> tuple[IntArray, NDArray[np.int32], IntArray, FloatArray]:
+    """Cubes of the given size: their number per axis, cube of each point, first and members.
+
+    The members of a cube come by host; where they are is given besides, one axis after the other.
+    """
+    n = len(y)
+    low = np.array([y[:, c].min() for c in range(3)])
+    counts = np.array([int((y[:, c].max() - low[c]) / size) + 1 for c in range(3)])
+    place = np.empty((n, 3), dtype=np.int32)
+    start = np.zeros(counts[0] * counts[1] * counts[2] + 1, dtype=np.int64)
+    for i in range(n):
+        for c in range(3):
+            place[i, c] = min(int((y[i, c] - low[c]) / size), counts[c] - 1)
+        start[(place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2] + 1] += 1
+    start = np.cumsum(start)
+    filled = start[:-1].copy()
+    table = np.empty((4, n))
     for p in range(n):
         i = by_host[p]
-        for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, n0)):
-            for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, n1)):
+        k = (place[i, 0] * counts[1] + place[i, 1]) * counts[2] + place[i, 2]
+        for c in range(3):
+            table[c, filled[k]] = y[i, c]
+        table[3, filled[k]] = i
+        filled[k] += 1
+    return counts, place, start, table
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _candidates(
+    y: FloatArray,
+    rest: FloatArray,
+    by_host: IntArray,
+    host: IntArray,
+    counts: IntArray,
+    place: NDArray[np.int32],
+    start: IntArray,
+    table: FloatArray,
+    thickness: FloatArray,
+    activation: float,
+    distance: float,
+    radius: float,
+    skin: float,
+    ends: IntArray,
+    second: NDArray[np.int32],
+) -> int:
+    """How many pairs there are; their second points, as far as there is room for them.
+
+    ``ends[p + 1]`` is where the pairs end whose first point is the p-th by host.
+    """
+    n = len(y)
+    x0, x1, x2 = table[0], table[1], table[2]
+    member, owner = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
+    for q in range(n):
+        member[q] = int(table[3, q])
+        owner[q] = host[member[q]]
+    near_ones, squares = np.empty(n, dtype=np.int32), np.empty(n)
+    n0, n1, n2 = counts
+    limit, count = radius * radius, 0
+    for p in range(n):
+        i = by_host[p]
+        y0, y1, y2, own = y[i, 0], y[i, 1], y[i, 2], host[i]
+        low = max(place[i, 2] - FINENESS, 0)
+        high = min(place[i, 2] + FINENESS + 1, n2)
+        for a in range(max(place[i, 0] - FINENESS, 0), min(place[i, 0] + FINENESS + 1, n0)):
+            for b in range(max(place[i, 1] - FINENESS, 0), min(place[i, 1] + FINENESS + 1, n1)):
                 row = (a * n1 + b) * n2
-                begin = start[row + max(place[i, 2] - 1, 0)]
-                end = start[row + min(place[i, 2] + 2, n2)]
-                for q in range(begin, end):
-                    j = members[q]
-                    if host[j] < host[i] or (host[j] == host[i] and j <= i):
-                        continue
-                    rr = 0.0
-                    for c in range(3):
-                        rr += (y[i, c] - y[j, c]) ** 2
-                    if rr >= radius * radius:
+                some = 0
+                for q in range(start[row + low], start[row + high]):
+                    rr = (y0 - x0[q]) ** 2 + (y1 - x1[q]) ** 2 + (y2 - x2[q]) ** 2
+                    # Written in any case and kept by counting on: nothing for the processor to
+                    # predict wrongly.
+                    near_ones[some], squares[some] = q, rr
+                    some += int((rr < limit) & (owner[q] >= own))
+                for k in range(some):
+                    j = member[near_ones[k]]
+                    if host[j] == own and j <= i:
                         continue
                     mean = 0.5 * (thickness[i] + thickness[j])
-                    full = activation * mean
-                    apart = 0.0
-                    for c in range(3):
-                        apart += (rest[i, c] - rest[j, c]) ** 2
-                    near = min(full, NEIGHBOUR * np.sqrt(apart))
+                    reach = _reach(rest, i, j, activation * mean)
                     # Neighbours that would have to be compressed to half their rest distance
                     # never touch.
-                    if rr >= (near + skin) ** 2 or near <= 0.5 * distance * mean:
+                    if reach <= 0.5 * distance * mean or squares[k] >= (reach + skin) ** 2:
                         continue
-                    if count == size:
-                        size *= 2
-                        first, second = _grown(first, size), _grown(second, size)
-                        reach, reference = _grown(reach, size), _grown(reference, size)
-                    first[count], second[count] = i, j
-                    reach[count] = near
-                    reference[count] = distance * mean * near / full
+                    if count < len(second):
+                        second[count] = j
                     count += 1
-    order = _sort_by_second_host(first, second, count, host)
-    return first[order], second[order], reach[order], reference[order]
+        ends[p + 1] = count
+    return count
 
 
-@nb.njit(cache=True)
-def _grown(values: np.ndarray, size: int) -> np.ndarray:
-    out = np.empty(size, dtype=values.dtype)
-    out[: len(values)] = values
-    return out
+@nb.njit(cache=True, inline="always")
+def _reach(rest: FloatArray, i: int, j: int, full: float) -> float:
+    """Activation distance of a pair: ``full``, or less if it is close at rest."""
+    apart = 0.0
+    for c in range(3):
+        apart += (rest[i, c] - rest[j, c]) ** 2
+    return min(full, NEIGHBOUR * np.sqrt(apart))
 
 
-@nb.njit(cache=True)
-def _sort_by_second_host(first: IntArray, second: IntArray, count: int, host: IntArray) -> IntArray:
-    """Stable order by the host of ``second`` within each run of equal hosts of ``first``."""
-    order = np.empty(count, dtype=np.int64)
-    bins = np.zeros(host.max() + 2, dtype=np.int64)
-    begin = 0
-    while begin < count:
-        end = begin
-        owner = host[first[begin]]
-        while end < count and host[first[end]] == owner:
-            end += 1
-        bins[:] = 0
-        for k in range(begin, end):
-            bins[host[second[k]] + 1] += 1
-        bins = np.cumsum(bins)
-        for k in range(begin, end):
+@nb.njit(cache=True, error_model="numpy")
+def _grouped(
+    rest: FloatArray,
+    thickness: FloatArray,
+    by_host: IntArray,
+    host: IntArray,
+    activation: float,
+    distance: float,
+    ends: IntArray,
+    second: NDArray[np.int32],
+    points: NDArray[np.int32],
+    lengths: FloatArray,
+) -> tuple[IntArray, IntArray]:
+    """Write the pairs in the order of both hosts, and their lengths; where groups start, hosts."""
+    n, count = len(by_host), ends[-1]
+    place = np.zeros(host.max() + 1, dtype=np.int64)
+    start, hosts = np.empty(count + 1, dtype=np.int64), np.empty((count, 2), dtype=np.int64)
+    groups, done = 0, 0
+    while done < n:
+        own, after = host[by_host[done]], done
+        low, high = len(place), -1
+        while after < n and host[by_host[after]] == own:
+            after += 1
+        for k in range(ends[done], ends[after]):
             h = host[second[k]]
-            order[begin + bins[h]] = k
-            bins[h] += 1
-        begin = end
-    return order
+            place[h] += 1
+            low, high = min(low, h), max(high, h)
+        at = ends[done]
+        for h in range(low, high + 1):
+            if place[h] > 0:
+                start[groups], hosts[groups, 0], hosts[groups, 1] = at, own, h
+                groups += 1
+                at, place[h] = at + place[h], at
+        for p in range(done, after):
+            i = by_host[p]
+            for k in range(ends[p], ends[p + 1]):
+                j = second[k]
+                mean = 0.5 * (thickness[i] + thickness[j])
+                full = activation * mean
+                reach = _reach(rest, i, j, full)
+                at = place[host[j]]
+                place[host[j]] += 1
+                points[0, at], points[1, at] = i, j
+                lengths[0, at], lengths[1, at] = reach, distance * mean * reach / full
+        place[low : high + 1] = 0
+        done = after
+    start[groups] = count
+    return start[: groups + 1].copy(), hosts[:groups].copy()
