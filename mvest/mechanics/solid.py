@@ -9,12 +9,12 @@ Kinematics. Shape-function gradients are stored along the axes of the fibre fram
 quadrature point, ``g_a = Q^T dN_a/dX``, so that ``F Q = sum_a x_a g_a^T`` and the Green-Lagrange
 strain comes out in the fibre frame in which the law lives.
 
-Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with
-``M = (det J0 / det J) (G^3 x G^3) p`` (G^3 the contravariant thickness vector at the centre). The
-parameters alpha of an element solve ``int M^T S dV = 0`` and are eliminated inside the element by
-Newton's method at every evaluation, so that to the outside the element has an energy of nodal
-positions only (its condensed tangent is the Schur complement). The modes integrate to zero against
-constant stress: the patch test holds.
+Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = d p^T``: the strain
+``d = (det J0 / det J) (G^3 x G^3)`` (G^3 the contravariant thickness vector at the centre) times
+the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0`` and are
+eliminated inside the element by Newton's method at every evaluation, so that to the outside the
+element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
+modes integrate to zero against constant stress: the patch test holds.
 """
 
 from __future__ import annotations
@@ -36,7 +36,13 @@ __all__ = ["Law", "Solid", "SolidState", "kernels_are_compiled"]
 
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
-"""Relative size of the last alpha correction (strain) at which the elimination stops."""
+"""Size of the last alpha correction (strain) at which the elimination stops."""
+LINEAR = 1e-9
+"""Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
+
+
+VOIGT = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
+"""Component of a six-vector that an entry of a symmetric tensor is."""
 
 
 @runtime_checkable
@@ -142,11 +148,10 @@ class Solid:
         reference = mesh.reference
         self.n_nodes = len(mesh.nodes)
         self.gradients, self.volumes = _fibre_gradients(mesh, reference)
-        if enhanced:
-            self.modes = _enhanced_modes(mesh, reference)
-        else:
-            self.modes = np.zeros((*self.volumes.shape, 6, 0))
-        self.n_modes = self.modes.shape[3]
+        self.direction = _enhanced_direction(mesh, reference)
+        polynomials = reference.enhanced(reference.points)
+        self.polynomials = np.ascontiguousarray(polynomials if enhanced else polynomials[:, :0])
+        self.n_modes = self.polynomials.shape[1]
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
         self.reset()
 
@@ -167,15 +172,19 @@ class Solid:
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
         alpha = self.enhanced_parameters
         for _ in range(ENHANCED_ITERATIONS):
-            green = green_u + np.einsum("eqim,em->eqi", self.modes, alpha)
+            green = _enhanced(green_u, self.direction, self.polynomials, alpha)
             stress, tangent = self.law.response(green, region, previous, rate)
-            residual, matrix = _enhanced_system(self.modes, self.volumes, stress, tangent)
-            step = -np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
-            size = np.max(np.abs(step), initial=0.0)
+            step = self._alpha_change(stress, tangent)
+            size = float(np.abs(step).max(initial=0.0))
             if not np.isfinite(size) or size < ENHANCED_TOLERANCE:
                 break
             # An enhanced strain beyond +-0.2 per iteration is far outside the law's small strains.
             alpha = alpha + np.clip(step, -0.2, 0.2)
+            if size < LINEAR:
+                more = _enhanced(np.zeros_like(green), self.direction, self.polynomials, step)
+                green += more
+                stress += np.einsum("eqij,eqj->eqi", tangent, more)
+                break
         if np.isfinite(alpha).all():
             self.enhanced_parameters = alpha
         return SolidState(green, stress, tangent, alpha, f)
@@ -184,10 +193,27 @@ class Solid:
         """Internal forces ``(e, k, 3)`` N."""
         return _forces(self.gradients, self.volumes, state.deformation, state.stress)
 
-    def tangents(self, state: SolidState) -> FloatArray:
-        """Condensed consistent tangents ``(e, 3k, 3k)`` N/mm."""
-        return _tangents(
-            self.gradients, self.volumes, state.deformation, state.stress, state.tangent, self.modes
+    def add_tangents(self, state: SolidState, positions: IntArray, blocks: FloatArray) -> None:
+        """Add the condensed consistent tangents, N/mm, to block data.
+
+        Parameters
+        ----------
+        state : SolidState
+        positions : ndarray
+            ``(e, k, k)`` where the blocks of the pairs of nodes lie in the data.
+        blocks : ndarray
+            ``(n_blocks, 3, 3)``.
+        """
+        _add_tangents(
+            self.gradients,
+            self.volumes,
+            state.deformation,
+            state.stress,
+            state.tangent,
+            self.direction,
+            self.polynomials,
+            positions,
+            blocks,
         )
 
     def extrapolated_stress(self, state: SolidState, dx: FloatArray) -> FloatArray:
@@ -204,9 +230,8 @@ class Solid:
             ``(e, q, 6)`` partial derivative of S with respect to a parameter at fixed strain.
         """
         if self.n_modes:
-            d_stress = d_stress + np.einsum(
-                "eqij,eqjm,em->eqi", state.tangent, self.modes, self._alpha_change(state, d_stress)
-            )
+            change = self._enhanced_change(state, d_stress)
+            d_stress = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
         return _forces(self.gradients, self.volumes, state.deformation, d_stress)
 
     def green_change(self, state: SolidState, dx: FloatArray, d_stress: FloatArray) -> FloatArray:
@@ -222,20 +247,23 @@ class Solid:
         d_green = _strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
         if self.n_modes:
             total = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, d_green)
-            change = self._alpha_change(state, total)
-            d_green = d_green + np.einsum("eqim,em->eqi", self.modes, change)
+            d_green = d_green + self._enhanced_change(state, total)
         return d_green
 
-    def _alpha_change(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
-        residual, matrix = _enhanced_system(self.modes, self.volumes, d_stress, state.tangent)
-        change = np.linalg.solve(matrix, residual[:, :, None])[:, :, 0]
-        return np.asarray(-change, dtype=np.float64)
+    def _enhanced_change(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
+        """Change of the enhanced strain ``(e, q, 6)`` that balances a change of the stress."""
+        change = self._alpha_change(d_stress, state.tangent)
+        return _enhanced(np.zeros_like(d_stress), self.direction, self.polynomials, change)
+
+    def _alpha_change(self, stress: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Step ``(e, n_modes)`` of Newton's method for ``int M^T S dV = 0``."""
+        return _alpha_change(self.direction, self.polynomials, self.volumes, stress, tangent)
 
 
 def kernels_are_compiled() -> bool:
     """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
-    place = _tangents.stats.cache_path
-    return place is not None and any(Path(place).glob("solid._tangents-*.nbi"))
+    place = _add_tangents.stats.cache_path
+    return place is not None and any(Path(place).glob("solid._add_tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
@@ -267,9 +295,8 @@ def _fibre_frames(mesh: SolidMesh, reference: Element, jacobian: FloatArray) -> 
     return np.stack([fibre, np.cross(normal, fibre), normal], axis=-1)
 
 
-def _enhanced_modes(mesh: SolidMesh, reference: Element) -> FloatArray:
-    """Modes ``(e, q, 6, m)`` in the fibre frame, engineering shear."""
-    polynomial = reference.enhanced(reference.points)
+def _enhanced_direction(mesh: SolidMesh, reference: Element) -> FloatArray:
+    """Strain ``d (e, q, 6)`` of all modes in the fibre frame, engineering shear."""
     x_e = mesh.nodes[mesh.elements]
     jacobian = np.einsum("eai,qaj->eqij", x_e, reference.gradient(reference.points))
     centre = np.einsum("eai,aj->eij", x_e, reference.gradient(reference.centre)[0])
@@ -290,9 +317,7 @@ def _enhanced_modes(mesh: SolidMesh, reference: Element) -> FloatArray:
         axis=-1,
     )
     ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
-    return np.ascontiguousarray(
-        ratio[:, :, None, None] * dyad[:, :, :, None] * polynomial[None, :, None, :]
-    )
+    return np.ascontiguousarray(ratio[:, :, None] * dyad)
 
 
 def _lumped_volume(mesh: SolidMesh, reference: Element, volumes: FloatArray) -> FloatArray:
@@ -359,30 +384,76 @@ def _strain_derivative(
 
 
 @nb.njit(cache=True)
-def _enhanced_system(
-    modes: FloatArray, volumes: FloatArray, stress: FloatArray, tangent: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    n_e, n_q, _, n_m = modes.shape
-    residual = np.zeros((n_e, n_m))
-    matrix = np.zeros((n_e, n_m, n_m))
-    dm = np.empty((6, n_m))
-    for e in range(n_e):
+def _enhanced(
+    green: FloatArray, direction: FloatArray, polynomials: FloatArray, alpha: FloatArray
+) -> FloatArray:
+    """Green-Lagrange strain ``(e, q, 6)`` with the enhanced part added."""
+    out = np.empty_like(green)
+    for e in range(green.shape[0]):
+        for q in range(green.shape[1]):
+            amplitude = 0.0
+            for m in range(alpha.shape[1]):
+                amplitude += polynomials[q, m] * alpha[e, m]
+            for i in range(6):
+                out[e, q, i] = green[e, q, i] + amplitude * direction[e, q, i]
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _alpha_change(
+    direction: FloatArray,
+    polynomials: FloatArray,
+    volumes: FloatArray,
+    stress: FloatArray,
+    tangent: FloatArray,
+) -> FloatArray:
+    n_q, n_m = polynomials.shape
+    out = np.zeros((len(volumes), n_m))
+    matrix = np.empty((n_m, n_m))
+    for e in range(len(volumes)):
+        matrix[:] = 0.0
         for q in range(n_q):
-            w = volumes[e, q]
+            d, force, stiffness = direction[e, q], 0.0, 0.0
+            for i in range(6):
+                force += d[i] * stress[e, q, i]
+                row = 0.0
+                for j in range(6):
+                    row += tangent[e, q, i, j] * d[j]
+                stiffness += d[i] * row
             for k in range(n_m):
-                for i in range(6):
-                    value = 0.0
-                    for j in range(6):
-                        value += tangent[e, q, i, j] * modes[e, q, j, k]
-                    dm[i, k] = value
-                    residual[e, k] += w * modes[e, q, i, k] * stress[e, q, i]
-            for k in range(n_m):
+                p = volumes[e, q] * polynomials[q, k]
+                out[e, k] -= p * force
                 for m in range(n_m):
-                    value = 0.0
-                    for i in range(6):
-                        value += modes[e, q, i, k] * dm[i, m]
-                    matrix[e, k, m] += w * value
-    return residual, matrix
+                    matrix[k, m] += p * polynomials[q, m] * stiffness
+        _solve_small(matrix, out[e].reshape(n_m, 1))
+    return out
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _solve_small(matrix: FloatArray, right: FloatArray) -> None:
+    """Overwrite ``right (m, c)`` by the solution; the matrix ``(m, m)`` is overwritten too."""
+    m = len(matrix)
+    for k in range(m):
+        pivot = k
+        for r in range(k + 1, m):
+            if abs(matrix[r, k]) > abs(matrix[pivot, k]):
+                pivot = r
+        if pivot != k:
+            for c in range(m):
+                matrix[k, c], matrix[pivot, c] = matrix[pivot, c], matrix[k, c]
+            for c in range(right.shape[1]):
+                right[k, c], right[pivot, c] = right[pivot, c], right[k, c]
+        for r in range(k + 1, m):
+            factor = matrix[r, k] / matrix[k, k]
+            for c in range(k + 1, m):
+                matrix[r, c] -= factor * matrix[k, c]
+            for c in range(right.shape[1]):
+                right[r, c] -= factor * right[k, c]
+    for k in range(m - 1, -1, -1):
+        for c in range(right.shape[1]):
+            for r in range(k + 1, m):
+                right[k, c] -= matrix[k, r] * right[r, c]
+            right[k, c] /= matrix[k, k]
 
 
 @nb.njit(cache=True)
@@ -406,60 +477,110 @@ def _forces(
     return out
 
 
-@nb.njit(cache=True)
-def _tangents(
+@nb.njit(cache=True, error_model="numpy")
+def _moduli(
+    f: FloatArray,
+    stress: FloatArray,
+    tangent: FloatArray,
+    w: float,
+    half: FloatArray,
+    a: FloatArray,
+) -> None:
+    """``w dP/dF`` as ``a (9, 9)``, rows and columns ``3 i + J``, of one quadrature point."""
+    for i in range(3):
+        for j in range(3):
+            r0, r1, r2 = tangent[VOIGT[0, j]], tangent[VOIGT[1, j]], tangent[VOIGT[2, j]]
+            f0, f1, f2 = w * f[i, 0], w * f[i, 1], w * f[i, 2]
+            for v in range(6):
+                half[3 * i + j, v] = f0 * r0[v] + f1 * r1[v] + f2 * r2[v]
+    for r in range(9):
+        h = half[r]
+        for k in range(3):
+            f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
+            a[r, 3 * k] = f0 * h[0] + f1 * h[5] + f2 * h[4]
+            a[r, 3 * k + 1] = f0 * h[5] + f1 * h[1] + f2 * h[3]
+            a[r, 3 * k + 2] = f0 * h[4] + f1 * h[3] + f2 * h[2]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                a[3 * i + j, 3 * i + k] += w * stress[VOIGT[j, k]]
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _add_tangents(
     gradients: FloatArray,
     volumes: FloatArray,
     deformation: FloatArray,
     stress: FloatArray,
     tangent: FloatArray,
-    modes: FloatArray,
-) -> FloatArray:
+    direction: FloatArray,
+    polynomials: FloatArray,
+    positions: IntArray,
+    blocks: FloatArray,
+) -> None:
+    """``K_ab = sum_q w g_a (dP/dF) g_b``, less what the enhanced strains take away."""
     n_e, n_q, n_a, _ = gradients.shape
-    n_m = modes.shape[3]
-    n_d = 3 * n_a
-    out = np.empty((n_e, n_d, n_d))
-    b = np.zeros((n_q * 6, n_d))
-    db = np.empty((n_q * 6, n_d))
-    g_all = np.empty((n_q * 3, n_a))
-    sg = np.empty((n_q * 3, n_a))
-    k_am = np.empty((n_m, n_d))
-    k_mm = np.empty((n_m, n_m))
+    n_m = polynomials.shape[1]
+    half, a = np.empty((9, 6)), np.empty((9, 9))
+    # Components come first and nodes last, so that the innermost loops run along the nodes: the
+    # block of nodes a and b is k[a, :, :, b].
+    g, g_t = np.empty((3 * n_q, n_a)), np.empty((n_a, 3 * n_q))
+    t, k = np.empty((3 * n_q, 9 * n_a)), np.empty((n_a, 9 * n_a))
+    row, d_d, p_d = np.empty((3, n_a)), np.empty(6), np.empty((3, 3))
+    k_am, k_mm = np.empty((n_m, 3 * n_a)), np.empty((n_m, n_m))
     for e in range(n_e):
-        k_mm[:, :] = 0.0
+        k_am[:] = 0.0
+        k_mm[:] = 0.0
         for q in range(n_q):
-            f, s, w = deformation[e, q], stress[e, q], volumes[e, q]
-            r = 6 * q
-            for a in range(n_a):
-                g0, g1, g2 = gradients[e, q, a, 0], gradients[e, q, a, 1], gradients[e, q, a, 2]
+            f, w = deformation[e, q], volumes[e, q]
+            for j in range(3):
+                for b in range(n_a):
+                    g[3 * q + j, b] = g_t[b, 3 * q + j] = gradients[e, q, b, j]
+            g0, g1, g2 = g[3 * q], g[3 * q + 1], g[3 * q + 2]
+            _moduli(f, stress[e, q], tangent[e, q], w, half, a)
+            for j in range(3):
                 for i in range(3):
-                    c = 3 * a + i
-                    b[r, c] = f[i, 0] * g0
-                    b[r + 1, c] = f[i, 1] * g1
-                    b[r + 2, c] = f[i, 2] * g2
-                    b[r + 3, c] = f[i, 1] * g2 + f[i, 2] * g1
-                    b[r + 4, c] = f[i, 0] * g2 + f[i, 2] * g0
-                    b[r + 5, c] = f[i, 0] * g1 + f[i, 1] * g0
-                p = 3 * q
-                g_all[p, a], g_all[p + 1, a], g_all[p + 2, a] = g0, g1, g2
-                sg[p, a] = w * (s[0] * g0 + s[5] * g1 + s[4] * g2)
-                sg[p + 1, a] = w * (s[5] * g0 + s[1] * g1 + s[3] * g2)
-                sg[p + 2, a] = w * (s[4] * g0 + s[3] * g1 + s[2] * g2)
-            db[r : r + 6] = w * np.dot(np.ascontiguousarray(tangent[e, q]), b[r : r + 6])
-        k = np.dot(b.T, db)
-        geometric = np.dot(g_all.T, sg)
-        for a in range(n_a):
-            for c in range(n_a):
+                    for c in range(3):
+                        a0, a1, a2 = a[3 * i + j, 3 * c : 3 * c + 3]
+                        at = (3 * i + c) * n_a
+                        for b in range(n_a):
+                            t[3 * q + j, at + b] = a0 * g0[b] + a1 * g1[b] + a2 * g2[b]
+            if n_m > 0:
+                stiffness, d = 0.0, direction[e, q]
+                for i in range(6):
+                    d_d[i] = 0.0
+                    for j in range(6):
+                        d_d[i] += w * tangent[e, q, i, j] * d[j]
+                    stiffness += d[i] * d_d[i]
                 for i in range(3):
-                    k[3 * a + i, 3 * c + i] += geometric[a, c]
+                    for j in range(3):
+                        p_d[i, j] = (
+                            f[i, 0] * d_d[VOIGT[0, j]]
+                            + f[i, 1] * d_d[VOIGT[1, j]]
+                            + f[i, 2] * d_d[VOIGT[2, j]]
+                        )
+                    for b in range(n_a):
+                        row[i, b] = p_d[i, 0] * g0[b] + p_d[i, 1] * g1[b] + p_d[i, 2] * g2[b]
+                for m in range(n_m):
+                    p = polynomials[q, m]
+                    for c in range(n_m):
+                        k_mm[m, c] += p * polynomials[q, c] * stiffness
+                    for i in range(3):
+                        for b in range(n_a):
+                            k_am[m, i * n_a + b] += p * row[i, b]
+        np.dot(g_t, t, k)
         if n_m > 0:
-            k_am[:, :] = 0.0
-            for q in range(n_q):
-                m_q = np.ascontiguousarray(modes[e, q])
-                k_am += np.dot(m_q.T, db[6 * q : 6 * q + 6])
-                k_mm += volumes[e, q] * np.dot(
-                    m_q.T, np.dot(np.ascontiguousarray(tangent[e, q]), m_q)
-                )
-            k -= np.dot(k_am.T, np.linalg.solve(k_mm, k_am))
-        out[e] = k
-    return out
+            change = k_am.copy()
+            _solve_small(k_mm, change)
+            for m in range(n_m):
+                for i in range(3):
+                    for b in range(n_a):
+                        factor = k_am[m, i * n_a + b]
+                        for c in range(3 * n_a):
+                            k[b, 3 * i * n_a + c] -= factor * change[m, c]
+        for b in range(n_a):
+            for c in range(n_a):
+                block = blocks[positions[e, b, c]]
+                for i in range(3):
+                    for j in range(3):
+                        block[i, j] += k[b, (3 * i + j) * n_a + c]

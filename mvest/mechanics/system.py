@@ -234,7 +234,7 @@ class System:
                 slots = self._contact_slots(self.contact, pairs, self.contact.points(x))
             blocks = self.pattern.zeros()
             carrying = state if stress is None else replace(state, stress=stress)
-            scatter_matrices(blocks, self._at_elements, self.solid.tangents(carrying))
+            self.solid.add_tangents(carrying, self._at_elements, blocks)
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0:
             external = np.zeros((self.n, 3))

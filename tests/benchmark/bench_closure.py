@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mvest.mechanics.assembly import scatter_matrices
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Step
@@ -34,12 +33,12 @@ def test_tangent(case, measure):
     measure(lambda: c.system.evaluate(*at, tangent=True), **about)
 
 
-def test_scatter(case, measure):
+def test_element_tangents(case, measure):
     c, about = case
-    tangents = c.system.solid.tangents(c.system.solid.evaluate(c.x, c.strain, 0.0))
-    blocks = c.system.pattern.zeros()
-    where = c.system._at_elements
-    measure(lambda: scatter_matrices(blocks, where, tangents), **about)
+    solid = c.system.solid
+    state = solid.evaluate(c.x, c.strain, 0.0)
+    blocks, where = c.system.pattern.zeros(), c.system._at_elements
+    measure(lambda: solid.add_tangents(state, where, blocks), **about)
 
 
 def test_contact_search(case, measure):
