@@ -81,8 +81,8 @@ class ContactPairs:
         ``(k, 3)`` point positions of the search.
     """
 
-    first: IntArray
-    second: IntArray
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
     reach: FloatArray
     reference: FloatArray
     start: IntArray
@@ -414,8 +414,8 @@ def _active(
 @nb.njit(cache=True)
 def _touching(
     y: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
     reach: FloatArray,
     start: IntArray,
     margin: float,
@@ -435,8 +435,8 @@ def _touching(
 def _largest_step(
     y: FloatArray,
     dy: FloatArray,
-    first: IntArray,
-    second: IntArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
     reach: FloatArray,
     reference: FloatArray,
 ) -> float:

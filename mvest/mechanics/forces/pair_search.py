@@ -58,16 +58,35 @@ def search_pairs(
         ``(g, 2)``.
     """
     n = len(y)
-    grid = _cells(y, by_host, radius / FINENESS)
-    rules = (thickness, activation, distance, radius, skin)
+    counts, place, first_of, table = _cells(y, by_host, radius / FINENESS)
     ends = np.zeros(n + 1, dtype=np.int64)
+
+    def write(second: NDArray[np.int32]) -> int:
+        return _candidates(
+            y,
+            rest,
+            by_host,
+            host,
+            counts,
+            place,
+            first_of,
+            table,
+            thickness,
+            activation,
+            distance,
+            radius,
+            skin,
+            ends,
+            second,
+        )
+
     # Large arrays are made here and not in the kernels: numpy has them on huge pages, and their
     # first use would otherwise take longer than the search.
     second = np.empty(EXPECTED * n, dtype=np.int32)
-    count = _candidates(y, rest, by_host, host, *grid, *rules, ends, second)
+    count = write(second)
     if count > len(second):
         second = np.empty(count, dtype=np.int32)
-        _candidates(y, rest, by_host, host, *grid, *rules, ends, second)
+        write(second)
     points = np.empty((2, count), dtype=np.int32)
     lengths = np.empty((2, count))
     start, hosts = _grouped(
