@@ -21,14 +21,14 @@ Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for ea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
-from mvest.mechanics.forces.contact import Contact, ContactPairs
+from mvest.mechanics.forces.contact import HARMLESS, Contact, ContactPairs
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,
@@ -322,54 +322,65 @@ class _Stepper:
         if fixed.size:
             x[fixed] = loads.fixed
 
-        def evaluate(at: FloatArray, tangent: bool, stress: FloatArray | None = None) -> Evaluation:
+        def evaluate(at: FloatArray) -> Evaluation:
             nonlocal pairs
             pairs = self._candidates(at)
-            result = system.evaluate(
-                at, loads, pairs, state.strain, rate, tangent=tangent, stress=stress
-            )
+            result = system.evaluate(at, loads, pairs, state.strain, rate, tangent=False)
             inertial = mass_factor * mass * at - push
             result.residual += inertial
             result.scale = max(result.scale, float(np.linalg.norm(inertial)), 1e-12)
             result.residual[system.held] = 0.0
             return result
 
+        def factorize() -> None:
+            nonlocal pairs
+            pairs = self._candidates(x)  # the line search may have tried other places since
+            blocks = system.tangent(x, loads, pairs, current.solid)
+            self.solver.factorize(system.matrix(blocks, mass_factor))
+
+        def linearize(at: FloatArray, stress: FloatArray | None) -> Evaluation:
+            result = evaluate(at)
+            solid = result.solid if stress is None else replace(result.solid, stress=stress)
+            result.blocks = system.tangent(at, loads, pairs, solid)
+            return result
+
         residuals: list[float] = []
         if not mass_factor and system.contact is None and not newton.single_solve:
-            x, residuals = approach(
-                system, self.solver, lambda at, s: evaluate(at, True, s), x, self._far
-            )
-        current = evaluate(x, True)
+            x, residuals = approach(system, self.solver, linearize, x, self._far)
+        current = evaluate(x)
         residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
         for iteration in range(newton.max_iterations + 1):
             if not np.isfinite(residuals[-1]):
                 raise _StepError(StepReason.NO_CONVERGENCE)
-            assert current.blocks is not None
             converged = residuals[-1] <= tolerance
-            if converged and (self.passing or not self.parameters):
+            if converged and self.passing:
                 return _Solved(x, current, residuals, pairs)
             if iteration == newton.max_iterations and not converged:
                 break
             try:
-                self.solver.factorize(system.matrix(current.blocks, mass_factor))
+                # A converged state keeps the last factor, unless derivatives need its own.
+                if not converged or self.parameters or iteration == 0:
+                    factorize()
                 # A forcing term of the size of the residual keeps the convergence quadratic
                 # (Dembo, Eisenstat and Steihaug 1982, SIAM J. Numer. Anal. 19:400).
-                forcing = min(1e-3, max(1e-9, residuals[-1]))
+                forcing = 1e-3 if converged else min(1e-3, max(1e-9, residuals[-1]))
                 d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
                 raise _StepError(StepReason.SINGULAR) from error
             if not np.isfinite(d).all():
                 raise _StepError(StepReason.SINGULAR)
-            if converged or float(np.abs(d).max()) <= newton.smallest_move:
-                # The factor of the converged state is kept for the sensitivities.
-                return _Solved(x, current, residuals, pairs)
+            size = float(np.abs(d).max())
+            if converged or size <= newton.smallest_move:
+                # What is left of the way is gone, so that the state depends on its start by less
+                # than the tolerance admits.
+                return _Solved(x + d if size <= HARMLESS else x, current, residuals, pairs)
             x, current = self._line_search(x, d, current, pairs, evaluate)
             if float(np.abs(x - state.x).max()) > self._far:
                 raise _StepError(StepReason.NO_CONVERGENCE)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
-                assert current.blocks is not None
-                self.solver.factorize(system.matrix(current.blocks, mass_factor))
+                if self.parameters:
+                    factorize()
                 return _Solved(x, current, residuals, pairs)
         raise _StepError(StepReason.NO_CONVERGENCE)
 
@@ -389,7 +400,7 @@ class _Stepper:
         d: FloatArray,
         current: Evaluation,
         pairs: ContactPairs | None,
-        evaluate: Callable[[FloatArray, bool], Evaluation],
+        evaluate: Callable[[FloatArray], Evaluation],
     ) -> tuple[FloatArray, Evaluation]:
         """Step along ``d``: admissible for contact, then backtracking on the slope r . d."""
         contact = self.system.contact
@@ -398,25 +409,24 @@ class _Stepper:
             y, dy = contact.points(x), contact.points(d)
             factor *= _largest_step(contact, pairs, y, factor * dy)
         if self.newton.single_solve:
-            return x + factor * d, evaluate(x + factor * d, True)
+            return x + factor * d, evaluate(x + factor * d)
         norm = float(np.linalg.norm(current.residual))
         slope = abs(float(np.sum(current.residual * d)))
-        best: tuple[float, FloatArray] | None = None
+        best: tuple[float, FloatArray, Evaluation] | None = None
         for _ in range(8):
             trial = x + factor * d
-            result = evaluate(trial, True)
+            result = evaluate(trial)
             new_norm = float(np.linalg.norm(result.residual))
             new_slope = abs(float(np.sum(result.residual * d)))
             if np.isfinite(new_norm):
                 if new_norm <= (1 - 1e-3 * factor) * norm or new_slope <= 0.9 * slope:
                     return trial, result
                 if best is None or new_slope < best[0]:
-                    best = (new_slope, trial)
+                    best = (new_slope, trial, result)
             factor *= 0.5
         if best is None:
             raise _StepError(StepReason.NO_CONVERGENCE)
-        # Anew, since later trials may have changed the sparsity pattern.
-        return best[1], evaluate(best[1], True)
+        return best[1:]
 
     def _differentiate(
         self,

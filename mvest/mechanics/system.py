@@ -7,7 +7,7 @@ inertia and mass-proportional damping. The tangent is dr/dx, exact in every term
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
@@ -28,6 +28,7 @@ from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.mesh.embedding import Embedding
 
 __all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
 
@@ -217,63 +218,65 @@ class System:
         rate: float,
         *,
         tangent: bool,
-        stress: FloatArray | None = None,
     ) -> Evaluation:
-        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm.
-
-        With ``stress (e, q, 6)`` MPa the geometric part of the tangent is that of this stress.
-        """
+        """Residual ``(n, 3)`` N and, if asked for, the blocks of its tangent N/mm."""
         state = self.solid.evaluate(x, previous, rate)
         residual = np.zeros((self.n, 3))
         add_forces(residual, self.solid.mesh.elements, self.solid.forces(state))
         scale = float(np.linalg.norm(residual))
-        blocks = None
-        slots = None
-        if tangent:
-            if self.contact is not None and pairs is not None:
-                slots = self._contact_slots(self.contact, pairs, self.contact.points(x))
-            blocks = self.pattern.zeros()
-            carrying = state if stress is None else replace(state, stress=stress)
-            self.solid.add_tangents(carrying, self._at_elements, blocks)
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0:
             external = np.zeros((self.n, 3))
             add_forces(external, self.pressure.faces, p * self.pressure.forces(x))
             residual -= external
             scale = max(scale, float(np.linalg.norm(external)))
-            if blocks is not None:
-                scatter_matrices(blocks, self._at_faces, -p * self.pressure.tangents(x))
         if loads.body_force is not None:
             residual -= loads.body_force
             scale = max(scale, float(np.linalg.norm(loads.body_force)))
         if self.cables is not None:
-            force, stiffness, _, _ = self._cable_forces(self.cables, x, loads)
-            patches = self.cables.patches
-            add_forces(residual, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
-            if blocks is not None:
-                scatter_blocks(blocks, self._at_cables, patches.weights, stiffness)
+            force = self._cable_forces(self.cables, x, loads)[0]
+            _spread(residual, self.cables.patches, force)
         if self.hinge is not None:
-            force = self.hinge.forces(x, loads.hinge)
-            points = self.hinge.points
-            add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
-            if blocks is not None:
-                scatter_blocks(blocks, self._at_hinge, points.weights, self.hinge.blocks)
+            _spread(residual, self.hinge.points, self.hinge.forces(x, loads.hinge))
         if self.ties is not None and loads.tie_lengths is not None:
-            force, stiffness = self.ties.forces(x, loads.tie_lengths)
-            spans = self.ties.spans
-            add_forces(residual, spans.nodes, spans.weights[:, :, None] * force[:, None, :])
-            if blocks is not None:
-                scatter_blocks(blocks, self._at_ties, spans.weights, stiffness)
+            force, _ = self.ties.forces(x, loads.tie_lengths)
+            _spread(residual, self.ties.spans, force)
         if self.contact is not None and pairs is not None:
             points = self.contact.points
-            y = points(x)
-            force = self.contact.forces(pairs, y)
-            add_forces(residual, points.nodes, points.weights[:, :, None] * force[:, None, :])
-            if blocks is not None and slots is not None:
-                self.contact.add_tangent(
-                    pairs, y, blocks, slots, self._forward, self._backward, self._at_elements
-                )
+            _spread(residual, points, self.contact.forces(pairs, points(x)))
+        blocks = self.tangent(x, loads, pairs, state) if tangent else None
         return Evaluation(residual, scale, state, blocks)
+
+    def tangent(
+        self, x: FloatArray, loads: Loads, pairs: ContactPairs | None, state: SolidState
+    ) -> FloatArray:
+        """Blocks N/mm of the derivative of the residual that was evaluated with the same.
+
+        ``state`` is the solid's of that evaluation; the stress in it is only felt as the geometric
+        part of the stiffness.
+        """
+        slots, y = None, None
+        if self.contact is not None and pairs is not None:
+            y = self.contact.points(x)
+            slots = self._contact_slots(self.contact, pairs, y)
+        blocks = self.pattern.zeros()
+        self.solid.add_tangents(state, self._at_elements, blocks)
+        p = self.factors.pressure * loads.pressure
+        if self.pressure is not None and p != 0:
+            scatter_matrices(blocks, self._at_faces, -p * self.pressure.tangents(x))
+        if self.cables is not None:
+            stiffness = self._cable_forces(self.cables, x, loads)[1]
+            scatter_blocks(blocks, self._at_cables, self.cables.patches.weights, stiffness)
+        if self.hinge is not None:
+            scatter_blocks(blocks, self._at_hinge, self.hinge.points.weights, self.hinge.blocks)
+        if self.ties is not None and loads.tie_lengths is not None:
+            _, stiffness = self.ties.forces(x, loads.tie_lengths)
+            scatter_blocks(blocks, self._at_ties, self.ties.spans.weights, stiffness)
+        if self.contact is not None and pairs is not None and y is not None and slots is not None:
+            self.contact.add_tangent(
+                pairs, y, blocks, slots, self._forward, self._backward, self._at_elements
+            )
+        return blocks
 
     def _cable_forces(
         self, cables: Cables, x: FloatArray, loads: Loads
@@ -350,3 +353,8 @@ class System:
             weights = patches.weights * share[:, None]
             add_forces(out, patches.nodes, weights[:, :, None] * force[:, None, :])
         return out
+
+
+def _spread(out: FloatArray, points: Embedding, force: FloatArray) -> None:
+    """Add forces ``(k, 3)`` N at embedded points to those of the nodes ``out (n, 3)``."""
+    add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])

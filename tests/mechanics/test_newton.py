@@ -121,6 +121,37 @@ def test_newton_converges_quadratically_with_contact():
     assert sum(assert_quadratic(record.residuals) for record in result.records) >= 4
 
 
+@pytest.mark.parametrize("parameters", [(), (Parameter("E_f.0", 6.23),)])
+def test_the_last_correction_is_part_of_the_solution(parameters):
+    # What the tolerance leaves would be some 1e-5 mm; two runs that stop at different residuals
+    # would differ by as much.
+    exact = sheet(static=True, newton=NewtonSettings(tolerance=1e-12)).frames[-1]
+    rough = sheet(static=True, newton=NewtonSettings(tolerance=1e-4), parameters=parameters)
+    assert 1e-9 < rough.records[-1].residuals[-1] < 1e-4
+    np.testing.assert_allclose(rough.frames[-1], exact, rtol=0, atol=1e-8)
+
+
+def test_the_tangent_is_made_of_accepted_states_only(monkeypatch):
+    counts = {"evaluate": 0, "tangent": 0}
+
+    def counted(name):
+        true = getattr(System, name)
+
+        def call(self, *arguments, **options):
+            counts[name] += 1
+            return true(self, *arguments, **options)
+
+        return call
+
+    for name in counts:
+        monkeypatch.setattr(System, name, counted(name))
+    system, loading = sandwich(cells=2, samples=11)
+    result = simulate(system, loading, [Step(0.1)], parameters=[Parameter("E_f.upper", 0.5)])
+    assert result.converged
+    # One for each iteration and one for the derivatives, whatever the line search tries.
+    assert counts["tangent"] == result.iterations + 1 < counts["evaluate"]
+
+
 def test_an_expected_move_is_followed_as_far_as_contact_admits():
     # Expected five millimetres below the other sheet, the upper one stops on it.
     system, loading = sandwich(cells=2, samples=11)
