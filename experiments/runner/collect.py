@@ -8,9 +8,8 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
-from experiments.common.plain import flat
-from experiments.common.record import model_of_values
-from experiments.runner.folder import last_record
+from experiments.common.record import Record, model_of_values
+from experiments.runner.compared import Compared, last_compared
 from experiments.runner.plan import Plan, PlannedJob
 from mvest.provenance import config_hash, provenance
 
@@ -18,27 +17,6 @@ __all__ = ["NOT_RUN", "collect", "overheads"]
 
 SCHEMA = 1
 """Version of the layout of ``sweep.json``."""
-
-RUN = (
-    "seed",
-    "status",
-    "reason",
-    "detail",
-    "estimate",
-    "std",
-    "relative_error",
-    "bound",
-    "distance_mm",
-    "distance_to_truth_mm",
-    "nis",
-    "nis_band",
-    "iterations",
-    "forward_solves",
-    "iterates",
-    "iterate_std",
-    "seconds",
-)
-"""What is kept of each seed of a job."""
 
 UNSAID = ("factors", "paths", "tracking")
 """Settings that are no part of what a sweep has in common, or belong to a machine."""
@@ -60,9 +38,13 @@ def collect(
     earlier : mapping
         Short hash -> overhead that was measured when the job was run before.
     """
-    found = [_entry(job, returned.get(job.config_hash[:16])) for job in plan.jobs]
-    records = [record for _, record in found if record is not None]
-    stored = [flat(record).get("truth_store") for record in records]
+    records = [last_compared(job.folder, job.config_hash) for job in plan.jobs]
+    ended = [record for record in records if record is not None]
+    stored = [record.findings.truth_store for record in ended]
+    entries = [
+        _entry(job, record, returned.get(job.config_hash[:16]))
+        for job, record in zip(plan.jobs, records, strict=True)
+    ]
     first = plan.jobs[0].values
     run_again = {job.config_hash[:16] for job in plan.to_run}
     kept = {key: value for key, value in earlier.items() if key not in run_again}
@@ -78,21 +60,21 @@ def collect(
         "provenance": {
             **provenance(),
             "config_hash": config_hash({"jobs": [job.config_hash for job in plan.jobs]}),
-            "mesh_hash": next((r["provenance"]["mesh_hash"] for r in records), "none"),
+            "mesh_hash": next((r.provenance.mesh_hash for r in ended), "none"),
             "seed": first["seed"],
-            "commits": sorted({str(r["provenance"]["git"]["sha"]) for r in records}),
+            "commits": sorted({str(r.provenance.git.sha) for r in ended}),
             "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
         "settings": {key: value for key, value in first.items() if key not in UNSAID},
-        "jobs": [entry for entry, _ in found],
+        "jobs": entries,
         "cost": [
             {
                 "hash": entry["hash"],
                 "seconds": sum(run["seconds"] or 0.0 for run in entry["runs"]),
-                "seconds_total": None if record is None else record["seconds_total"],
+                "seconds_total": None if record is None else record.seconds_total,
                 "overhead": spent.get(entry["hash"]),
             }
-            for entry, record in found
+            for entry, record in zip(entries, records, strict=True)
         ],
     }
 
@@ -106,39 +88,39 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
     """
     computing = {}
     for job in plan.to_run:
-        record = last_record(job.folder, job.config_hash)
-        if record is not None and record["status"] == "converged":
-            whole = flat(record)
-            computing[job.config_hash[:16]] = float(
-                whole.get("seconds_computing") or whole.get("seconds") or whole["seconds_total"]
+        record = last_compared(job.folder, job.config_hash)
+        if record is not None and record.converged:
+            found = record.findings
+            computing[job.config_hash[:16]] = (
+                found.seconds_computing or found.repeats[0].seconds or record.seconds_total
             )
     processes: dict[str, list[Mapping[str, Any]]] = {}
     for end in returned.values():
         processes.setdefault(str(end["process"]), []).append(end)
-    found = {}
+    spent = {}
     for ends in processes.values():
         ordered = sorted(ends, key=lambda end: float(end["finished"]))
         for before, end in pairwise(ordered):
             if end["hash"] in computing:
-                spent = float(end["finished"]) - float(before["finished"])
-                found[str(end["hash"])] = spent - computing[str(end["hash"])]
-    return found
+                between = float(end["finished"]) - float(before["finished"])
+                spent[str(end["hash"])] = between - computing[str(end["hash"])]
+    return spent
 
 
 def _entry(
-    job: PlannedJob, end: Mapping[str, Any] | None
-) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """A job's part of the file, and its record if there is one."""
+    job: PlannedJob, record: Record[Compared] | None, end: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """A job's part of the file, with what each seed gave."""
     values, settings = job.values, job.values["filter"]
-    record = last_record(job.folder, job.config_hash)
-    entry = {
+    runs = record.findings.repeats if record and not record.findings.died else ()
+    return {
         "hash": job.config_hash[:16],
         "row": values["row"],
         "factors": values["factors"],
         "seed": values["seed"],
         "repeats": values["repeats"],
-        "status": "failed" if record is None else record["status"],
-        "reason": record["reason"] if record else (end["reason"] if end else NOT_RUN),
+        "status": "failed" if record is None else record.status,
+        "reason": record.reason if record else (end["reason"] if end else NOT_RUN),
         "model": asdict(model_of_values(values)),
         "initial": settings["initial"],
         "truth": values["truth"]["values"],
@@ -146,25 +128,5 @@ def _entry(
         "Q": settings["Q"],
         "R": settings["R"],
         "filter": settings["mode"],
-        "runs": _runs(record),
+        "runs": [asdict(run) for run in runs],
     }
-    return entry, record
-
-
-def _runs(record: Mapping[str, Any] | None) -> list[dict[str, Any]]:
-    """What each seed of a job found; nothing where the job as a whole was lost."""
-    if record is None or record["findings"] is None:
-        return []
-    record = flat(record)
-    if "repeats" in record:
-        return [{key: run.get(key) for key in RUN} for run in record["repeats"]]
-    innovation = record.get("innovation") or {}
-    bound = (record.get("identifiability") or {}).get("cramer_rao_std")
-    more = {
-        "seed": record["provenance"]["seed"],
-        "bound": bound,
-        "nis": innovation.get("nis"),
-        "nis_band": innovation.get("nis_band"),
-        "seconds": record.get("seconds", record["seconds_total"]),
-    }
-    return [{key: more[key] if key in more else record.get(key) for key in RUN}]

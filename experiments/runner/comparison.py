@@ -7,9 +7,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
+from experiments.common.estimates import Vector
+from experiments.common.record import Record
+from experiments.runner.compared import Compared
 from mvest.provenance import config_hash
 
 __all__ = ["inputs", "metrics", "parameters", "short_names"]
@@ -35,7 +39,7 @@ DIGEST_LENGTH = 36
 """Most characters of a digest that MLflow takes."""
 
 
-def parameters(config: Values, record: Values) -> dict[str, str]:
+def parameters(config: Values, names: Sequence[str]) -> dict[str, str]:
     """Settings of a run by short dotted names; numbers are texts that read as numbers.
 
     A list gets one name for each of its values: the parameter's where there is one value for each
@@ -46,10 +50,10 @@ def parameters(config: Values, record: Values) -> dict[str, str]:
     ----------
     config : mapping
         The resolved configuration.
-    record : mapping
-        The contents of ``result.json``.
+    names : sequence of str
+        Of the parameters.
     """
-    names = short_names(record["parameters"])
+    names = short_names(names)
     others = {"donor", "imaging"} - {config["study"]}
     left_out = {*NOT_COMPARED, *others}
     found: dict[str, Any] = {}
@@ -75,7 +79,7 @@ def short_names(names: Sequence[str]) -> list[str]:
     return [name.split(".", 1)[1] if together else name for name in names]
 
 
-def metrics(record: Values) -> list[tuple[str, float, int]]:
+def metrics(record: Record[Compared]) -> list[tuple[str, float, int]]:
     """Name, value and step of every number worth comparing between runs.
 
     A job that repeats over seeds is one run: its numbers are means over the seeds that converged
@@ -84,56 +88,59 @@ def metrics(record: Values) -> list[tuple[str, float, int]]:
     step. So there is one line for each setting in a comparison, whatever the number of seeds, and
     the seeds cost nothing but a few values in the same call.
     """
-    runs = record.get("repeats") or [record]
-    done = [run for run in runs if run.get("status") == "converged"]
+    runs = record.findings.repeats
+    done = [run for run in runs if run.converged]
     found: list[tuple[str, float | None, int]] = []
     errors: list[float] = []
-    for k, name in enumerate(short_names(record["parameters"])):
-        estimates = _column(done, "estimate", k)
-        error = [100.0 * abs(value) for value in _column(done, "relative_error", k)]
+    for k, name in enumerate(short_names(record.parameters)):
+        estimates = _column([run.estimate for run in done], k)
+        error = [100.0 * abs(value) for value in _column([run.relative_error for run in done], k)]
         errors += error
         found += [
             (f"error.{name}", _mean(error), 0),
             (f"estimate.{name}", _mean(estimates), 0),
-            (f"std.{name}", _mean(_column(done, "std", k)), 0),
+            (f"std.{name}", _mean(_column([run.std for run in done], k)), 0),
         ]
         if len(runs) > 1:
             found.append((f"spread.{name}", _deviation(estimates), 0))
             found += [
-                (f"repeat.{key}.{name}", run[source][k], int(run["seed"]))
+                (f"repeat.{what}.{name}", values[k], run.seed or 0)
                 for run in done
-                for key, source in (("estimate", "estimate"), ("relative_error", "relative_error"))
-                if run.get(source) is not None
+                for what, values in (
+                    ("estimate", run.estimate),
+                    ("relative_error", run.relative_error),
+                )
+                if values is not None
             ]
         found += [
             (f"iterate.{name}", iterate[k], step)
-            for step, iterate in enumerate(record.get("iterates") or [])
+            for step, iterate in enumerate(runs[0].iterates or ())
         ]
     # MLflow's own comparison begins with the metric that was logged first.
     found.insert(0, ("error.mean", _mean(errors), 0))
-    for key, name in (("distance_mm", "distance"), ("distance_to_truth_mm", "distance_truth")):
-        spreads = [run[key] for run in done if run.get(key) is not None]
-        found += [
-            (f"{name}.{part}", _mean([spread[part] for spread in spreads]), 0)
-            for part in ("mean", "max")
-            if all(part in spread for spread in spreads)
-        ]
-    found.append(("nis", _mean([run["nis"] for run in done if run.get("nis") is not None]), 0))
-    found.append(("failed", len(runs) - len(done), 0))
-    found.append(("iterations", _mean([run.get("iterations") or 0 for run in runs]), 0))
-    found.append(("forward_solves", math.fsum(run.get("forward_solves") or 0 for run in runs), 0))
-    # Studies that do more than one estimate have no time but their own.
-    seconds = math.fsum(run.get("seconds", record["seconds_total"]) or 0 for run in runs)
-    found.append(("seconds", seconds, 0))
+    for name, distances in (
+        ("distance", [run.distance_mm for run in done]),
+        ("distance_truth", [run.distance_to_truth_mm for run in done]),
+    ):
+        known = [distance for distance in distances if distance is not None]
+        found.append((f"{name}.mean", _mean([distance.mean for distance in known]), 0))
+        found.append((f"{name}.max", _mean([distance.max for distance in known]), 0))
+    found += [
+        ("nis", _mean([run.nis for run in done if run.nis is not None]), 0),
+        ("failed", len(runs) - len(done), 0),
+        ("iterations", _mean([run.iterations or 0 for run in runs]), 0),
+        ("forward_solves", math.fsum(run.forward_solves or 0 for run in runs), 0),
+        ("seconds", math.fsum(run.seconds or 0.0 for run in runs), 0),
+    ]
     found += [
         (name, value, 0)
-        for name, value in (record.get("measures") or {}).items()
+        for name, value in record.findings.measures.items()
         if not isinstance(value, str)  # what a measure means
     ]
     return [(name, float(value), step) for name, value, step in found if value is not None]
 
 
-def inputs(config: Values, record: Values) -> list[dict[str, str]]:
+def inputs(config: Values, record: Record[Compared]) -> list[dict[str, str]]:
     """What a run was computed from, as MLflow's data sets: the observation and the mesh.
 
     Returns
@@ -143,29 +150,29 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
         observation's digest is that of the recording where there is one, and otherwise of the
         settings that it is simulated from: valve, mechanics, truth, frames, noise and seed.
     """
-    mesh, model = record["mesh"] or {}, record.get("model")
+    mesh, model, recording = record.mesh, record.model, record.findings.data
     found = []
-    if "sha256" in mesh and model is not None:
-        cells = " x ".join(str(count) for count in model["cells"])
+    if mesh is not None and model is not None:
+        sizes = {k: v for k, v in asdict(mesh).items() if not k.endswith("sha256")}
         found.append(
             {
                 "context": "mesh",
-                "name": f"mesh {model['element']} {cells}",
-                "digest": str(mesh["sha256"])[:DIGEST_LENGTH],
+                "name": f"mesh {model.element} {' x '.join(map(str, model.cells))}",
+                "digest": mesh.sha256[:DIGEST_LENGTH],
                 "source_type": "mesh",
-                "source": json.dumps({**config["mesh"], "element": model["element"]}),
-                "profile": json.dumps({k: v for k, v in mesh.items() if not k.endswith("sha256")}),
+                "source": json.dumps({**config["mesh"], "element": model.element}),
+                "profile": json.dumps(sizes),
             }
         )
     frames = config["observation"]["frames"]
-    if record.get("data"):
+    if recording is not None:
         found.append(
             {
                 "context": "observation",
                 "name": "recording",
-                "digest": str(record["data"]["sha256"])[:DIGEST_LENGTH],
+                "digest": recording.sha256[:DIGEST_LENGTH],
                 "source_type": "file",
-                "source": json.dumps({"citation": record["data"].get("citation")}),
+                "source": json.dumps({"citation": recording.citation}),
                 "profile": json.dumps({"frames": frames}),
             }
         )
@@ -173,7 +180,7 @@ def inputs(config: Values, record: Values) -> list[dict[str, str]]:
         repeats = int(config.get("repeats") or 1)
         source = {
             key: config[key] for key in ("valve", "mechanics", "truth", "observation", "seed")
-        } | {"repeats": repeats, "mesh": mesh.get("truth_sha256", mesh.get("sha256"))}
+        } | {"repeats": repeats, "mesh": mesh and (mesh.truth_sha256 or mesh.sha256)}
         noise = config["observation"]["noise_mm"]
         found.append(
             {
@@ -218,8 +225,8 @@ def _text(value: Any) -> str:
     return repr(value) if isinstance(value, float) else str(value)
 
 
-def _column(runs: Iterable[Values], key: str, k: int) -> list[float]:
-    return [run[key][k] for run in runs if run.get(key) is not None and run[key][k] is not None]
+def _column(rows: Sequence[Vector | None], k: int) -> list[float]:
+    return [row[k] for row in rows if row is not None]
 
 
 def _mean(values: Sequence[float]) -> float | None:

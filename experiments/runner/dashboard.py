@@ -24,9 +24,10 @@ from pathlib import Path
 from types import FrameType
 from urllib.parse import quote
 
+from experiments.common.record import read_data
 from experiments.runner.plan import PLAN
 from experiments.runner.sync import jobs_in
-from experiments.runner.tracking import open_store, read_json
+from experiments.runner.tracking import open_store
 from mvest.errors import InputError, MvestError
 
 __all__ = ["Comparison", "last_comparison", "main", "serving"]
@@ -104,13 +105,13 @@ def last_comparison(outputs: Path) -> Comparison:
     TrackingError
         If the store cannot be read.
     """
-    plans = [(read_json(path), path.parent) for path in outputs.glob(f"*/{PLAN}")]
+    plans = [(read_data(path), path.parent) for path in outputs.glob(f"*/{PLAN}")]
     for plan, folder in sorted(plans, key=lambda one: str(one[0]["created"]), reverse=True):
         names = {Path(job["folder"]).name for job in plan["jobs"]}
         jobs = [job for job in jobs_in(folder) if job.name in names]
         if not jobs:
             continue
-        config = read_json(jobs[0] / "config.json")
+        config = read_data(jobs[0] / "config.json")
         store = open_store(config["tracking"]["uri"], outputs, str(config["name"]))
         runs = [
             run.info.run_id

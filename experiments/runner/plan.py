@@ -25,11 +25,11 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.config import hash_of, plain
-from experiments.common.plain import flat
-from experiments.common.record import model_of_values
-from experiments.runner.folder import RESULT, last_record
+from experiments.common.record import Record, model_of_values, read_data
+from experiments.runner.compared import Compared, compared, last_compared
+from experiments.runner.folder import RESULT
 from experiments.runner.request import Request
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import git_state, write_json
 
 __all__ = ["PLAN", "Plan", "PlannedJob", "expand", "grids", "make_plan", "plan_run"]
@@ -52,7 +52,7 @@ class PlannedJob:
     overrides : tuple of str
     values : dict
         The resolved configuration.
-    record : dict or None
+    record : Record or None
         What an earlier attempt recorded.
     done : bool
     """
@@ -61,7 +61,7 @@ class PlannedJob:
     folder: Path
     overrides: tuple[str, ...]
     values: dict[str, Any]
-    record: dict[str, Any] | None
+    record: Record[Compared] | None
     done: bool
 
     @property
@@ -163,7 +163,7 @@ class Plan:
         return "\n".join(
             f"  {'run ' if job.config_hash in run_again else 'done'}  {job.config_hash[:16]}  "
             f"{job.label}"
-            + (f"  [failed before: {job.record['reason']}]" if job.record and not job.done else "")
+            + (f"  [failed before: {job.record.reason}]" if job.record and not job.done else "")
             for job in self.jobs
         )
 
@@ -187,9 +187,7 @@ class Plan:
     def _stale(self) -> str:
         """A remark on results that other code than the present one computed."""
         present = git_state(Path(__file__).resolve().parent)["sha"]
-        commits = [
-            job.record["provenance"]["git"]["sha"] for job in self.jobs if job.done and job.record
-        ]
+        commits = [job.record.provenance.git.sha for job in self.jobs if job.done and job.record]
         other = sum(sha != present for sha in commits)
         return f" ({other} of the done ones by another commit; force=true redoes)" if other else ""
 
@@ -297,8 +295,8 @@ def _choices(override: Override) -> list[str]:
 def _planned(
     values: dict[str, Any], config_hash: str, folder: Path, overrides: Sequence[str]
 ) -> PlannedJob:
-    record = last_record(folder, config_hash)
-    done = record is not None and record["status"] == "converged"
+    record = last_compared(folder, config_hash)
+    done = record is not None and record.converged
     return PlannedJob(config_hash, folder, tuple(overrides), values, record, done)
 
 
@@ -328,15 +326,13 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
     )
     for place in places[:MAX_READ]:
         try:
-            record = flat(json.loads(place.read_text(encoding="utf-8")))
-            kind, seconds = json.dumps(record["model"]), float(record["seconds_total"])
-            seeds = len(record.get("repeats") or [None])
-            converged = record["status"] == "converged"
-        except (OSError, ValueError, KeyError, TypeError):
-            # Not a result of this kind of study, or of this version: it tells no time.
+            record = compared(read_data(place), str(place))
+        except InputError:
+            # Not a result of this version: it tells no time.
             continue
-        if converged:
-            found.setdefault(kind, []).append(seconds / seeds)
+        if record.converged and record.model is not None:
+            seconds = record.seconds_total / len(record.findings.repeats)
+            found.setdefault(json.dumps(asdict(record.model)), []).append(seconds)
     return found
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from experiments.common.record import read_data
 from experiments.runner.plan import PLAN, Plan
 from experiments.runner.tracking import (
     REMEDY,
@@ -22,7 +23,6 @@ from experiments.runner.tracking import (
     is_complete,
     is_tracked,
     open_store,
-    read_json,
     upload,
 )
 from mvest.errors import InputError, MvestError
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         groups: dict[tuple[str | None, str], list[Path]] = {}
         for job in jobs_in(folder):
             try:
-                config = read_json(job / "config.json")
+                config = read_data(job / "config.json")
                 if config["tracking"]["enabled"] and is_complete(job):
                     key = config["tracking"]["uri"], str(config["name"])
                     groups.setdefault(key, []).append(job)
@@ -126,7 +126,7 @@ def _sweep_in(folder: Path) -> tuple[str | None, dict[str, str]]:
     """The sweep that a folder was last used for: its id, and folder -> name of its jobs."""
     if not (folder / PLAN).is_file():
         return None, {}
-    plan = read_json(folder / PLAN)
+    plan = read_data(folder / PLAN)
     names = {Path(job["folder"]).name: str(job.get("name", "")) for job in plan["jobs"]}
     return plan.get("sweep_id"), names
 

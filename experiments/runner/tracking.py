@@ -10,7 +10,6 @@ has been logged; every other one is still to be.
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import os
 import re
@@ -23,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from experiments.common.plain import flat
-from experiments.common.record import SCHEMA
+from experiments.common.record import SCHEMA, Record, read_data
+from experiments.runner.compared import Compared, compared
 from experiments.runner.comparison import inputs, metrics, parameters
 from experiments.runner.folder import is_done
 from mvest.errors import ConfigurationError, InputError, MvestError
@@ -44,7 +43,6 @@ __all__ = [
     "is_complete",
     "is_tracked",
     "open_store",
-    "read_json",
     "require_no_password",
     "track_job",
     "upload",
@@ -200,7 +198,7 @@ def track_job(folder: Path, config: Mapping[str, Any]) -> None:
 
 def is_complete(job: Path) -> bool:
     """Whether a job has ended: it has failed, or its marker says that everything is on disk."""
-    return is_done(job) or read_json(job / "result.json").get("status") != "converged"
+    return is_done(job) or read_data(job / "result.json").get("status") != "converged"
 
 
 def is_tracked(folder: Path) -> bool:
@@ -208,7 +206,7 @@ def is_tracked(folder: Path) -> bool:
     receipt = folder / RECEIPT
     if not receipt.is_file():
         return False
-    return bool(read_json(receipt).get("result_hash") == _digest(folder / "result.json"))
+    return bool(read_data(receipt).get("result_hash") == _digest(folder / "result.json"))
 
 
 def upload(
@@ -236,13 +234,14 @@ def upload(
     InputError
         If a file of the job cannot be read.
     """
-    record, config = read_json(folder / "result.json"), read_json(folder / "config.json")
-    if record.get("schema") != SCHEMA:
-        raise InputError(f"{folder / 'result.json'} was written by another version")
-    record = flat(record)
-    result_hash = _digest(folder / "result.json")
-    receipt = read_json(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
-    config_hash = str(record["provenance"]["config_hash"])
+    place = folder / "result.json"
+    data, config = read_data(place), read_data(folder / "config.json")
+    if data.get("schema") != SCHEMA:
+        raise InputError(f"{place} was written by another version")
+    record = compared(data, str(place))
+    result_hash = _digest(place)
+    receipt = read_data(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
+    config_hash = record.provenance.config_hash
     present = None
     for run in store.runs(config_hash):
         tags = run.data.tags
@@ -257,7 +256,7 @@ def upload(
     sweep_id = sweep_id or str(receipt.get("sweep_id", NO_SWEEP))
     if present is None:
         store.changed.add(config_hash)
-        name = name or str(record["row"])
+        name = name or record.row
         run_id = _log(store, folder, record, config, name, sweep_id, result_hash)
     else:
         run_id = present.info.run_id
@@ -270,23 +269,6 @@ def upload(
     if written != receipt:
         write_json(folder / RECEIPT, written)
     return present is None
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or holds something else.
-    """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {first_line(error)}") from error
-    if not isinstance(value, dict):
-        raise InputError(f"{path} holds a {type(value).__name__}, expected a mapping")
-    return value
 
 
 def first_line(error: BaseException) -> str:
@@ -309,7 +291,7 @@ def telling(place: str) -> Iterator[None]:
 def _log(
     store: Store,
     folder: Path,
-    record: Mapping[str, Any],
+    record: Record[Compared],
     config: Mapping[str, Any],
     name: str,
     sweep_id: str,
@@ -318,26 +300,27 @@ def _log(
     """Log one run, closed as the last step; returns its id."""
     from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
 
-    provenance = record["provenance"]
+    provenance = record.provenance
     end = int(1000 * (folder / "result.json").stat().st_mtime)
-    begin = end - int(1000 * (record.get("seconds_total") or 0.0))
-    git = provenance.get("git") or {}
+    begin = end - int(1000 * record.seconds_total)
     tags = {
         "sweep_id": sweep_id,
-        "config_hash": provenance["config_hash"],
+        "config_hash": provenance.config_hash,
         "result_hash": result_hash,
-        "git_sha": git.get("sha"),
-        "mesh_hash": provenance.get("mesh_hash"),
-        "seed": provenance.get("seed"),
-        "status": record["status"],
-        "reason": record["reason"],
+        "git_sha": provenance.git.sha,
+        "mesh_hash": provenance.mesh_hash,
+        "seed": provenance.seed,
+        "status": record.status,
+        "reason": record.reason,
         "folder": folder.name,
         "mlflow.source.name": "experiments.run",
         "mlflow.source.type": "LOCAL",
-        "mlflow.source.git.commit": git.get("sha"),
+        "mlflow.source.git.commit": provenance.git.sha,
     }
     numbers = [Metric(k, v, end, step) for k, v, step in metrics(record)]
-    settings = [Param(k, v[:LONGEST_TEXT]) for k, v in parameters(config, record).items()]
+    settings = [
+        Param(k, v[:LONGEST_TEXT]) for k, v in parameters(config, record.parameters).items()
+    ]
     data = [
         DatasetInput(
             Dataset(**{key: value for key, value in one.items() if key != "context"}),
@@ -366,8 +349,8 @@ def _log(
         for path in sorted(path for name in FILES for path in folder.glob(name)):
             if path.name != RECEIPT and not path.name.startswith("."):
                 store.client.log_artifact(run_id, str(path))
-        finished = record["status"] == "converged"
-        store.client.set_terminated(run_id, "FINISHED" if finished else "FAILED", end_time=end)
+        ended = "FINISHED" if record.converged else "FAILED"
+        store.client.set_terminated(run_id, ended, end_time=end)
     return run_id
 
 

@@ -6,7 +6,7 @@ also distinguished by its marker. Nothing touches matplotlib's global state or n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,29 +34,43 @@ VIEWS = (("from the atrium", 90.0, -90.0), ("from the side", 12.0, -60.0))
 """Title, elevation and azimuth in degrees; the atrium is at positive z."""
 
 
-def iterates_figure(record: Mapping[str, Any]) -> Figure:
+def iterates_figure(
+    title: str,
+    parameters: Sequence[str],
+    iterates: Sequence[Sequence[float]] | None,
+    std: Sequence[Sequence[float]] | None,
+    truth: Sequence[float] | None = None,
+) -> Figure:
     """Each parameter against the iteration, with its band of two standard deviations and the truth.
 
     Parameters
     ----------
-    record : mapping
-        A record with at least one iterate.
+    title : str
+    parameters : sequence of str, (p,)
+    iterates, std : (i, p)
+        At least one.
+    truth : (p,), optional
+
+    Raises
+    ------
+    InputError
+        If there is no iterate.
     """
-    if not record["iterates"]:
-        raise InputError(f"{record['experiment']}: a run without iterates has nothing to draw")
-    iterates, std = np.array(record["iterates"]), np.array(record["iterate_std"])
+    if not iterates:
+        raise InputError(f"{title}: a run without iterates has nothing to draw")
+    m, s = np.array(iterates), np.array(std)
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.subplots()
-    rounds = np.arange(len(iterates))
-    for k, name in enumerate(record["parameters"]):
+    rounds = np.arange(len(m))
+    for k, name in enumerate(parameters):
         colour = COLOURS[k % len(COLOURS)]
-        m, s = iterates[:, k], std[:, k]
-        axes.fill_between(rounds, m - 2 * s, m + 2 * s, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(rounds, m, color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
-        if record["truth"] is not None:
-            axes.axhline(record["truth"][k], color=colour, linestyle="--", linewidth=1)
+        low, high = (m[:, k] + side * 2 * s[:, k] for side in (-1, 1))
+        axes.fill_between(rounds, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.plot(rounds, m[:, k], color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
+        if truth is not None:
+            axes.axhline(truth[k], color=colour, linestyle="--", linewidth=1)
     axes.set_xlabel("iteration")
-    units = {"MPa" for name in record["parameters"] if name.startswith("E_f.")}
+    units = {"MPa" for name in parameters if name.startswith("E_f.")}
     axes.set_ylabel(f"modulus [{units.pop()}]" if units else "parameter")
     axes.set_xticks(rounds if len(rounds) <= 12 else rounds[:: len(rounds) // 8])
     axes.grid(alpha=0.3)
@@ -64,7 +78,7 @@ def iterates_figure(record: Mapping[str, Any]) -> Figure:
     axes.plot([], [], color="grey", linestyle="--", linewidth=1, label="truth")
     axes.fill_between([], [], color="grey", alpha=0.2, linewidth=0, label="± 2 SD")
     axes.legend(frameon=False, fontsize=8)
-    axes.set_title(f"{record['title']}: {record['row']}", fontsize=10)
+    axes.set_title(title, fontsize=10)
     return figure
 
 

@@ -3,6 +3,9 @@
 import copy
 from typing import Any
 
+from experiments.common.record import Record, record_from
+from experiments.studies.twin.findings import Findings
+
 RECORD: dict[str, Any] = {
     "schema": 1,
     "experiment": "table1",
@@ -30,8 +33,22 @@ RECORD: dict[str, Any] = {
     "distance_mm": {"mean": 0.0004, "std": 0.0003, "max": 0.002},
     "distance_to_truth_mm": {"mean": 0.0004, "std": 0.0003, "max": 0.002},
     "closure": {
-        "open": {"orifice_area": 310.0, "passing_ball_diameter": 16.0, "coaptation_length": 0.0},
-        "closed": {"orifice_area": 1.2, "passing_ball_diameter": 0.5, "coaptation_length": 6.0},
+        "open": {
+            "orifice_area": 310.0,
+            "passing_ball_diameter": 16.0,
+            "coaptation_length": 0.0,
+            "coaptation_area": 0.0,
+            "contact_distance": 2.4,
+            "intersections": 0,
+        },
+        "closed": {
+            "orifice_area": 1.2,
+            "passing_ball_diameter": 0.5,
+            "coaptation_length": 6.0,
+            "coaptation_area": 229.0,
+            "contact_distance": 2.4,
+            "intersections": 0,
+        },
     },
     "iterations": 3,
     "forward_solves": 4,
@@ -41,6 +58,10 @@ RECORD: dict[str, Any] = {
     "iterate_std": [[0.1, 0.1], [0.03, 0.02], [0.02, 0.011], [0.02, 0.011]],
     "innovation": None,
     "identifiability": None,
+    "repeats": [],
+    "confirmed_mm": None,
+    "seconds_computing": 62.0,
+    "truth_store": "miss",
     "mesh": {"sha256": "ab" * 32, "nodes": 1296, "elements": 144, "truth_sha256": "ab" * 32},
     "model": {
         "element": "hex18",
@@ -102,3 +123,8 @@ def stored(record: dict[str, Any], study: str = "twin") -> dict[str, Any]:
         "provenance": source,
         "findings": {key: value for key, value in record.items() if key not in stamped},
     }
+
+
+def twin(data: dict[str, Any]) -> Record[Findings]:
+    """The record of a synthetic study."""
+    return record_from(stored(data), Findings, "made up")

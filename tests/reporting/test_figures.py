@@ -23,8 +23,16 @@ def fields(tmp_path):
     return path
 
 
+def drawn(of):
+    """The iterates of a record."""
+    return iterates_figure(
+        f"{of['title']}: {of['row']}", of["parameters"], of["iterates"], of["iterate_std"],
+        of["truth"],
+    )  # fmt: skip
+
+
 def test_iterates_band_and_truth_are_drawn() -> None:
-    axes = iterates_figure(record()).axes[0]
+    axes = drawn(record()).axes[0]
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     assert list(lines["E_f.anterior"]) == [5.0, 6.1, 6.22, 6.2296]
     band = axes.collections[0].get_paths()[0].vertices
@@ -42,7 +50,7 @@ def test_iterates_band_and_truth_are_drawn() -> None:
 
 def test_a_run_without_iterates_is_refused() -> None:
     with pytest.raises(InputError, match="nothing to draw"):
-        iterates_figure(failed_record())
+        drawn(failed_record())
 
 
 def test_valve_is_drawn_open_and_closed_from_two_sides(fields) -> None:
@@ -82,7 +90,7 @@ def test_missing_or_damaged_fields_are_named(tmp_path) -> None:
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
     names = []
     for base in ("a", "b"):
-        names.append(save_figure(tmp_path / base, iterates_figure(record()), record()))
+        names.append(save_figure(tmp_path / base, drawn(record()), record()))
     for first, second in zip(*names, strict=True):
         assert first.read_bytes() == second.read_bytes()
     assert [path.suffix for path in names[0]] == [".png", ".pdf"]
@@ -93,4 +101,4 @@ def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
 def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
-        save_figure(tmp_path / "file" / "a", iterates_figure(record()), record())
+        save_figure(tmp_path / "file" / "a", drawn(record()), record())

@@ -4,95 +4,92 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from mvest.files import write_atomically
-from mvest.reporting.figures import iterates_figure, save_figure
-from mvest.reporting.files import provenance_line
+from experiments.common.record import Record
+from experiments.common.report import write_report
+from experiments.studies.external.findings import Findings
+from mvest.reporting.figures import iterates_figure, save_figure_with
 from mvest.reporting.markup import MISSING, markdown_rows, with_std
 
-__all__ = ["external_text", "write_external_tables"]
-
-Record = Mapping[str, Any]
+__all__ = ["external_table", "external_text", "write_external"]
 
 
-def _rows(record: Record) -> list[dict[str, str]]:
-    absent = [None] * len(record["parameters"])
+def external_table(record: Record[Findings]) -> pd.DataFrame:
+    """One row per parameter."""
+    found = record.findings
+    absent = [None] * len(found.initial)
+    return pd.DataFrame(
+        {
+            "parameter": record.parameters,
+            "unit": found.units,
+            "prior_mean": found.initial,
+            "prior_std": found.prior_std,
+            "estimate": found.estimate or absent,
+            "std": found.std or absent,
+        }
+    )
+
+
+def _rows(record: Record[Findings]) -> list[dict[str, str]]:
     return [
         {
-            "parameter": name,
-            "unit": unit or MISSING,
-            "prior": with_std(mean, spread),
-            "estimate": with_std(estimate, std),
+            "parameter": row["parameter"],
+            "unit": row["unit"] or MISSING,
+            "prior": with_std(row["prior_mean"], row["prior_std"]),
+            "estimate": with_std(row["estimate"], row["std"]),
         }
-        for name, unit, mean, spread, estimate, std in zip(
-            record["parameters"],
-            record["units"],
-            record["initial"],
-            record["prior_std"],
-            record["estimate"] or absent,
-            record["std"] or absent,
-            strict=True,
-        )
+        for row in external_table(record).to_dict("records")
     ]
 
 
-def _words(record: Record) -> str:
+def _words(record: Record[Findings]) -> str:
     """What is to be said below the table."""
-    program = record["program"]
-    own = program["own_jacobian"]
+    found, program = record.findings, record.findings.program
+    derivatives = "of the program" if program.own_jacobian else "differences of its predictions"
     lines = [
-        record["reason"] + (f" ({record['detail']})" if record["detail"] else "") + ".",
-        f"{record['iterations']} iterations, {record['forward_solves']} predictions; the program "
-        f"ran {program['runs']} times in {program['seconds']:.3g} s, {program['reused']} finished "
+        record.reason + (f" ({record.detail})" if record.detail else "") + ".",
+        f"{found.iterations} iterations, {record.forward_solves} predictions; the program "
+        f"ran {program.runs} times in {program.seconds:.3g} s, {program.reused} finished "
         "runs served again.",
-        f"Derivatives: {'of the program' if own else 'differences of its predictions'}.",
+        f"Derivatives: {derivatives}.",
     ]
-    if record["distance_mm"] is not None:
-        distance = record["distance_mm"]
+    if found.distance_mm is not None:
         lines.append(
-            f"Distance of the {program['points']} points from where they were observed: mean "
-            f"{distance['mean']:.3g} mm, largest {distance['max']:.3g} mm."
+            f"Distance of the {program.points} points from where they were observed: mean "
+            f"{found.distance_mm.mean:.3g} mm, largest {found.distance_mm.max:.3g} mm."
         )
-    if record["innovation"] is not None:
-        low, high = record["innovation"]["nis_band"]
+    if found.innovation is not None:
+        low, high = found.innovation.nis_band
         lines.append(
             f"Innovation in units of what model, prior and noise explain: "
-            f"{record['innovation']['nis']:.4g}, expected between {low:.4g} and {high:.4g}."
+            f"{found.innovation.nis:.4g}, expected between {low:.4g} and {high:.4g}."
         )
     return "\n\n".join(lines)
 
 
-def external_text(record: Record) -> str:
+def external_text(record: Record[Findings]) -> str:
     """Table and words for the terminal."""
     table = pd.DataFrame(_rows(record)).to_string(index=False)
     return f"{table}\n{_words(record).replace(chr(10) * 2, chr(10))}"
 
 
-def write_external_tables(folder: Path, record: Record) -> list[Path]:
-    """``external.csv``, ``external.md`` and the figure of the iterates in ``folder``."""
-    rows = _rows(record)
-    absent = [None] * len(rows)
-    table = pd.DataFrame(
-        {
-            "parameter": record["parameters"],
-            "unit": record["units"],
-            "prior_mean": record["initial"],
-            "prior_std": record["prior_std"],
-            "estimate": record["estimate"] or absent,
-            "std": record["std"] or absent,
-        }
-    )
-    text = (
-        f"# {record['title']}\n\n{markdown_rows(rows)}\n\n{_words(record)}\n\n"
-        f"{provenance_line(record)}\n"
-    )
-    written = [
-        write_atomically(folder / "external.csv", lambda path: table.to_csv(path, index=False)),
-        write_atomically(folder / "external.md", text),
-    ]
-    if record["iterates"]:
-        written += save_figure(folder / "iterates", iterates_figure(record), record)
+def write_external(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table, words and the figure of the iterates of each record."""
+    written = []
+    for record in records.values():
+        found = record.findings
+        words = f"{markdown_rows(_rows(record))}\n\n{_words(record)}"
+        written += write_report(folder, record, external_table(record), words)
+        if found.iterates:
+            figure = iterates_figure(
+                f"{record.title}: {record.row}",
+                record.parameters,
+                found.iterates,
+                found.iterate_std,
+            )
+            written += save_figure_with(folder / "iterates", figure, record.line)
     return written

@@ -15,11 +15,11 @@ class ExternalSettings:
     command: tuple[str, ...] = ()  # the program and its arguments, no shell
     folder: str | None = None  # where its runs are kept; null: in the folder of the job
     observation: str | None = None  # .csv x,y,z (mm), one row per observed point
-    points: str | None = None  # .csv x,y,z (mm), reference positions that the program is told
-    units: tuple[str, ...] = ()  # of the parameters; empty: not told
+    points: str | None = None  # .csv x,y,z (mm), reference positions that the program is given
+    units: tuple[str, ...] = ()  # of the parameters; empty: not stated
     prior_std: tuple[float, ...] = ()  # of the parameters, in their units
     noise_mm: float | None = None  # SD of the error of each observed coordinate
-    settings: dict[str, Any] = field(default_factory=dict)  # handed to the program as they are
+    settings: dict[str, Any] = field(default_factory=dict)  # given to the program as they are
     environment: dict[str, str] = field(default_factory=dict)  # beside what this process has
     inputs: tuple[str, ...] = ()  # files after whose change runs are done anew
     time_limit_s: float = 600.0  # of one run

@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
-from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.estimate_record import innovation_of, spread, vector, vectors
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.study import Study
-from experiments.studies.external.report import external_text, write_external_tables
-from experiments.studies.external.settings import Settings
+from experiments.common.record import Outcome
+from experiments.common.schema import build
+from experiments.common.study import Job, Study
+from experiments.studies.external.findings import Findings, Program
+from experiments.studies.external.report import external_text, write_external
+from experiments.studies.external.settings import ExternalSettings, Settings
 from mvest.errors import ConfigurationError, InputError
-from mvest.estimation.estimate import Estimate, Filter
+from mvest.estimation.estimate import Filter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform
@@ -24,19 +27,17 @@ from mvest.external.contract import read_points, write_points
 from mvest.external.differences import Differences
 from mvest.external.model import ProcessModel
 from mvest.external.process import Command
-from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "check_external", "model_of", "run_external"]
 
 Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
 
 FITTED = "fitted.csv"
 """Where the program puts the observed points at the estimate."""
 
 
-def observed(about: Values) -> FloatArray:
+def observed(about: ExternalSettings) -> FloatArray:
     """The observed positions ``(n, 3)`` mm that the configuration names.
 
     Raises
@@ -44,53 +45,54 @@ def observed(about: Values) -> FloatArray:
     ConfigurationError
         If it names none, or the file is not in order.
     """
-    if about["observation"] is None:
+    if about.observation is None:
         raise ConfigurationError(
             "external.observation is not given; expected a .csv file with the columns x,y,z (mm)"
         )
-    return _points(about["observation"], "external.observation")
+    return _points(about.observation, "external.observation")
 
 
-def model_of(config: Values, count: int, folder: Path) -> ProcessModel:
-    """The configured program as an observation model.
+def model_of(
+    about: ExternalSettings, names: tuple[str, ...], count: int, folder: Path
+) -> ProcessModel:
+    """The configured program as an observation model of ``count`` points.
 
     Raises
     ------
     MvestError
         If the program, a file or a setting is inadmissible.
     """
-    about = config["external"]
-    if not about["command"]:
+    if not about.command:
         raise ConfigurationError(
             "external.command is not given; expected the program and its arguments, such as "
             '[python,"{here}/solve.py","{request}","{folder}"]'
         )
-    names = config["parameters"]
-    if about["units"] and len(about["units"]) != len(names):
+    if about.units and len(about.units) != len(names):
         raise ConfigurationError(
-            f"external.units = {about['units']}, expected one for each of {', '.join(names)}"
+            f"external.units = {list(about.units)}, expected one for each of {', '.join(names)}"
         )
     differences = None
-    if about["differences"] != "none":
+    if about.differences != "none":
         differences = Differences(
-            about["differences"], about["relative_step"], about["floor"], about["processes"]
+            about.differences, about.relative_step, about.floor, about.processes
         )
-    kept = about["folder"]
     return ProcessModel(
-        Command(tuple(about["command"]), about["environment"], about["time_limit_s"]),
-        folder / "runs" if kept is None else Path(kept),
+        Command(about.command, about.environment, about.time_limit_s),
+        folder / "runs" if about.folder is None else Path(about.folder),
         names,
         count,
-        units=about["units"] or None,
-        points=None if about["points"] is None else _points(about["points"], "external.points"),
-        settings=about["settings"],
+        units=about.units or None,
+        points=None if about.points is None else _points(about.points, "external.points"),
+        settings=about.settings,
         differences=differences,
-        reuse=about["reuse"],
-        inputs=tuple(map(Path, about["inputs"])),
+        reuse=about.reuse,
+        inputs=tuple(map(Path, about.inputs)),
     )
 
 
-def estimator_of(config: Values) -> tuple[Filter, Transform, Gaussian, float]:
+def estimator_of(
+    about: ExternalSettings, values: Values
+) -> tuple[Filter, Transform, Gaussian, float]:
     """Filter, coordinates, prior and variance of each observed coordinate (mm²).
 
     Raises
@@ -98,24 +100,24 @@ def estimator_of(config: Values) -> tuple[Filter, Transform, Gaussian, float]:
     MvestError
         If a setting is missing or inadmissible.
     """
-    about, names = config["external"], tuple(config["parameters"])
+    names = tuple(values["parameters"])
     for key, instead in (("P0", "external.prior_std"), ("R", "external.noise_mm")):
-        if config["filter"][key] is not None:
+        if values["filter"][key] is not None:
             raise ConfigurationError(f"filter.{key} is given; expected {instead} in its place")
-    std = np.array(about["prior_std"], dtype=float)
+    std = np.array(about.prior_std, dtype=float)
     if std.shape != (len(names),) or not np.all(np.isfinite(std) & (std > 0)):
         raise ConfigurationError(
-            f"external.prior_std = {about['prior_std']}, expected one standard deviation > 0 for "
-            f"each of {', '.join(names)}"
+            f"external.prior_std = {list(about.prior_std)}, expected one standard deviation > 0 "
+            f"for each of {', '.join(names)}"
         )
-    noise = about["noise_mm"]
+    noise = about.noise_mm
     if noise is None or not (np.isfinite(noise) and noise > 0):
         raise ConfigurationError(f"external.noise_mm = {noise}, expected a number > 0 (mm)")
-    settings = {**config["filter"], "P0": (std**2).tolist()}
+    settings = {**values["filter"], "P0": (std**2).tolist()}
     return *build_filter(settings, names, positive=True), float(noise) ** 2
 
 
-def check_external(config: Values, folder: Path) -> str:
+def check_external(values: Values, folder: Path) -> str:
     """Run the program once at the initial values, and compare its derivatives with differences.
 
     Raises
@@ -123,9 +125,10 @@ def check_external(config: Values, folder: Path) -> str:
     MvestError
         If a setting or a file is inadmissible, or the program gives no prediction.
     """
-    y = observed(config["external"])
-    _, _, prior, _ = estimator_of(config)
-    model = model_of(config, len(y), folder)
+    about = build(ExternalSettings, values["external"])
+    y = observed(about)
+    _, _, prior, _ = estimator_of(about, values)
+    model = model_of(about, tuple(values["parameters"]), len(y), folder)
     prediction = model(prior.mean)
     if not prediction.converged:
         raise InputError(f"at the initial values: {prediction.reason}")
@@ -150,11 +153,11 @@ def _compared(model: ProcessModel, m: FloatArray, prediction: Prediction) -> str
         return f"derivatives: the program's own; not compared with differences: {by}"
     size = np.linalg.norm(by, axis=0)
     apart = np.linalg.norm(prediction.jacobian - by, axis=0) / np.where(size > 0, size, 1.0)
-    told = ", ".join(f"{n} {100 * a:.2g} %" for n, a in zip(model.names, apart, strict=True))
-    return f"derivatives: the program's own; apart from differences by {told}"
+    shares = ", ".join(f"{n} {100 * a:.2g} %" for n, a in zip(model.names, apart, strict=True))
+    return f"derivatives: the program's own; apart from differences by {shares}"
 
 
-def run_external(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
+def run_external(job: Job[Settings]) -> Outcome[Findings]:
     """Estimate the parameters of the configured program from the observed positions.
 
     Raises
@@ -162,14 +165,15 @@ def run_external(config: Values, config_hash: str, folder: Path, started: float)
     MvestError
         If a setting or a file is inadmissible.
     """
-    (folder / FITTED).unlink(missing_ok=True)
-    y = observed(config["external"])
-    filter_, transform, prior, variance = estimator_of(config)
-    model = model_of(config, len(y), folder)
+    about, values = job.settings.external, job.values
+    (job.folder / FITTED).unlink(missing_ok=True)
+    y = observed(about)
+    filter_, transform, prior, variance = estimator_of(about, values)
+    model = model_of(about, tuple(values["parameters"]), len(y), job.folder)
 
     began = time.perf_counter()
-    with SolveBar(config["name"], 0, TYPICAL_SOLVES, model.names) as bar:
-        found = filter_(
+    with SolveBar(values["name"], 0, TYPICAL_SOLVES, model.names) as bar:
+        estimate = filter_(
             model,
             prior,
             y.ravel(),
@@ -178,19 +182,40 @@ def run_external(config: Values, config_hash: str, folder: Path, started: float)
             transform=transform,
             on_iterate=bar.iterate,
         )
-    record = _record(config, config_hash, found, model, started)
-    record["seconds"] = time.perf_counter() - began
-    if found.prediction is None:
-        return record, []
-    fitted = found.prediction.y.reshape(-1, 3)
-    write_points(folder / FITTED, fitted)
-    distance = np.linalg.norm(fitted - y, axis=1)
-    record["distance_mm"] = {
-        "mean": float(distance.mean()),
-        "std": float(distance.std()),
-        "max": float(distance.max()),
-    }
-    return record, [folder / FITTED]
+    distance = None
+    if estimate.prediction is not None:
+        fitted = estimate.prediction.y.reshape(-1, 3)
+        write_points(job.folder / FITTED, fitted)
+        distance = np.linalg.norm(fitted - y, axis=1)
+    known = estimate.converged
+    findings = Findings(
+        units=model.units,
+        initial=tuple(estimate.prior.mean.tolist()),
+        prior_std=tuple(estimate.prior.std.tolist()),
+        estimate=vector(estimate.mean) if known else None,
+        std=vector(estimate.std) if known else None,
+        iterates=vectors(estimate.iterates),
+        iterate_std=vectors(estimate.iterate_std),
+        distance_mm=spread(distance),
+        innovation=innovation_of(estimate),
+        iterations=estimate.iterations,
+        seconds=time.perf_counter() - began,
+        program=Program(
+            model.command.arguments,
+            model.count,
+            model.runs,
+            model.reused,
+            model.seconds,
+            model.own_jacobian,
+        ),
+    )
+    return Outcome(
+        findings=findings,
+        status="converged" if known else "failed",
+        reason=estimate.reason.value,
+        detail=estimate.detail,
+        forward_solves=estimate.forward_solves,
+    )
 
 
 def _points(file: str, what: str) -> FloatArray:
@@ -200,65 +225,11 @@ def _points(file: str, what: str) -> FloatArray:
         raise ConfigurationError(f"{what} = {file}: {error}") from error
 
 
-def _record(
-    config: Values, config_hash: str, found: Estimate, model: ProcessModel, started: float
-) -> dict[str, Any]:
-    summary = found.innovation
-    return {
-        "schema": 1,
-        **{key: config[key] for key in ("title", "row", "table", "paper", "parameters")},
-        "experiment": config["name"],
-        "status": "converged" if found.converged else "failed",
-        "reason": found.reason.value,
-        "detail": found.detail,
-        "truth": None,
-        "units": list(model.units),
-        "initial": found.prior.mean.tolist(),
-        "prior_std": found.prior.std.tolist(),
-        "estimate": found.mean.tolist() if found.converged else None,
-        "std": found.std.tolist() if found.converged else None,
-        "iterates": found.iterates.tolist(),
-        "iterate_std": found.iterate_std.tolist(),
-        **dict.fromkeys(
-            ("relative_error", "moduli_error_percent", "distance_mm", "distance_to_truth_mm")
-        ),
-        "innovation": None
-        if summary is None
-        else {
-            "size": summary.size,
-            "rms": summary.rms,
-            "nis": summary.nis,
-            "nis_band": list(summary.nis_band),
-        },
-        "iterations": found.iterations,
-        "forward_solves": found.forward_solves,
-        "program": {
-            "command": list(model.command.arguments),
-            "points": model.count,
-            "runs": model.runs,
-            "reused": model.reused,
-            "seconds": model.seconds,
-            "own_jacobian": model.own_jacobian,
-        },
-        "seconds": 0.0,
-        "seconds_total": time.time() - started,
-        "mesh": {},
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": "none",
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
-
-
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_external),
-    words=lambda record: external_text(flat(record)),
-    write=each(write_external_tables),
+    findings=Findings,
+    run=run_external,
+    words=external_text,
+    write=write_external,
     checks=lambda: (check_external,),
-    sections=(),
 )

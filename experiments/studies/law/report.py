@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mvest.files import write_atomically
-from mvest.reporting.figures import COLOURS, save_figure
-from mvest.reporting.files import provenance_line
+from experiments.common.record import Record
+from experiments.common.report import write_report
+from experiments.studies.law.findings import Excised, Findings
+from mvest.reporting.figures import COLOURS, save_figure_with
 
-__all__ = ["biaxial_figure", "curves_figure", "law_text", "write_law_tables"]
-
-Record = Mapping[str, Any]
+__all__ = ["biaxial_figure", "curves_figure", "law_table", "law_text", "write_law"]
 
 DIRECTIONS = ("along the fibres", "across the fibres")
 TRUTH, EXPONENTIAL, LINEAR = "black", COLOURS[0], COLOURS[1]
@@ -24,31 +24,25 @@ LAST_STRESS = 0.8
 """MPa; beyond it nothing is drawn."""
 
 
-def curves_figure(record: Record) -> Figure:
+def curves_figure(found: Findings) -> Figure:
     """Stress against stretch of each leaflet, true and as estimated with either law."""
-    regions = list(record["curves"])
-    figure = Figure(figsize=(8.6, 3.4 * len(regions)), layout="constrained")
-    grid = figure.subplots(len(regions), 2, squeeze=False, sharey=True)
-    for axes_of_region, region in zip(grid, regions, strict=True):
-        curves, seen = record["curves"][region], record["stretches"][region]
-        stretch = np.array(curves["stretch"])
+    figure = Figure(figsize=(8.6, 3.4 * len(found.curves)), layout="constrained")
+    grid = figure.subplots(len(found.curves), 2, squeeze=False, sharey=True)
+    for axes_of_region, (region, curves) in zip(grid, found.curves.items(), strict=True):
+        seen, stretch, law = found.stretches[region], np.array(curves.stretch), curves.exponential
         for k, (axes, direction) in enumerate(zip(axes_of_region, DIRECTIONS, strict=True)):
-            low, _, high = seen["along" if k == 0 else "across"]
+            low, _, high = seen.across if k else seen.along
             axes.axvspan(low, high, color="0.9", label="stretches in the closed valve (90 %)")
-            band = [np.array(curves["exponential"][side])[:, k] for side in ("low", "high")]
+            band = [np.array(side)[:, k] for side in (law.low, law.high)]
             axes.fill_between(stretch, *band, color=EXPONENTIAL, alpha=0.25, linewidth=0)
-            for name, colour, style, label in (
-                ("truth", TRUTH, "-", "truth"),
-                ("exponential", EXPONENTIAL, "--", "exponential law, estimated (95 % band)"),
-                ("linear", LINEAR, "-.", "linear law, estimated"),
+            for values, colour, style, label in (
+                (curves.truth, TRUTH, "-", "truth"),
+                (law.estimate, EXPONENTIAL, "--", "exponential law, estimated (95 % band)"),
+                (curves.linear, LINEAR, "-.", "linear law, estimated"),
             ):
-                values = curves[name]["estimate"] if name == "exponential" else curves[name]
                 axes.plot(stretch, np.array(values)[:, k], style, color=colour, label=label)
             axes.set(xlim=(stretch[0], stretch[-1]), ylim=(0, LAST_STRESS))
-            axes.set_title(f"{region} leaflet, {direction}", fontsize=10)
-            axes.set_xlabel("stretch in both directions")
-            axes.grid(alpha=0.3)
-            axes.spines[["top", "right"]].set_visible(False)
+            _label(axes, f"{region} leaflet, {direction}")
         axes_of_region[0].set_ylabel("nominal stress [MPa]")
     figure.legend(
         *grid[0, 0].get_legend_handles_labels(),
@@ -61,111 +55,118 @@ def curves_figure(record: Record) -> Figure:
     return figure
 
 
-def biaxial_figure(record: Record) -> Figure:
+def _label(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("stretch in both directions")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def biaxial_figure(excised: Mapping[str, Excised]) -> Figure:
     """The law with the coefficients of excised leaflets, under equibiaxial stretch."""
-    excised = record["excised"]
     figure = Figure(figsize=(4.2 * len(excised), 3.6), layout="constrained")
     grid = figure.subplots(1, len(excised), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (region, curves) in zip(grid, excised.items(), strict=True):
-        stress = np.array(curves["stress"])
+        stress = np.array(curves.stress)
         for k, (name, style) in enumerate((("circumferential", "-"), ("radial", "--"))):
-            axes.plot(curves["stretch"], 1e3 * stress[:, k], style, color=COLOURS[k], label=name)
+            axes.plot(curves.stretch, 1e3 * stress[:, k], style, color=COLOURS[k], label=name)
         axes.set(ylim=(0, 150), xlim=(1.0, 1.3))  # kPa
-        axes.set_title(f"{region} leaflet", fontsize=10)
-        axes.set_xlabel("stretch in both directions")
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        _label(axes, f"{region} leaflet")
     grid[0].set_ylabel("nominal stress [kPa]")
     grid[0].legend(frameon=False, fontsize=8)
     figure.suptitle("The law with coefficients of excised leaflets", fontsize=11)
     return figure
 
 
-def _frame(record: Record) -> pd.DataFrame:
+def law_table(record: Record[Findings]) -> pd.DataFrame:
     """One row for each parameter of each fit."""
-    return pd.DataFrame(
-        [
-            {
-                "law": fit["law"],
-                "parameter": parameter["name"],
-                **{key: value for key, value in parameter.items() if key != "name"},
-                "distance_mean_mm": fit["distance_mm"]["mean"],
-                "distance_max_mm": fit["distance_mm"]["max"],
-                "residual_rms_mm": fit["residual_rms_mm"],
-                "chi_square_per_number": fit["chi_square"],
-                "iterations": fit["iterations"],
-                "seconds": fit["seconds"],
-                "reason": fit["reason"],
-            }
-            for fit in record["fits"]
-            for parameter in fit["parameters"]
-        ]
-    )
+    rows = []
+    for fit in record.findings.fits:
+        distance = fit.distance_mm
+        for parameter in fit.parameters:
+            own = asdict(parameter)
+            rows.append(
+                {
+                    "law": fit.law,
+                    "parameter": own.pop("name"),
+                    **own,
+                    "distance_mean_mm": None if distance is None else distance.mean,
+                    "distance_max_mm": None if distance is None else distance.max,
+                    "residual_rms_mm": fit.residual_rms_mm,
+                    "chi_square_per_number": fit.chi_square,
+                    "iterations": fit.iterations,
+                    "seconds": fit.seconds,
+                    "reason": fit.reason,
+                }
+            )
+    return pd.DataFrame(rows)
 
 
-def _readable(record: Record) -> str:
+def law_text(record: Record[Findings]) -> str:
+    """The tables of both fits and of what other errors make of the exponential law."""
+    found = record.findings
     lines = [
         "| law | parameter | truth | start | estimate | SD | Cramér-Rao |",
         "|---|---|---|---|---|---|---|",
     ]
-    for fit in record["fits"]:
-        for p in fit["parameters"]:
-            numbers = (p["truth"], p["start"], p["estimate"], p["std"], p["bound"])
+    for fit in found.fits:
+        for p in fit.parameters:
+            numbers = (p.truth, p.start, p.estimate, p.std, p.bound)
             cells = ["–" if v is None else f"{v:.3g}" for v in numbers]
-            name = f"{p['name']} ({p['unit']})" if p["unit"] else p["name"]
-            lines.append(f"| {fit['law']} | {name} | {' | '.join(cells)} |")
+            name = f"{p.name} ({p.unit})" if p.unit else p.name
+            lines.append(f"| {fit.law} | {name} | {' | '.join(cells)} |")
     lines += [
         "",
         "| law | distance from the true closed valve, mean / max (mm) | χ² per coordinate | "
         "iterations | time (s) |",
         "|---|---|---|---|---|",
     ]
-    for fit in record["fits"]:
-        distance = fit["distance_mm"]
-        cell = "–"
-        if distance["mean"] is not None:
-            cell = f"{distance['mean']:.3f} / {distance['max']:.2f}"
-        chi = "–" if fit["chi_square"] is None else f"{fit['chi_square']:.3f}"
-        ended = "" if fit["converged"] else f" ({fit['reason']})"
+    for fit in found.fits:
+        d = fit.distance_mm
+        cell = "–" if d is None else f"{d.mean:.3f} / {d.max:.2f}"
+        chi = "–" if fit.chi_square is None else f"{fit.chi_square:.3f}"
+        ended = "" if fit.converged else f" ({fit.reason})"
         lines.append(
-            f"| {fit['law']}{ended} | {cell} | {chi} | {fit['iterations']} | {fit['seconds']:.0f} |"
+            f"| {fit.law}{ended} | {cell} | {chi} | {fit.iterations} | {fit.seconds:.0f} |"
         )
-    band = record["chi_square_band"]
-    if band is None:
+    if found.chi_square_band is None:
         return "\n".join(lines)
+    low, high = found.chi_square_band
     lines += [
         "",
         f"Data: one closed frame of a simulated valve of the exponential law, with independent "
-        f"errors of {record['noise_mm']:g} mm of each coordinate. χ² of a right model lies between "
-        f"{band[0]:.3f} and {band[1]:.3f} per coordinate (95 %).",
+        f"errors of {found.noise_mm:g} mm of each coordinate. χ² of a right model lies between "
+        f"{low:.3f} and {high:.3f} per coordinate (95 %).",
         "",
         "| leaflet | stretch along the fibres (5th, 50th, 95th percentile) | across |",
         "|---|---|---|",
     ]
-    for region, seen in record["stretches"].items():
-        cells = [", ".join(f"{v:.2f}" for v in seen[k]) for k in ("along", "across")]
+    for region, seen in found.stretches.items():
+        cells = [", ".join(f"{v:.2f}" for v in values) for values in (seen.along, seen.across)]
         lines.append(f"| {region} | {cells[0]} | {cells[1]} |")
-    lines += _repeats(record)
-    return "\n".join(lines)
+    return "\n".join([*lines, *_scatter(record)])
 
 
-def _repeats(record: Record) -> list[str]:
+def _scatter(record: Record[Findings]) -> list[str]:
     """How the estimates with the exponential law scatter about the truth, in lines of Markdown."""
-    done = [r for r in record["repeats"] if r["converged"]]
+    found = record.findings
+    done = [sample for sample in found.samples if sample.converged]
     if not done:
         return []
-    truth = np.array(record["truth"])
-    estimates, low, high = (np.array([r[k] for r in done]) for k in ("estimate", "low", "high"))
+    truth = np.array(found.truth)
+    estimates, low, high = (
+        np.array(rows) for rows in zip(*((s.estimate, s.low, s.high) for s in done), strict=True)
+    )
     inside = ((low <= truth) & (truth <= high)).sum(axis=0)
     lines = [
         "",
-        f"The exponential law from {len(record['repeats'])} samples of the errors, of which "
+        f"The exponential law from {len(found.samples)} samples of the errors, of which "
         f"{len(done)} gave an estimate:",
         "",
         "| parameter | truth | median | smallest to largest | 95 % interval holds the truth |",
         "|---|---|---|---|---|",
     ]
-    for k, name in enumerate(record["parameters"]):
+    for k, name in enumerate(record.parameters):
         own = estimates[:, k]
         lines.append(
             f"| {name} | {truth[k]:.3g} | {np.median(own):.3g} | {own.min():.3g} to "
@@ -174,7 +175,7 @@ def _repeats(record: Record) -> list[str]:
     return lines
 
 
-def _excised(record: Record) -> str:
+def _excised(excised: Mapping[str, Excised]) -> str:
     """What the coefficients of excised leaflets give, beside what was measured in others."""
     lines = [
         "## Coefficients of excised leaflets",
@@ -183,11 +184,10 @@ def _excised(record: Record) -> str:
         "is reached along / across the fibres |",
         "|---|---|---|---|",
     ]
-    for region, curves in record["excised"].items():
-        reached = " / ".join("–" if v is None else f"{v:.2f}" for v in curves["reached"])
-        lines.append(
-            f"| {region} | {curves['slope_at_rest']:.2g} | {curves['slope']:.2g} | {reached} |"
-        )
+    for region, curves in excised.items():
+        reached = " / ".join("–" if v is None else f"{v:.2f}" for v in curves.reached)
+        slope = "–" if curves.slope is None else f"{curves.slope:.2g}"
+        lines.append(f"| {region} | {curves.slope_at_rest:.2g} | {slope} | {reached} |")
     return "\n".join(
         [
             *lines,
@@ -202,18 +202,17 @@ def _excised(record: Record) -> str:
     )
 
 
-def law_text(record: Record) -> str:
-    """The tables for the terminal."""
-    return _readable(record)
-
-
-def write_law_tables(folder: Path, record: Record) -> list[Path]:
-    """``law.csv``, ``law.md`` and both figures in ``folder``."""
-    table = _frame(record)
-    parts = [f"# {record['title']}", _readable(record), _excised(record), provenance_line(record)]
-    return [
-        write_atomically(folder / "law.csv", lambda path: table.to_csv(path, index=False)),
-        write_atomically(folder / "law.md", "\n\n".join(parts) + "\n"),
-        *(save_figure(folder / "law", curves_figure(record), record) if record["curves"] else []),
-        *save_figure(folder / "law_biaxial", biaxial_figure(record), record),
-    ]
+def write_law(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table, words and both figures of each record."""
+    written = []
+    for record in records.values():
+        found = record.findings
+        words = f"{law_text(record)}\n\n{_excised(found.excised)}"
+        curves = curves_figure(found) if found.curves else None
+        written += write_report(folder, record, law_table(record), words, curves)
+        written += save_figure_with(
+            folder / f"{record.experiment}_biaxial", biaxial_figure(found.excised), record.line
+        )
+    return written

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.common.build import Twin, build_twin
-from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.estimate_record import vectors
+from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.study import Section, Study
-from experiments.studies.law.report import law_text, write_law_tables
-from experiments.studies.law.settings import Settings
+from experiments.common.record import Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.law.findings import (
+    Band,
+    Curves,
+    Distance,
+    Excised,
+    Findings,
+    Fit,
+    Parameter,
+    Sample,
+    Stretches,
+)
+from experiments.studies.law.report import law_text, write_law
+from experiments.studies.law.settings import LawSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.information.consistency import chi_square_band
@@ -30,13 +41,11 @@ from mvest.mechanics.valve_system import material_law
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import Truth, TwinData, simulate_observation
-from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_law_study"]
 
 Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
 
 DRAWS = 200
 """Samples of the estimate of which the band of the curves is made."""
@@ -47,58 +56,73 @@ REACHED = 0.1
 """MPa, stress at which excised leaflets are compared."""
 
 
-def run_law_study(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
-    """Close the valve, observe it, fit either law to what was observed."""
-    twin, linear = build_twin(config), build_twin(_linear(config))
-    record = _record(config, config_hash, twin, started)
-    record["excised"] = _excised(config["law_study"]["excised"])
+def run_law_study(job: Job[Settings]) -> Outcome[Findings]:
+    """Close the valve, observe it, fit either law to what was observed.
+
+    Raises
+    ------
+    ConfigurationError
+        If the linear law is to estimate anything but moduli.
+    """
+    values, settings = job.values, job.settings.law_study
+    twin, linear = build_twin(values), build_twin(_linear(values, settings))
+    seed, mesh = values["seed"], twin.model.mesh
+    findings = Findings(
+        truth=tuple(twin.truth_values.tolist()),
+        noise_mm=values["observation"]["noise_mm"],
+        excised=_excised(settings.excised),
+    )
     closed = twin.truth_model(twin.truth_values)
-    data = _observed(twin, closed, config["seed"])
+    data = _observed(twin, closed, seed)
     if data.observation is None or data.truth is None:
-        return record | {"status": "failed", "reason": data.reason}, []
-    record["stretches"] = _stretches(twin.truth_model, twin.truth_values)
-    record["chi_square_band"] = [
-        end / data.observation.y.size for end in chi_square_band(data.observation.y.size)
-    ]
-    fits = {}
-    for name, problem in (("exponential", twin.problem), ("linear", linear.problem)):
-        model = twin.model if name == "exponential" else linear.model
+        return outcome_of(findings, mesh, 0, (data.reason,))
+    stretches = _stretches(twin.truth_model, twin.truth_values)
+    low, high = chi_square_band(data.observation.y.size)
+    results, fits = {}, []
+    for name, case in (("exponential", twin), ("linear", linear)):
+        model, problem = case.model, case.problem
         steps = len(model.settings.protocol.steps())
         with SolveBar(f"{name} law", steps, TYPICAL_SOLVES, problem.parameters) as bar:
             model.on_step = bar.step
-            fits[name] = estimate(problem, data.observation, on_iterate=bar.iterate)
-        own = fits[name].against(data.truth) if name == "exponential" else fits[name]
-        record["fits"].append(_fit(name, own, problem.prior.mean, data.observation, data.truth))
-    if all(result.estimate is not None for result in fits.values()):
-        models = (twin.model, linear.model)
-        record["curves"] = _curves(models, fits, twin.truth_values, config["seed"])
-    record["repeats"] = _repeats(
-        twin, closed, range(config["seed"], config["seed"] + config["repeats"])
+            results[name] = estimate(problem, data.observation, on_iterate=bar.iterate)
+        own = results[name].against(data.truth) if name == "exponential" else results[name]
+        fits.append(_fit(name, own, problem.prior.mean, data.observation, data.truth))
+    curves = {}
+    if all(result.estimate is not None for result in results.values()):
+        curves = _curves((twin.model, linear.model), results, twin.truth_values, seed)
+    samples = _samples(twin, closed, range(seed, seed + values["repeats"]))
+    failed = [result for result in results.values() if not result.converged]
+    outcome = outcome_of(
+        replace(
+            findings,
+            fits=tuple(fits),
+            samples=samples,
+            curves=curves,
+            stretches=stretches,
+            chi_square_band=(low / data.observation.y.size, high / data.observation.y.size),
+        ),
+        mesh,
+        1 + sum(fit.forward_solves for fit in fits) + sum(s.forward_solves for s in samples),
+        [result.reason for result in failed],
     )
-    failed = [result for result in fits.values() if not result.converged]
-    if failed:
-        record |= {"status": "failed", "reason": failed[0].reason, "detail": failed[0].detail}
-    solves = [fit["forward_solves"] for fit in record["fits"]]
-    record["forward_solves"] = 1 + sum(solves) + sum(r["forward_solves"] for r in record["repeats"])
-    record["seconds"] = record["seconds_total"] = time.time() - started
-    return record, []
+    return replace(outcome, detail=failed[0].detail) if failed else outcome
 
 
-def _linear(config: Values) -> dict[str, Any]:
+def _linear(values: Values, settings: LawSettings) -> dict[str, Any]:
     """The same study with tissue of the linear law."""
-    own = config["law_study"]
-    names = list(own["linear_parameters"])
+    names = list(settings.linear_parameters)
     if any(kind_of(name) is not kind_of("E_f.any") for name in names):
         raise ConfigurationError(f"law_study.linear_parameters = {names}, expected E_f.REGION")
-    mechanics = dict(config["mechanics"])
+    mechanics = dict(values["mechanics"])
     mechanics["tissue"] = {
         region: {**tissue, "law": "biot", "exponential": None}
         for region, tissue in mechanics["tissue"].items()
     }
-    filter_ = {**config["filter"], "initial": own["linear_initial"], "P0": own["linear_P0"]}
-    truth = {**config["truth"], "values": list(own["linear_initial"])}
+    initial = list(settings.linear_initial)
+    filter_ = {**values["filter"], "initial": initial, "P0": settings.linear_P0}
+    truth = {**values["truth"], "values": initial}
     changes = {"mechanics": mechanics, "parameters": names, "filter": filter_, "truth": truth}
-    return {**config, **changes}
+    return {**values, **changes}
 
 
 def _observed(twin: Twin, closed: Prediction, seed: int) -> TwinData:
@@ -114,7 +138,7 @@ def _observed(twin: Twin, closed: Prediction, seed: int) -> TwinData:
     )
 
 
-def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Any]:
+def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Stretches]:
     """Percentiles of the stretches along and across the fibres of each leaflet, closed."""
     assert model.closed is not None
     system, _ = model.tuned(values)
@@ -124,55 +148,55 @@ def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Any]:
     for k, region in enumerate(model.mesh.region_names):
         own = np.sqrt(1 + 2 * green[model.mesh.region == k][:, :, :2].reshape(-1, 2))
         quantiles = np.percentile(own, [5, 50, 95], axis=0)
-        found[region] = {"along": quantiles[:, 0].tolist(), "across": quantiles[:, 1].tolist()}
+        found[region] = Stretches(*vectors(quantiles.T))
     return found
 
 
 def _fit(
     name: str, result: StudyResult, start: FloatArray, observation: Observation, truth: Truth
-) -> dict[str, Any]:
+) -> Fit:
     """What one law makes of the observation."""
-    nothing = [None] * len(result.parameters)
     bound, filtered = result.identifiability, result.filtered
-    columns: dict[str, Any] = {
-        "truth": nothing if result.truth is None else result.truth.values,
-        "start": start,
-        "estimate": nothing if result.estimate is None else result.estimate,
-        "std": nothing if result.std is None else result.std,
-        "bound": nothing if bound is None else bound.std,
-    }
-    distance: dict[str, float | None] = {"mean": None, "max": None}
-    residual: dict[str, float | None] = {"residual_rms_mm": None, "chi_square": None}
+
+    def at(values: FloatArray | None, k: int) -> float | None:
+        return None if values is None else float(values[k])
+
+    distance = rms = chi_square = None
     if result.fitted is not None:
         d = np.linalg.norm(result.fitted[-1] - truth.positions[-1], axis=1)
-        distance = {"mean": float(d.mean()), "max": float(d.max())}
+        distance = Distance(float(d.mean()), float(d.max()))
         e = result.fitted - observation.positions
-        share = e**2 / observation.variance[:, None, None]
-        residual = {
-            "residual_rms_mm": float(np.sqrt(np.nanmean(e**2))),
-            "chi_square": float(np.nanmean(share)),
-        }
-    return {
-        "law": name,
-        "parameters": [
-            {"name": parameter, "unit": kind_of(parameter).unit}
-            | {key: None if c[k] is None else float(c[k]) for key, c in columns.items()}
+        rms = float(np.sqrt(np.nanmean(e**2)))
+        chi_square = float(np.nanmean(e**2 / observation.variance[:, None, None]))
+    return Fit(
+        law=name,
+        parameters=tuple(
+            Parameter(
+                parameter,
+                kind_of(parameter).unit,
+                None if result.truth is None else float(result.truth.values[k]),
+                float(start[k]),
+                at(result.estimate, k),
+                at(result.std, k),
+                None if bound is None else float(bound.std[k]),
+            )
             for k, parameter in enumerate(result.parameters)
-        ],
-        "distance_mm": distance,
-        **residual,
-        "iterations": 0 if filtered is None else filtered.iterations,
-        "forward_solves": 0 if filtered is None else filtered.forward_solves,
-        "seconds": result.seconds,
-        "reason": result.reason,
-        "converged": result.converged,
-    }
+        ),
+        distance_mm=distance,
+        residual_rms_mm=rms,
+        chi_square=chi_square,
+        iterations=0 if filtered is None else filtered.iterations,
+        forward_solves=0 if filtered is None else filtered.forward_solves,
+        seconds=result.seconds,
+        reason=result.reason,
+        converged=result.converged,
+    )
 
 
-def _repeats(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> list[dict[str, Any]]:
+def _samples(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> tuple[Sample, ...]:
     """Estimates with the exponential law from observations with other errors."""
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
-    entries = []
+    samples = []
     steps = len(twin.model.settings.protocol.steps())
     solves = TYPICAL_SOLVES * len(seeds)
     with SolveBar("other errors", steps, solves, problem.parameters) as bar:
@@ -182,18 +206,11 @@ def _repeats(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> list[dict[
             assert data.observation is not None
             filtered = estimate(problem, data.observation, on_iterate=bar.iterate).filtered
             assert filtered is not None
-            low, high = filtered.interval()
-            entries.append(
-                {
-                    "seed": seed,
-                    "estimate": filtered.mean.tolist(),
-                    "low": low.tolist(),
-                    "high": high.tolist(),
-                    "converged": filtered.converged,
-                    "forward_solves": filtered.forward_solves,
-                }
+            mean, low, high = vectors(np.stack([filtered.mean, *filtered.interval()]))
+            samples.append(
+                Sample(seed, mean, low, high, filtered.converged, filtered.forward_solves)
             )
-    return entries
+    return tuple(samples)
 
 
 def _curves(
@@ -201,7 +218,7 @@ def _curves(
     fits: Mapping[str, StudyResult],
     truth: FloatArray,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Curves]:
     """Stress of each leaflet under equibiaxial stretch: true, and as estimated with either law."""
     model, linear = models
     exponential = fits["exponential"].filtered
@@ -217,16 +234,12 @@ def _curves(
         many = np.array([biaxial_stress(law, stretches, k) for law in sampled])
         low, high = np.percentile(many, [2.5, 97.5], axis=0)
         estimated = biaxial_stress(_law(model, exponential.mean), stretches, k)
-        found[region] = {
-            "stretch": CURVE.tolist(),
-            "truth": biaxial_stress(_law(model, truth), stretches, k).tolist(),
-            "exponential": {
-                "estimate": estimated.tolist(),
-                "low": low.tolist(),
-                "high": high.tolist(),
-            },
-            "linear": biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k).tolist(),
-        }
+        found[region] = Curves(
+            tuple(CURVE.tolist()),
+            vectors(biaxial_stress(_law(model, truth), stretches, k)),
+            Band(vectors(estimated), vectors(low), vectors(high)),
+            vectors(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
+        )
     return found
 
 
@@ -236,7 +249,7 @@ def _law(model: ClosureModel, values: FloatArray) -> Law:
     return material_law(model.mesh, model.settings, named)
 
 
-def _excised(coefficients: Mapping[str, Any]) -> dict[str, Any]:
+def _excised(coefficients: Mapping[str, tuple[float, ...]]) -> dict[str, Excised]:
     """Curves of the law with coefficients ``[c0 (MPa), c1, c2]`` of each leaflet."""
     found = {}
     for region, (c0, c1, c2) in coefficients.items():
@@ -245,13 +258,13 @@ def _excised(coefficients: Mapping[str, Any]) -> dict[str, Any]:
         slopes = np.diff(stress[:, 0]) / np.diff(EXCISED_CURVE)
         reached = [_first_above(stress[:, k]) for k in (0, 1)]
         shown = stress.max(axis=1) < 2.0  # MPa; far beyond what is drawn
-        found[region] = {
-            "stretch": EXCISED_CURVE[shown].tolist(),
-            "stress": stress[shown].tolist(),
-            "slope_at_rest": float(slopes[0]),
-            "slope": None if reached[0] is None else float(slopes[reached[0] - 1]),
-            "reached": [None if i is None else float(EXCISED_CURVE[i]) for i in reached],
-        }
+        found[region] = Excised(
+            tuple(EXCISED_CURVE[shown].tolist()),
+            vectors(stress[shown]),
+            float(slopes[0]),
+            None if reached[0] is None else float(slopes[reached[0] - 1]),
+            tuple(None if i is None else float(EXCISED_CURVE[i]) for i in reached),
+        )
     return found
 
 
@@ -260,49 +273,12 @@ def _first_above(stress: FloatArray) -> int | None:
     return int(above[0]) if len(above) else None
 
 
-def _record(config: Values, config_hash: str, twin: Twin, started: float) -> dict[str, Any]:
-    mesh = twin.model.mesh
-    return {
-        "schema": 1,
-        "experiment": config["name"],
-        "title": config["title"],
-        "row": config["row"],
-        "table": config["table"],
-        "status": "converged",
-        "reason": "completed",
-        "detail": "",
-        "parameters": list(config["parameters"]),
-        "truth": twin.truth_values.tolist(),
-        "fits": [],
-        "repeats": [],
-        "curves": {},
-        "stretches": {},
-        "chi_square_band": None,
-        "noise_mm": config["observation"]["noise_mm"],
-        "forward_solves": 0,
-        "seconds": time.time() - started,
-        "seconds_total": time.time() - started,
-        "mesh": {"sha256": mesh.sha256, "nodes": len(mesh.nodes)},
-        "model": {
-            "element": config["mechanics"]["element"],
-            "cells": [config["mesh"][key] for key in ("columns", "rows", "layers")],
-        },
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": mesh.sha256,
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
-
-
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_law_study),
-    words=lambda record: law_text(flat(record)),
-    write=each(write_law_tables),
+    findings=Findings,
+    run=run_law_study,
+    words=law_text,
+    write=write_law,
     sections=(
         Section(
             "law",

@@ -8,83 +8,113 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from mvest.files import write_atomically
-from mvest.reporting.figures import COLOURS, MARKERS, save_figure
-from mvest.reporting.files import provenance_line
+from experiments.common.record import Record
+from experiments.common.report import write_report
+from experiments.studies.models.findings import Apart, Difference, Findings
+from experiments.studies.models.sheet.sheet import Sheet
+from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.markup import MISSING, markdown_rows, number
 from mvest.typing import FloatArray
 
-__all__ = ["models_figure", "models_text", "write_models_tables"]
-
-Record = Mapping[str, Any]
+__all__ = ["models_figure", "models_table", "models_text", "write_models"]
 
 AGAINST = (
-    ("hex27", "this project, the same elements"),
-    ("hex18", "this project, solid-shells"),
-    ("st_venant_kirchhoff", "scikit-fem, St. Venant-Kirchhoff"),
+    "this project, the same elements",
+    "this project, solid-shells",
+    "scikit-fem, St. Venant-Kirchhoff",
 )
-"""What is compared with scikit-fem's Biot law on the same mesh, and its name."""
+"""What is compared with scikit-fem's Biot law on the same mesh."""
 
 
-def _estimates(record: Record) -> list[dict[str, str]]:
-    rows = []
-    alone = {row["data"]: row["estimate"] for row in record["rows"] if row["model"] == row["data"]}
-    for row in record["rows"]:
-        found = {"data of": row["data"], "model of the filter": row["model"]}
-        for k, name in enumerate(record["parameters"]):
-            value = f"{row['estimate'][k]:.3f} ± {row['std'][k]:.3f}"
-            found[f"{name} (MPa)"] = value if row["converged"] else MISSING
-            error = f"{100 * row['relative_error'][k]:+.2f}"
-            found[f"error of {name} (%)"] = error if row["converged"] else MISSING
-        apart = [
-            100 * (e / o - 1) for e, o in zip(row["estimate"], alone[row["data"]], strict=True)
+def _against(row: Difference) -> tuple[Apart | None, ...]:
+    """In the order of `AGAINST`."""
+    return row.hex27, row.hex18, row.st_venant_kirchhoff
+
+
+def models_table(record: Record[Findings]) -> pd.DataFrame:
+    """One row per model and data."""
+    return pd.DataFrame(
+        [
+            {
+                "data": row.data,
+                "model": row.model,
+                "converged": row.converged,
+                "residual_mm": row.residual_mm,
+                "iterations": row.iterations,
+                "forward_solves": row.forward_solves,
+                "program_runs": row.program_runs,
+                "seconds": row.seconds,
+            }
+            | {
+                f"{name}_{what}": values[k]
+                for k, name in enumerate(record.parameters)
+                for what, values in (
+                    ("estimate", row.estimate),
+                    ("std", row.std),
+                    ("relative_error", row.relative_error),
+                )
+            }
+            for row in record.findings.rows
         ]
-        found |= {
-            "apart from the data's own model (%)": ", ".join(f"{value:+.2f}" for value in apart),
-            "residual (mm)": number(row["residual_mm"]),
-            "predictions": str(row["forward_solves"]),
-            "program runs": MISSING if row["program_runs"] is None else str(row["program_runs"]),
-            "time (s)": number(row["seconds"], 2),
-        }
-        rows.append(found)
-    return rows
+    )
 
 
-def _differences(record: Record) -> list[dict[str, str]]:
+def _estimates(record: Record[Findings]) -> list[dict[str, str]]:
     rows = []
-    for row in record["differences"]:
-        found = {"cells": " × ".join(map(str, row["cells"]))}
-        for key, name in AGAINST:
-            apart = row[key] or dict.fromkeys(("rms_mm", "max_mm", "derivatives"))
-            found[f"{name}: largest (mm)"] = number(apart["max_mm"], 2)
-            change = apart["derivatives"]
-            found[f"{name}: derivatives (%)"] = number(None if change is None else 100 * change, 2)
-        rows.append(found)
+    alone = {row.data: row.estimate for row in record.findings.rows if row.model == row.data}
+    for row in record.findings.rows:
+        cells = {"data of": row.data, "model of the filter": row.model}
+        for k, name in enumerate(record.parameters):
+            value = f"{row.estimate[k]:.3f} ± {row.std[k]:.3f}"
+            cells[f"{name} (MPa)"] = value if row.converged else MISSING
+            error = f"{100 * row.relative_error[k]:+.2f}"
+            cells[f"error of {name} (%)"] = error if row.converged else MISSING
+        apart = [100 * (e / o - 1) for e, o in zip(row.estimate, alone[row.data], strict=True)]
+        cells |= {
+            "apart from the data's own model (%)": ", ".join(f"{value:+.2f}" for value in apart),
+            "residual (mm)": number(row.residual_mm),
+            "predictions": str(row.forward_solves),
+            "program runs": MISSING if row.program_runs is None else str(row.program_runs),
+            "time (s)": number(row.seconds, 2),
+        }
+        rows.append(cells)
     return rows
 
 
-def _words(record: Record) -> str:
+def _differences(found: Findings) -> list[dict[str, str]]:
+    rows = []
+    for row in found.differences:
+        cells = {"cells": " × ".join(map(str, row.cells))}
+        for name, apart in zip(AGAINST, _against(row), strict=True):
+            cells[f"{name}: largest (mm)"] = number(apart and apart.max_mm, 2)
+            cells[f"{name}: derivatives (%)"] = number(apart and 100 * apart.derivatives, 2)
+        rows.append(cells)
+    return rows
+
+
+def _words(record: Record[Findings]) -> str:
+    found, sheet = record.findings, record.findings.sheet
     truth = ", ".join(
         f"{name} = {value:g} MPa"
-        for name, value in zip(record["parameters"], record["truth"], strict=True)
+        for name, value in zip(record.parameters, found.truth, strict=True)
     )
-    sheet = record["sheet"]
     return (
-        f"Simulated: a sheet of {sheet['length']:g} × {sheet['width']:g} × "
-        f"{sheet['thickness']:g} mm, clamped at three sides, under {sheet['pressure_mmHg']:g} "
-        f"mmHg; truth {truth}; errors of {record['noise_mm']:g} mm SD, the same in both sets of "
+        f"Simulated: a sheet of {sheet.length:g} × {sheet.width:g} × "
+        f"{sheet.thickness:g} mm, clamped at three sides, under {sheet.pressure_mmHg:g} "
+        f"mmHg; truth {truth}; errors of {found.noise_mm:g} mm SD, the same in both sets of "
         "data. ± is one standard deviation. The estimates that belong to one set of data see the "
         "same numbers, so that what they differ by is the model."
     )
 
 
-def _readable(record: Record) -> str:
+def models_text(record: Record[Findings]) -> str:
     """Markdown of the two tables and the words around them."""
-    if not record["rows"]:
-        return f"No estimate: {record['reason']}."
+    if not record.findings.rows:
+        return f"No estimate: {record.reason}."
     return "\n\n".join(
         [
             _words(record),
@@ -93,34 +123,33 @@ def _readable(record: Record) -> str:
             "scikit-fem with the Biot law on the same mesh, at the true moduli. The same elements "
             "are triquadratic bricks, in both codes with the same quadrature; solid-shells are "
             "what this project uses for leaflets, compared with fully integrated bricks:",
-            markdown_rows(_differences(record)),
+            markdown_rows(_differences(record.findings)),
         ]
     )
 
 
-def models_text(record: Record) -> str:
-    """The estimates for the terminal."""
-    return _readable(record)
-
-
-def models_figure(record: Record) -> Figure:
+def models_figure(record: Record[Findings]) -> Figure:
     """The deformed sheet of both codes, the codes' difference, and the estimates of every model."""
+    found = record.findings
     figure = Figure(figsize=(11.0, 7.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=[1.0, 1.1])
-    _draw_sheet(figure.add_subplot(grid[0, 0], projection="3d", computed_zorder=False), record)
-    _draw_differences(figure.add_subplot(grid[1, 0]), record)
-    panels = [figure.add_subplot(grid[k, 1]) for k in range(len(record["parameters"]))]
+    _draw_sheet(
+        figure.add_subplot(grid[0, 0], projection="3d", computed_zorder=False), record.findings
+    )
+    _draw_differences(figure.add_subplot(grid[1, 0]), found)
+    panels = [figure.add_subplot(grid[k, 1]) for k in range(len(record.parameters))]
     for k, axes in enumerate(panels):
-        _draw_iterates(axes, record, k)
+        _draw_iterates(axes, found, k)
+        axes.set_ylabel(f"{record.parameters[k]} [MPa]")
     panels[0].set_title("estimates iterate by iterate; the start lies outside", fontsize=10)
     lines, names = panels[0].get_legend_handles_labels()
     panels[0].legend(lines, names, frameon=False, fontsize=8, ncols=2)
     return figure
 
 
-def _draw_sheet(axes: Axes3D, record: Record) -> None:
-    sheet = record["sheet"]
-    (one, first), (other, second) = record["shapes"].items()
+def _draw_sheet(axes: Axes3D, found: Findings) -> None:
+    sheet = found.sheet
+    (one, first), (other, second) = found.shapes.items()
     surface = _with_clamped_sides(np.array(first), sheet)
     middle = surface.shape[0] // 2
     halves = ((surface[: middle + 1], COLOURS[4]), (surface[middle:], COLOURS[5]))
@@ -145,41 +174,41 @@ def _draw_sheet(axes: Axes3D, record: Record) -> None:
     axes.set_axis_off()
     axes.legend(frameon=False, fontsize=8, loc="upper left")
     axes.set_title(
-        f"the pressed sheet, {sheet['length']:g} × {sheet['width']:g} mm, to scale", fontsize=10
+        f"the pressed sheet, {sheet.length:g} × {sheet.width:g} mm, to scale", fontsize=10
     )
 
 
-def _with_clamped_sides(points: FloatArray, sheet: Mapping[str, Any]) -> FloatArray:
+def _with_clamped_sides(points: FloatArray, sheet: Sheet) -> FloatArray:
     """Observed points as a grid ``(along, across, 3)``, the sides that do not move added."""
-    along, across = sheet["observed"]
+    along, across = sheet.observed
     grid = np.zeros((along + 1, across + 2, 3))
-    grid[..., 0] = np.linspace(0.0, sheet["length"], along + 1)[:, None]
-    grid[..., 1] = np.linspace(0.0, sheet["width"], across + 2)
-    grid[..., 2] = 0.5 * sheet["thickness"]
+    grid[..., 0] = np.linspace(0.0, sheet.length, along + 1)[:, None]
+    grid[..., 1] = np.linspace(0.0, sheet.width, across + 2)
+    grid[..., 2] = 0.5 * sheet.thickness
     grid[1:, 1:-1] = points.reshape(along, across, 3)
     return grid
 
 
-def _draw_iterates(axes: Any, record: Record, k: int) -> None:
-    """One modulus iterate by iterate: colour tells the model, the line the data."""
-    styles = dict(zip(record["shapes"], ("-", ":"), strict=True))
-    models = list(dict.fromkeys(row["model"] for row in record["rows"]))
-    shown = [record["truth"][k]]
-    for row in record["rows"]:
-        n = models.index(row["model"])
-        values = np.array(row["iterates"])[:, k]
+def _draw_iterates(axes: Any, found: Findings, k: int) -> None:
+    """One modulus iterate by iterate: the colour is the model's, the line the data's."""
+    styles = dict(zip(found.shapes, ("-", ":"), strict=True))
+    models = list(dict.fromkeys(row.model for row in found.rows))
+    shown = [found.truth[k]]
+    for row in found.rows:
+        n = models.index(row.model)
+        values = np.array(row.iterates)[:, k]
         shown += values[1:].tolist()
         axes.plot(
-            np.arange(len(values)), values, linestyle=styles[row["data"]], color=COLOURS[n],
+            np.arange(len(values)), values, linestyle=styles[row.data], color=COLOURS[n],
             marker=MARKERS[n], markersize=10 - 1.5 * n, markerfacecolor="none",
         )  # fmt: skip
-    first = record["rows"][0]
+    first = found.rows[0]
     axes.errorbar(
-        len(first["iterates"]) - 0.85, first["estimate"][k], first["std"][k], color="black",
+        len(first.iterates) - 0.85, first.estimate[k], first.std[k], color="black",
         capsize=3, linewidth=1, label="± 1 SD of the noise and the prior",
     )  # fmt: skip
-    shown += [first["estimate"][k] + sign * first["std"][k] for sign in (-1, 1)]
-    axes.axhline(record["truth"][k], color="grey", linestyle="--", linewidth=1, label="truth")
+    shown += [first.estimate[k] + sign * first.std[k] for sign in (-1, 1)]
+    axes.axhline(found.truth[k], color="grey", linestyle="--", linewidth=1, label="truth")
     for data, style in styles.items():
         axes.plot([], [], color="black", linestyle=style, label=f"data of {data}")
     for n, model in enumerate(models):
@@ -188,19 +217,19 @@ def _draw_iterates(axes: Any, record: Record, k: int) -> None:
     # Room for the legend above the first panel's lines.
     axes.set_ylim(min(shown) - margin, max(shown) + (5 if k == 0 else 1) * margin)
     axes.set_xlabel("iteration")
-    axes.set_ylabel(f"{record['parameters'][k]} [MPa]")
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_differences(axes: Any, record: Record) -> None:
-    rows = record["differences"]
+def _draw_differences(axes: Axes, found: Findings) -> None:
+    rows = found.differences
     at = np.arange(len(rows))
-    for n, (key, name) in enumerate(AGAINST):
-        values = [np.nan if row[key] is None else row[key]["max_mm"] for row in rows]
+    for n, name in enumerate(AGAINST):
+        column = [_against(row)[n] for row in rows]
+        values = [np.nan if apart is None else apart.max_mm for apart in column]
         axes.semilogy(at, values, color=COLOURS[n], marker=MARKERS[n], label=name)
-    axes.set_xticks(at, [" × ".join(map(str, row["cells"])) for row in rows])
+    axes.set_xticks(at, [" × ".join(map(str, row.cells)) for row in rows])
     axes.set_xlabel("cells along × across × through the thickness")
     axes.set_ylabel("largest distance [mm]")
     axes.set_title("distance from scikit-fem with the Biot law, same mesh", fontsize=10)
@@ -209,26 +238,12 @@ def _draw_differences(axes: Any, record: Record) -> None:
     axes.legend(frameon=False, fontsize=8, loc="center right")
 
 
-def write_models_tables(folder: Path, record: Record) -> list[Path]:
-    """``models.csv``, ``models.md`` and, if there are estimates, the figure in ``folder``."""
-    columns = ("data", "model", "converged", "residual_mm", "iterations", "forward_solves",
-               "program_runs", "seconds")  # fmt: skip
-    table = pd.DataFrame(
-        [
-            {column: row[column] for column in columns}
-            | {
-                f"{name}_{what}": row[what][k]
-                for k, name in enumerate(record["parameters"])
-                for what in ("estimate", "std", "relative_error")
-            }
-            for row in record["rows"]
-        ]
-    )
-    text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
-    written = [
-        write_atomically(folder / "models.csv", lambda path: table.to_csv(path, index=False)),
-        write_atomically(folder / "models.md", text),
-    ]
-    if record["rows"]:
-        written += save_figure(folder / "models", models_figure(record), record)
+def write_models(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table, words and, if there are estimates, the figure of each record."""
+    written = []
+    for record in records.values():
+        figure = models_figure(record) if record.findings.rows else None
+        written += write_report(folder, record, models_table(record), models_text(record), figure)
     return written

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from experiments.studies.models.sheet.sheet import Sheet
 
@@ -15,7 +14,7 @@ class ModelsSettings:
     """The same sheet in two finite-element codes, and as a program."""
 
     sheet: Sheet = field(default_factory=Sheet)
-    refinements: tuple[Any, ...] = ()  # [along, across, layers] to compare on
+    refinements: tuple[tuple[int, ...], ...] = ()  # [along, across, layers] to compare on
     relative_step: float = 1e-3  # of the program's differences
     time_limit_s: float = 120.0  # of one run of the program
     processes: int = 1  # of its runs at a time

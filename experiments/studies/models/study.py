@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import sys
 import time
@@ -14,12 +15,13 @@ import numpy as np
 
 import mvest
 from experiments.common.build import build_filter
-from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.estimate_record import vectors
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.schema import build
-from experiments.common.study import Section, Study
-from experiments.studies.models.report import models_text, write_models_tables
-from experiments.studies.models.settings import Settings
+from experiments.common.record import Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.models.findings import Apart, Difference, Findings, Row
+from experiments.studies.models.report import models_text, write_models
+from experiments.studies.models.settings import ModelsSettings, Settings
 from experiments.studies.models.sheet.own import OwnSheet
 from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
@@ -31,14 +33,11 @@ from mvest.estimation.transform import Transform
 from mvest.external.differences import Differences
 from mvest.external.model import ProcessModel
 from mvest.external.process import Command
-from mvest.provenance import config_hash as hash_of_data
-from mvest.provenance import provenance
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_models", "sheet_program"]
 
 Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
 
 OWN, SECOND, OTHER_LAW = "this project", "scikit-fem", "scikit-fem, St. Venant-Kirchhoff"
 PROGRAM, PROGRAM_ALONE = "scikit-fem as a program", "the same, by differences"
@@ -55,7 +54,7 @@ class SheetProblem:
     truth: FloatArray
 
 
-def run_models(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
+def run_models(job: Job[Settings]) -> Outcome[Findings]:
     """Compare the codes on finer meshes, then estimate with each from the data of each.
 
     Raises
@@ -63,89 +62,94 @@ def run_models(config: Values, config_hash: str, folder: Path, started: float) -
     ConfigurationError
         If the parameters or their values do not fit the sheet, or scikit-fem is not installed.
     """
-    if tuple(config["parameters"]) != PARAMETERS:
+    values, about = job.values, job.settings.models
+    if tuple(values["parameters"]) != PARAMETERS:
         raise ConfigurationError(
-            f"parameters = {config['parameters']}, expected {list(PARAMETERS)}"
+            f"parameters = {values['parameters']}, expected {list(PARAMETERS)}"
         )
-    about = config["models"]
-    sheet = build(Sheet, about["sheet"])
-    filter_, transform, prior = build_filter(config["filter"], PARAMETERS, positive=True)
-    variance = float(config["filter"]["R"])
-    truth = np.array(config["truth"]["values"], dtype=float)
-    problem = SheetProblem(filter_, transform, prior, variance, truth)
+    sheet, noise = about.sheet, values["observation"]["noise_mm"]
+    filter_, transform, prior = build_filter(values["filter"], PARAMETERS, positive=True)
+    truth = np.array(values["truth"]["values"], dtype=float)
+    problem = SheetProblem(filter_, transform, prior, float(values["filter"]["R"]), truth)
     own, second = OwnSheet(sheet), SecondSheet(sheet)
-    record = _record(config, config_hash, sheet, truth, started)
-
+    findings = Findings(
+        truth=tuple(truth.tolist()),
+        noise_mm=noise,
+        rows=(),
+        differences=(),
+        shapes={},
+        sheet=sheet,
+        library={"scikit-fem": importlib.metadata.version("scikit-fem")},
+        seconds=0.0,
+    )
     clean = {OWN: own(truth), SECOND: second(truth)}
     lost = [f"{name}: {p.reason}" for name, p in clean.items() if not p.converged]
     if lost:
-        return {**record, "status": "failed", "reason": lost[0]}, []
-    error = config["observation"]["noise_mm"] * np.random.default_rng(
-        config["seed"]
-    ).standard_normal(clean[OWN].y.size)
-    runs = folder / "runs"
+        return Outcome(findings=findings, status="failed", reason=lost[0])
+    rng = np.random.default_rng(values["seed"])
+    error = noise * rng.standard_normal(clean[OWN].y.size)
+    runs = job.folder / "runs"
     models: dict[str, ObservationModel] = {
         OWN: own,
         SECOND: second,
         OTHER_LAW: SecondSheet(sheet, "st_venant_kirchhoff"),
-        PROGRAM: sheet_program(sheet, runs, about, derivatives=True),
-        PROGRAM_ALONE: sheet_program(sheet, runs, about, derivatives=False),
+        PROGRAM: sheet_program(about, runs, derivatives=True),
+        PROGRAM_ALONE: sheet_program(about, runs, derivatives=False),
     }
-    rows = [
+    rows = tuple(
         _estimate(data, clean[data].y + error, name, models[name], problem)
         for data, names in ((OWN, list(models)), (SECOND, [OWN, SECOND, OTHER_LAW]))
         for name in names
-    ]
-    record |= {
-        "rows": rows,
-        "shapes": {name: p.y.reshape(-1, 3).tolist() for name, p in clean.items()},
-        "differences": [_difference(sheet, cells, truth) for cells in about["refinements"]],
-        "forward_solves": sum(row["forward_solves"] for row in rows),
-        "seconds": sum(row["seconds"] for row in rows),
-        "seconds_total": time.time() - started,
-    }
-    return record, []
+    )
+    return Outcome(
+        findings=replace(
+            findings,
+            rows=rows,
+            shapes={name: vectors(p.y.reshape(-1, 3)) for name, p in clean.items()},
+            differences=tuple(_difference(sheet, cells, truth) for cells in about.refinements),
+            seconds=sum(row.seconds for row in rows),
+        ),
+        forward_solves=sum(row.forward_solves for row in rows),
+    )
 
 
-def sheet_program(sheet: Sheet, folder: Path, about: Values, *, derivatives: bool) -> ProcessModel:
+def sheet_program(about: ModelsSettings, folder: Path, *, derivatives: bool) -> ProcessModel:
     """The scikit-fem sheet as a program of its own.
 
     Parameters
     ----------
-    sheet : Sheet
+    about : ModelsSettings
     folder : Path
         Where its runs are kept.
-    about : mapping
-        ``time_limit_s``, ``relative_step`` and ``processes``.
     derivatives : bool
-        Whether the program tells its exact derivatives.
+        Whether the program gives its exact derivatives.
     """
     # The package itself, wherever the program is started.
     places = [str(Path(mvest.__file__).resolve().parent.parent), os.environ.get("PYTHONPATH", "")]
     command = Command(
         (sys.executable, "-m", "experiments.studies.models.sheet.solver", "{request}", "{folder}"),
         {"PYTHONPATH": os.pathsep.join(filter(None, places))},
-        about["time_limit_s"],
+        about.time_limit_s,
     )
     return ProcessModel(
         command,
         folder,
         PARAMETERS,
-        len(sheet.points),
+        len(about.sheet.points),
         units=("MPa", "MPa"),
-        points=sheet.points,
-        settings={"sheet": asdict(sheet), "law": "biot", "derivatives": derivatives},
-        differences=Differences("central", about["relative_step"], processes=about["processes"]),
+        points=about.sheet.points,
+        settings={"sheet": asdict(about.sheet), "law": "biot", "derivatives": derivatives},
+        differences=Differences("central", about.relative_step, processes=about.processes),
         reuse=False,
     )
 
 
 def _estimate(
     data: str, y: FloatArray, name: str, model: ObservationModel, problem: SheetProblem
-) -> dict[str, Any]:
-    """Moduli that one model finds in the data of one code."""
+) -> Row:
+    """Moduli that one model estimates from the data of one code."""
     print(f"{name} from data of {data}", file=sys.stderr, flush=True)
-    runs = model.runs if isinstance(model, ProcessModel) else None
+    runs = model.runs if isinstance(model, ProcessModel) else 0
     began = time.perf_counter()
     with SolveBar(name, 0, TYPICAL_SOLVES, PARAMETERS) as bar:
         found = problem.filter(
@@ -157,104 +161,52 @@ def _estimate(
             transform=problem.transform,
             on_iterate=bar.iterate,
         )
-    row: dict[str, Any] = {
-        "data": data,
-        "model": name,
-        "converged": found.converged,
-        "reason": found.reason.value,
-        "estimate": found.mean.tolist(),
-        "std": found.std.tolist(),
-        "relative_error": (found.mean / problem.truth - 1.0).tolist(),
-        "residual_mm": None
-        if found.prediction is None
-        else float(np.sqrt(np.mean((y - found.prediction.y) ** 2))),
-        "iterations": found.iterations,
-        "forward_solves": found.forward_solves,
-        "program_runs": None,
-        "seconds": time.perf_counter() - began,
-        "iterates": found.iterates.tolist(),
-    }
-    if isinstance(model, ProcessModel) and runs is not None:
-        row["program_runs"] = model.runs - runs
-    return row
+    return Row(
+        data=data,
+        model=name,
+        converged=found.converged,
+        reason=found.reason.value,
+        estimate=tuple(found.mean.tolist()),
+        std=tuple(found.std.tolist()),
+        relative_error=tuple((found.mean / problem.truth - 1.0).tolist()),
+        residual_mm=found.residual_rms(y),
+        iterations=found.iterations,
+        forward_solves=found.forward_solves,
+        program_runs=model.runs - runs if isinstance(model, ProcessModel) else None,
+        seconds=time.perf_counter() - began,
+        iterates=vectors(found.iterates),
+    )
 
 
-def _difference(sheet: Sheet, cells: list[int], truth: FloatArray) -> dict[str, Any]:
+def _difference(sheet: Sheet, cells: tuple[int, ...], truth: FloatArray) -> Difference:
     """How far apart the codes are on one mesh, at the true moduli."""
     along, across, layers = cells
     finer = replace(sheet, cells=(along, across), layers=layers)
     print(f"both codes on {along} x {across} x {layers} cells", file=sys.stderr, flush=True)
     second, alike = SecondSheet(finer)(truth), SecondSheet(finer, thickness_points=2)(truth)
-    return {
-        "cells": list(cells),
-        "hex18": _apart(OwnSheet(finer)(truth), second),
-        "hex27": _apart(OwnSheet(finer, "hex27")(truth), alike),
-        "st_venant_kirchhoff": _apart(SecondSheet(finer, "st_venant_kirchhoff")(truth), second),
-    }
+    return Difference(
+        tuple(cells),
+        _apart(OwnSheet(finer)(truth), second),
+        _apart(OwnSheet(finer, "hex27")(truth), alike),
+        _apart(SecondSheet(finer, "st_venant_kirchhoff")(truth), second),
+    )
 
 
-def _apart(one: Prediction, other: Prediction) -> dict[str, float] | None:
-    """Distances of the points (mm), and of the derivatives relative to their size."""
+def _apart(one: Prediction, other: Prediction) -> Apart | None:
+    """Distances of the points, and of the derivatives."""
     if not (one.converged and other.converged):
         return None
     distance = np.linalg.norm((one.y - other.y).reshape(-1, 3), axis=1)
     change = np.linalg.norm(one.jacobian - other.jacobian) / np.linalg.norm(other.jacobian)
-    return {
-        "rms_mm": float(np.sqrt(np.mean(distance**2))),
-        "max_mm": float(distance.max()),
-        "derivatives": float(change),
-    }
-
-
-def _record(
-    config: Values, config_hash: str, sheet: Sheet, truth: FloatArray, started: float
-) -> dict[str, Any]:
-    try:
-        import skfem
-
-        library: str | None = skfem.__version__
-    except ImportError:
-        library = None
-    return {
-        "schema": 1,
-        **{key: config[key] for key in ("title", "row", "table", "parameters")},
-        "experiment": config["name"],
-        "status": "converged",
-        "reason": "completed",
-        "detail": "",
-        "truth": truth.tolist(),
-        "initial": list(config["filter"]["initial"]),
-        "noise_mm": config["observation"]["noise_mm"],
-        **dict.fromkeys(
-            ("estimate", "std", "relative_error", "iterates", "iterate_std", "distance_mm",
-             "distance_to_truth_mm", "moduli_error_percent")
-        ),
-        "iterations": 0,
-        "forward_solves": 0,
-        "seconds": 0.0,
-        "seconds_total": time.time() - started,
-        "rows": [],
-        "differences": [],
-        "shapes": {},
-        "sheet": asdict(sheet),
-        "library": {"scikit-fem": library},
-        "mesh": {},
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": hash_of_data(asdict(sheet)),
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }  # fmt: skip
+    return Apart(float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(change))
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_models),
-    words=lambda record: models_text(flat(record)),
-    write=each(write_models_tables),
+    findings=Findings,
+    run=run_models,
+    words=models_text,
+    write=write_models,
     sections=(
         Section(
             "models",

@@ -6,35 +6,44 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.build import Twin, build_twin
+from experiments.common.build import Twin, build_filter, build_twin
 from experiments.common.estimate_record import (
-    make_record,
-    measure_frames,
-    repeat_entry,
-    write_fields,
+    identified_of,
+    innovation_of,
+    moduli_error,
+    moduli_of,
+    seed_run,
 )
+from experiments.common.estimates import Paper
 from experiments.common.expectation import TwinExpectation
-from experiments.common.plain import Plain, flat, plain_run
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.study import Section, Study
-from experiments.studies.twin.publish import (
-    require_twin,
+from experiments.common.record import Mesh, Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.twin.findings import Findings
+from experiments.studies.twin.report import (
     table1_answer,
-    text_table_of,
+    text_table,
     write_twin,
     write_twin_run,
 )
 from experiments.studies.twin.settings import Settings
 from mvest.closure.model import ClosureModel
+from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.estimation.noise import observation_noise
 from mvest.estimation.wrappers import SharedStart
-from mvest.observation.vertices import observed_frames
+from mvest.files import write_atomically
+from mvest.observation.vertices import Observation, observed_frames
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.measure.annulus import annulus_plane
+from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
 
 __all__ = ["STUDY", "run_twin"]
 
@@ -44,57 +53,54 @@ LOCKING = (
 )
 
 
-def run_twin(
-    config: Mapping[str, Any], config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """A synthetic study: the record, and the figures written to ``folder``."""
-    from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
-
-    twin = build_twin(config)
+def run_twin(job: Job[Settings]) -> Outcome[Findings]:
+    """Simulate an observation for each seed and estimate from it; the arrays of the first."""
+    values = job.values
+    twin = build_twin(values)
     if twin.model.mesh.element_type == "tet4":
         print(LOCKING, file=sys.stderr)
     began = time.perf_counter()
-    seeds = range(config["seed"], config["seed"] + config["repeats"])
+    seeds = range(values["seed"], values["seed"] + values["repeats"])
     results = _estimate_twin(twin, seeds)
     result = results[0]
-    confirmed = _confirm(twin, result) if config["confirm"] else None
+    confirmed = _confirm(twin, result) if values["confirm"] else None
     computing = time.perf_counter() - began
+    if values["figures"] and result.fitted is not None:
+        _write_fields(job.folder / "fields.npz", twin.valve.surface, result)
+    repeats = tuple(seed_run(s, r) for s, r in zip(seeds, results, strict=True))
+    first, paper = repeats[0], values["paper"]
     mesh = twin.model.mesh
-    closure = None
-    if config["measure"] and result.fitted is not None:
-        thickness = float(twin.valve.surface.thickness.mean())
-        reach = twin.model.settings.contact.activation_distance * thickness
-        closure = measure_frames(twin.valve, result, reach)
-    record = make_record(
-        result,
-        config,
-        config_hash=config_hash,
-        meshes={
-            "sha256": mesh.sha256,
-            "nodes": len(mesh.nodes),
-            "elements": len(mesh.elements),
-            "truth_sha256": twin.truth_model.mesh.sha256,
-        },
-        closure=closure,
-        truth_values=twin.truth_values,
-        started=started,
+    findings = Findings(
+        paper=paper and Paper(**paper),
+        truth=tuple(twin.truth_values.tolist()),
+        initial=tuple(values["filter"]["initial"]),
+        estimate=first.estimate,
+        std=first.std,
+        relative_error=first.relative_error,
+        moduli=moduli_of(result),
+        moduli_error_percent=moduli_error(result),
+        distance_mm=first.distance_mm,
+        distance_to_truth_mm=first.distance_to_truth_mm,
+        closure=_measured(twin, result) if values["measure"] else None,
+        iterations=first.iterations or 0,
+        seconds=result.seconds,
+        iterates=first.iterates,
+        iterate_std=first.iterate_std,
+        innovation=innovation_of(result.filtered),
+        identifiability=identified_of(result),
+        repeats=repeats,
+        confirmed_mm=confirmed,
+        seconds_computing=computing,
+        truth_store="hit" if twin.source.counts.hits else "miss",
     )
-    record["repeats"] = [repeat_entry(s, r) for s, r in zip(seeds, results, strict=True)]
-    record["confirmed_mm"] = confirmed
-    record["seconds_computing"] = computing
-    record["truth_store"] = "hit" if twin.source.counts.hits else "miss"
-    if confirmed is not None:
-        record["forward_solves"] += 1
-    files: list[Path] = []
-    if not config["figures"]:
-        return record, files
-    if record["iterates"]:
-        files += save_figure(folder / "iterates", iterates_figure(record), record)
-    if result.fitted is not None:
-        fields = folder / "fields.npz"
-        write_fields(fields, twin.valve.surface, result)
-        files += save_figure(folder / "valve", valve_figure(fields), record)
-    return record, files
+    return Outcome(
+        findings=findings,
+        status=first.status,
+        reason=result.reason,
+        detail=result.detail,
+        mesh=Mesh(mesh.sha256, len(mesh.nodes), len(mesh.elements), twin.truth_model.mesh.sha256),
+        forward_solves=(first.forward_solves or 0) + (confirmed is not None),
+    )
 
 
 def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
@@ -145,15 +151,77 @@ def _confirm(twin: Twin, result: StudyResult) -> float | None:
     return float(np.linalg.norm(last - result.fitted[-1], axis=1).max())
 
 
+def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements | str] | None:
+    """Measurements of each fitted frame, or why they could not be taken."""
+    if result.observation is None or result.fitted is None:
+        return None
+    valve, surface = twin.valve, twin.valve.surface
+    reach = twin.model.settings.contact.activation_distance * float(surface.thickness.mean())
+    first = np.unique(surface.triangles[surface.region == 0])
+    measured: dict[str, ClosureMeasurements | str] = {}
+    for frame, points in zip(result.observation.frames, result.fitted, strict=True):
+        annulus = points[valve.annulus]
+        anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
+        try:
+            measured[frame] = measure_closure(
+                points,
+                surface.triangles,
+                surface.region,
+                surface.thickness,
+                annulus,
+                annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior),
+                reach,
+            )
+        except MvestError as error:
+            # An estimate is not lost because the valve's shape defies a measurement.
+            measured[frame] = str(error)
+    return measured
+
+
+def _write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> None:
+    """The observed and the fitted frames as compressed arrays."""
+    assert isinstance(result.observation, Observation)
+    assert result.fitted is not None
+    arrays: dict[str, Any] = {
+        "triangles": surface.triangles.astype(np.int32),
+        "region": surface.region.astype(np.int8),
+        "rest": surface.vertices.astype(np.float32),
+        "observed": result.observation.positions.astype(np.float32),
+        "fitted": result.fitted.astype(np.float32),
+        "distance": np.asarray(result.distance, dtype=np.float64),
+    }
+    write_atomically(path, partial(np.savez_compressed, **arrays))
+
+
 def _steps(model: ClosureModel) -> Sequence[object]:
     return model.settings.protocol.steps()
 
 
+def require_twin(values: Mapping[str, Any]) -> None:
+    """Refuse settings of filter and observation that no job could run with.
+
+    Raises
+    ------
+    ConfigurationError
+        If a setting is inadmissible; the message names it.
+    """
+    build_filter(values["filter"], tuple(values["parameters"]))
+    variance = values["filter"]["R"]
+    try:
+        observation_noise(np.atleast_1d(np.asarray(variance, dtype=float)), np.size(variance))
+    except (InputError, TypeError, ValueError) as error:
+        text = str(error) if isinstance(error, MvestError) else "expected a number or numbers"
+        raise ConfigurationError(f"filter.R = {variance}: {text}") from error
+    noise = values["observation"]["noise_mm"]
+    if noise < 0:
+        raise ConfigurationError(f"observation.noise_mm = {noise}, expected at least 0")
+
+
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_twin),
-    words=lambda record: text_table_of(flat(record)),
+    findings=Findings,
+    run=run_twin,
+    words=lambda record: text_table([record]),
     write=write_twin,
     write_run=write_twin_run,
     checks=lambda: (TwinExpectation(),),

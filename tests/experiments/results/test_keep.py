@@ -3,17 +3,15 @@ from typing import Any
 
 import pytest
 
-from experiments.common.record import Record, record_from
 from experiments.results.keep import publish, regenerate
 from experiments.studies.twin.study import STUDY
 from mvest.errors import InputError
-from tests.reporting.records import failed_record, record, stored
+from tests.reporting.records import failed_record, record, twin
 
 
 def kept(results, name: str, data: dict[str, Any]) -> None:
     """Publish a made-up run that left no arrays."""
-    made: Record[dict] = record_from(stored(data), dict, name)
-    publish(STUDY, results, name, made, results / "no such folder")
+    publish(STUDY, results, name, twin(data), results / "no such folder")
 
 
 def test_tables_grow_with_the_records_and_need_nothing_else(tmp_path) -> None:

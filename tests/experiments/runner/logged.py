@@ -3,14 +3,15 @@
 import json
 from pathlib import Path
 
-from experiments.common.plain import flat
+from experiments.common.record import read_data
 from experiments.runner import comparison
+from experiments.runner.compared import compared
 
 
 def logged(folder: Path) -> dict[str, float]:
     """The metrics of a run at its last step; its settings and inputs must be there, too."""
-    record = flat(json.loads((folder / "result.json").read_text()))
-    config = json.loads((folder / "config.json").read_text())
-    assert comparison.parameters(config, record)
+    record = compared(read_data(folder / "result.json"), str(folder))
+    config = read_data(folder / "config.json")
+    assert comparison.parameters(config, record.parameters)
     json.dumps(comparison.inputs(config, record))
     return {name: value for name, value, _ in comparison.metrics(record)}

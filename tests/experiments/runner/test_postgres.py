@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.plain import flat
 from experiments.runner import comparison
+from experiments.runner.compared import compared
 from tests.experiments.runner.test_tracking import make_config, make_job
 from tests.places import ROOT
 
@@ -113,12 +113,12 @@ def test_eight_processes_lose_nothing(server, tmp_path) -> None:
         assert count("select count(*) from runs where status = 'FINISHED'") == runs
         found = connection.execute("select value from tags where key = 'folder'").fetchall()
         assert sorted(name for (name,) in found) == sorted(job.name for job in jobs)
-        config, record = (
+        config, data = (
             json.loads((jobs[0] / name).read_text()) for name in ("config.json", "result.json")
         )
-        record = flat(record)
+        record = compared(data, "the first job")
         for table, column, expected in (
-            ("params", "run_uuid", comparison.parameters(config, record)),
+            ("params", "run_uuid", comparison.parameters(config, record.parameters)),
             ("metrics", "run_uuid", comparison.metrics(record)),
             ("inputs", "destination_id", comparison.inputs(config, record)),
         ):

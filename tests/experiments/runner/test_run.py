@@ -10,26 +10,13 @@ import numpy as np
 import pytest
 
 from experiments import tables
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
+from experiments.studies.twin.findings import Findings
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
 from mvest.files import PREFIX
 from tests.places import ROOT
-
-REQUIRED = {
-    "parameters": list,
-    "truth": list,
-    "estimate": list,
-    "std": list,
-    "relative_error": list,
-    "distance_mm": dict,
-    "reason": str,
-    "iterations": int,
-    "forward_solves": int,
-    "seconds": float,
-    "provenance": dict,
-}
 
 
 @pytest.fixture
@@ -59,20 +46,21 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
     assert finished.returncode == 0, finished.stderr
     assert "E_f.anterior [MPa]" in finished.stdout
     (folder,) = (tmp_path / "outputs" / "debug").iterdir()
-    record = flat(json.loads((folder / "result.json").read_text()))
-    for key, kind in REQUIRED.items():
-        assert isinstance(record[key], kind), key
-    assert record["status"] == "converged"
-    assert set(record["distance_mm"]) == {"mean", "std", "max"}
-    assert max(abs(error) for error in record["relative_error"]) < 1e-4
-    assert len(record["moduli"]) == 6
-    assert (
-        record["closure"]["open"]["orifice_area"] > record["closure"]["closed"]["orifice_area"] > 0
-    )
-    provenance = record["provenance"]
-    assert {"git", "config_hash", "mesh_hash", "seed", "versions", "threads"} <= set(provenance)
-    assert provenance["config_hash"].startswith(folder.name)
-    assert set(provenance["threads"].values()) == {"1"}
+    # Read with its types, every field there.
+    record = read_record(folder / "result.json", Findings)
+    found, provenance = record.findings, record.provenance
+    assert record.converged
+    assert record.parameters == ("E_f.anterior", "E_f.posterior")
+    assert record.reason
+    assert record.forward_solves > found.iterations > 0
+    assert found.seconds > 0
+    assert len(found.truth) == len(found.std) == 2
+    assert found.distance_mm.max >= found.distance_mm.mean
+    assert max(abs(error) for error in found.relative_error) < 1e-4
+    assert len(found.moduli) == 6
+    assert found.closure["open"].orifice_area > found.closure["closed"].orifice_area > 0
+    assert provenance.config_hash.startswith(folder.name)
+    assert set(provenance.threads.values()) == {"1"}
     names = {path.name for path in folder.iterdir()}
     assert {
         "debug.csv",
@@ -90,10 +78,10 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
         tags = dict(database.execute("select key, value from tags").fetchall())
         metrics = dict(database.execute("select key, value from latest_metrics").fetchall())
         settings = dict(database.execute("select key, value from params").fetchall())
-    assert tags["config_hash"] == provenance["config_hash"]
+    assert tags["config_hash"] == provenance.config_hash
     assert tags["status"] == "converged"
     assert {"sweep_id", "git_sha", "mesh_hash"} <= set(tags)
-    assert metrics["estimate.anterior"] == pytest.approx(record["estimate"][0])
+    assert metrics["estimate.anterior"] == pytest.approx(found.estimate[0])
     assert settings["initial.anterior"] == "5.0"
     assert len(list((tmp_path / "outputs" / "mlartifacts").rglob("result.json"))) == 1
 
@@ -197,11 +185,11 @@ def test_a_failing_forward_run_is_recorded(run, tmp_path, instead_of_closing) ->
     assert status == 1
     assert err.startswith("no estimate: no synthetic observation: Newton's method")
     assert "result.json" in err
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
-    assert record["status"] == "failed"
-    assert record["estimate"] is None
-    assert record["distance_mm"] is None
-    assert "Newton" in record["reason"]
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    assert record.status == "failed"
+    assert record.findings.estimate is None
+    assert record.findings.distance_mm is None
+    assert "Newton" in record.reason
     assert "no synthetic observation" in out
     assert not (tmp_path / "published").exists()
     with sqlite3.connect(tmp_path / "outputs" / "mlflow.db") as database:
@@ -217,10 +205,10 @@ def test_a_model_that_fails_on_the_way_is_recorded(run, tmp_path, instead_of_clo
     status, _, err = run("experiment=debug", "hydra.run.dir=here", "tracking.enabled=false")
     assert status == 1
     assert "it buckled" in err
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
-    assert record["forward_solves"] == 1
-    assert record["estimate"] is None
-    assert record["iterates"] == [[5.0, 3.0]]
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    assert record.forward_solves == 1
+    assert record.findings.estimate is None
+    assert record.findings.iterates == ((5.0, 3.0),)
 
 
 def test_the_papers_element_says_what_is_wrong_with_it(run, instead_of_closing) -> None:

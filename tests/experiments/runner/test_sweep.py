@@ -295,8 +295,9 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
-    told = replace(study.STUDY, words=lambda record: f"told: {record.status}")
-    monkeypatch.setattr(study, "STUDY", told)
+    # What the worker's study finds is plain.
+    said = replace(study.STUDY, findings=dict, words=lambda record: f"said: {record.status}")
+    monkeypatch.setattr(study, "STUDY", said)
     alone = ("experiment=debug", "time_limit_s=600", "seed=2")
     Path("raise-2").touch()
     status, _, err = run(*alone)
@@ -304,7 +305,7 @@ def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):
     assert err.startswith("no estimate: RuntimeError: it broke (recorded in ")
     status, out, err = run(*alone)
     assert (status, err) == (0, "")
-    assert out.startswith("told: converged")
+    assert out.startswith("said: converged")
 
 
 def planned(folder: Path, seed: int) -> PlannedJob:

@@ -1,6 +1,8 @@
 """The sweeps' configurations: every job of every size composes, and says what sets it apart."""
 
 import json
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,13 @@ from omegaconf import OmegaConf
 
 from experiments.common.build import build_filter, build_twin
 from experiments.common.config import hash_of, register
+from experiments.common.estimates import SeedRun
+from experiments.common.record import Outcome
+from experiments.common.study import Job
 from experiments.runner.plan import expand, grids
 from experiments.runner.plugins import register_plugins
+from experiments.studies.twin.findings import Findings
+from experiments.studies.twin.settings import Settings
 from experiments.studies.twin.study import run_twin
 from mvest.errors import MvestError
 from tests.places import CONF
@@ -131,33 +138,37 @@ def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration
     assert len(keys) == len(set(keys.values())) == 12
 
 
+def ran(overrides: tuple[str, ...], folder: Path) -> Outcome[Findings]:
+    config_hash, config = composed(*overrides)
+    return run_twin(Job(config, Settings(), folder, config_hash))
+
+
 @pytest.mark.parametrize("name", SWEEPS)
 def test_a_job_of_each_sweep_runs(configuration, tmp_path, name: str) -> None:
     overrides = jobs(name, "small")[-1]
     settings = (*DEBUG, "repeats=2", f"paths.outputs={tmp_path}", "filter.R=1e-4")
-    config_hash, config = composed(f"sweep={name}", *overrides, *settings)
-    record, files = run_twin(config, config_hash, tmp_path, 0.0)
-    assert files == []
-    json.dumps(record, allow_nan=False)
-    assert [entry["seed"] for entry in record["repeats"]] == [config["seed"], config["seed"] + 1]
-    for entry in record["repeats"]:
-        assert np.shape(entry["estimate"]) == np.shape(entry["bound"]) == (2,)
-        assert len(entry["iterates"]) == len(entry["iterate_std"]) == entry["iterations"] + 1
-    first = record["repeats"][0]
-    for key in ("estimate", "std", "relative_error", "distance_mm", "iterates", "reason"):
-        assert first[key] == record[key]
+    job = (f"sweep={name}", *overrides, *settings)
+    outcome = ran(job, tmp_path / "job")
+    assert not (tmp_path / "job").exists(), "nothing is drawn, so nothing is kept to draw"
+    found = outcome.findings
+    json.dumps(asdict(found), allow_nan=False)
+    seed = composed(*job)[1]["seed"]
+    assert [entry.seed for entry in found.repeats] == [seed, seed + 1]
+    for entry in found.repeats:
+        assert np.shape(entry.estimate) == np.shape(entry.bound) == (2,)
+        assert len(entry.iterates) == len(entry.iterate_std) == entry.iterations + 1
+    first = found.repeats[0]
+    for key in ("estimate", "std", "relative_error", "distance_mm", "iterates"):
+        assert getattr(first, key) == getattr(found, key)
+    assert first.reason == outcome.reason
 
 
 def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> None:
     settings = ("sweep=noise", "observation.noise_mm=0.01", *DEBUG, f"paths.outputs={tmp_path}")
 
-    def run(seed: int, repeats: int) -> list[str]:
-        config_hash, config = composed(*settings, f"seed={seed}", f"repeats={repeats}")
-        record, _ = run_twin(config, config_hash, tmp_path, 0.0)
-        untimed = [
-            {k: v for k, v in entry.items() if k != "seconds"} for entry in record["repeats"]
-        ]
-        return [json.dumps(entry) for entry in untimed]
+    def run(seed: int, repeats: int) -> list[SeedRun]:
+        outcome = ran((*settings, f"seed={seed}", f"repeats={repeats}"), tmp_path)
+        return [replace(entry, seconds=None) for entry in outcome.findings.repeats]
 
     together = run(3, 3)
     assert run(4, 1) == together[1:2]

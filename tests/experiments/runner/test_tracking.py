@@ -9,14 +9,15 @@ import subprocess
 import sys
 import time
 import urllib.request
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.common.record import SCHEMA
+from experiments.common.record import SCHEMA, Record
 from experiments.runner import comparison, sync, tracking
+from experiments.runner.compared import Compared, compared
 from experiments.runner.dashboard import last_comparison
 from experiments.runner.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
@@ -62,10 +63,15 @@ def make_config(outputs: Path, **changes) -> dict:
 
 def make_record(config_hash: str = "c" * 64, **changes) -> dict:
     record = {
+        "study": "twin",
         "experiment": "debug",
+        "title": "A quick check",
         "row": "white noise",
+        "table": "debug",
         "status": "converged",
         "reason": "tolerance",
+        "detail": "",
+        "factors": {},
         "parameters": NAMES,
         "estimate": [6.0, 2.0],
         "std": [0.1, 0.05],
@@ -83,13 +89,15 @@ def make_record(config_hash: str = "c" * 64, **changes) -> dict:
             "config_hash": config_hash,
             "mesh_hash": "m" * 64,
             "seed": 1,
-            "git": {"sha": "a" * 40},
+            "git": {"sha": "a" * 40, "dirty": False},
+            **{"versions": {}, "threads": {}, "python": "3.12", "platform": "Linux"},
+            **{"machine": "x86_64", "cpu_count": 2, "finished": "2024-01-01T00:00:00Z"},
         },
     }
     return record | changes
 
 
-HEADER = {"experiment", "row", "status", "reason", "mesh", "model", "provenance"}
+HEADER = {field.name for field in fields(Record)}
 
 
 def written(record: dict) -> str:
@@ -97,6 +105,10 @@ def written(record: dict) -> str:
     header = {key: value for key, value in record.items() if key in HEADER}
     findings = {key: value for key, value in record.items() if key not in HEADER}
     return json.dumps({"schema": SCHEMA, **header, "findings": findings})
+
+
+def comparable(**changes) -> Record[Compared]:
+    return compared(json.loads(written(make_record(**changes))), "made up")
 
 
 def make_job(outputs: Path, name: str = "job", config=None, **changes) -> Path:
@@ -121,7 +133,7 @@ def stored(outputs: Path) -> list:
 def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
     config = make_config(tmp_path)
     config["filter"]["Q"] = [[0.1, 0.0], [0.0, 0.2]]
-    found = comparison.parameters(config, make_record())
+    found = comparison.parameters(config, NAMES)
     assert found["P0"] == "0.01"
     assert (found["initial.anterior"], found["initial.posterior"]) == ("5.0", "3.0")
     assert (found["Q.anterior"], found["Q.posterior"]) == ("0.1", "0.2")
@@ -134,14 +146,14 @@ def test_settings_have_short_names_that_read_as_numbers(tmp_path) -> None:
 
 def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
     runs = [
-        {"seed": 4, "status": "converged", "estimate": [6.0, 2.0], "std": [0.1, 0.1],
+        {"seed": 4, "status": "converged", "reason": "", "estimate": [6.0, 2.0], "std": [0.1, 0.1],
          "relative_error": [-0.04, 0.02], "seconds": 1.0, "forward_solves": 3, "iterations": 2},
-        {"seed": 5, "status": "converged", "estimate": [6.4, 2.0], "std": [0.1, 0.1],
+        {"seed": 5, "status": "converged", "reason": "", "estimate": [6.4, 2.0], "std": [0.1, 0.1],
          "relative_error": [0.02, 0.04], "seconds": 2.0, "forward_solves": 3, "iterations": 4},
-        {"seed": 6, "status": "failed", "estimate": None, "std": None, "relative_error": None,
-         "seconds": 3.0, "forward_solves": 1, "iterations": 0},
+        {"seed": 6, "status": "failed", "reason": "", "estimate": None, "std": None,
+         "relative_error": None, "seconds": 3.0, "forward_solves": 1, "iterations": 0},
     ]  # fmt: skip
-    found = comparison.metrics(make_record(repeats=runs))
+    found = comparison.metrics(comparable(repeats=runs))
     single = {name: value for name, value, _ in found if not name.startswith(("repeat", "iterate"))}
     assert single["error.anterior"] == pytest.approx((4 + 2) / 2)
     assert single["error.mean"] == pytest.approx((4 + 2 + 2 + 4) / 4)
@@ -154,7 +166,7 @@ def test_numbers_of_a_job_are_means_over_its_seeds() -> None:
 
 def test_a_failed_run_has_no_errors() -> None:
     nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
-    record = make_record(status="failed", mesh={}, repeats=[], **nothing)
+    record = comparable(status="failed", mesh=None, repeats=[], **nothing)
     found = {name: value for name, value, _ in comparison.metrics(record)}
     assert found["failed"] == 1
     assert not [name for name in found if name.startswith(("error", "estimate", "distance"))]
@@ -224,7 +236,7 @@ def test_a_run_that_was_cut_short_is_made_anew(tmp_path, monkeypatch) -> None:
 
 def test_a_failed_run_is_told_with_its_reason(tmp_path) -> None:
     nothing = dict.fromkeys(("estimate", "std", "relative_error", "distance_mm", "iterates"))
-    killed = {"status": "failed", "reason": "killed by signal 9", "mesh": {}, "repeats": []}
+    killed = {"status": "failed", "reason": "killed by signal 9", "mesh": None, "repeats": []}
     upload(open_store(None, tmp_path, "debug"), make_job(tmp_path, **killed, **nothing), "s")
     (run,) = stored(tmp_path)
     assert (run.info.status, run.data.tags["reason"]) == ("FAILED", "killed by signal 9")

@@ -1,13 +1,13 @@
 """One's own program from configuration to an estimate, and what is said where it cannot be."""
 
-import json
 import sys
 
 import numpy as np
 import pytest
 
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
+from experiments.studies.external.findings import Findings
 from mvest.external import write_points
 from tests.external.programs import SPRINGS, springs
 
@@ -53,26 +53,26 @@ def run(tmp_path, monkeypatch, capsys):
 def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     status, said = run()
     assert status == 0, said.err
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
+    record = read_record(tmp_path / "here" / "result.json", Findings)
     # Data without noise; the prior's weight is that of 0.01 mm against 3 N/mm, about 1e-3.
-    np.testing.assert_allclose(record["estimate"], M, rtol=2e-3)
+    np.testing.assert_allclose(record.findings.estimate, M, rtol=2e-3)
     # The covariance of least squares, from the derivatives by hand.
     _, H = springs(*M)
     np.testing.assert_allclose(
-        record["std"], NOISE * np.sqrt(np.diagonal(np.linalg.inv(H.T @ H))), rtol=0.02
+        record.findings.std, NOISE * np.sqrt(np.diagonal(np.linalg.inv(H.T @ H))), rtol=0.02
     )
-    program = record["program"]
-    assert program["runs"] == 5 * record["forward_solves"]
-    assert not program["own_jacobian"]
+    program = record.findings.program
+    assert program.runs == 5 * record.forward_solves
+    assert not program.own_jacobian
     names = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"external.csv", "external.md", "iterates.png", "fitted.csv", "done"} <= names
     assert "N/mm" in said.out
     assert "differences of its predictions" in said.out
     # The runs are kept: the same study again starts no program.
     status, said = run()
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
-    assert (status, record["program"]["runs"]) == (0, 0)
-    assert record["program"]["reused"] == program["runs"]
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    assert (status, record.findings.program.runs) == (0, 0)
+    assert record.findings.program.reused == program.runs
 
 
 def test_check_runs_the_program_once_and_compares_its_derivatives(run, tmp_path):
@@ -94,10 +94,10 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     (tmp_path / "solve.py").write_text("import sys; sys.exit('out of licences')")
     status, said = run()
     assert status == 1
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
-    assert record["status"] == "failed"
-    assert "out of licences" in record["detail"]
-    assert record["estimate"] is None
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    assert record.status == "failed"
+    assert "out of licences" in record.detail
+    assert record.findings.estimate is None
     assert "out of licences" in said.err
     status, said = run(check="true")
     assert status == 2

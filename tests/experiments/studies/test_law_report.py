@@ -1,15 +1,14 @@
 """The study of the laws: what its table and figures say, from a record made by hand."""
 
-import copy
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.studies.law.report import curves_figure, law_text, write_law_tables
+from experiments.common.record import read_record, record_from, write_record
+from experiments.studies.law.findings import Findings
+from experiments.studies.law.report import curves_figure, law_text, write_law
 from mvest.errors import InputError
-from mvest.reporting.files import keep_record
+from tests.reporting.records import stored
 
 STRETCH = np.linspace(1.0, 1.2, 5)
 
@@ -25,19 +24,34 @@ def parameter(name, truth, estimate, unit="MPa"):
     }  # fmt: skip
 
 
-RECORD = {
+def sample(seed, estimate, low, high, *, converged=True):
+    return {
+        "seed": seed, "estimate": estimate, "low": low, "high": high, "converged": converged,
+        "forward_solves": 5,
+    }  # fmt: skip
+
+
+DATA = {
+    "schema": 2,
     "experiment": "law",
     "title": "Two laws",
+    "row": "exponential law",
+    "table": "law",
+    "status": "converged",
+    "reason": "completed",
+    "detail": "",
+    "seconds_total": 99.0,
+    "forward_solves": 15,
+    "model": None,
+    "mesh": None,
     "noise_mm": 0.5,
     "chi_square_band": [0.97, 1.03],
     "parameters": ["c0.anterior", "c2.anterior"],
     "truth": [0.06, 1446.5],
-    "repeats": [
-        {"estimate": [0.058, 1300.0], "low": [0.055, 1100.0], "high": [0.0599, 1500.0],
-         "converged": True},
-        {"estimate": [0.061, 1400.0], "low": [0.057, 1200.0], "high": [0.065, 1600.0],
-         "converged": True},
-        {"estimate": [9.0, 9.0], "low": [8.0, 8.0], "high": [9.5, 9.5], "converged": False},
+    "samples": [
+        sample(1, [0.058, 1300.0], [0.055, 1100.0], [0.0599, 1500.0]),
+        sample(2, [0.061, 1400.0], [0.057, 1200.0], [0.065, 1600.0]),
+        sample(3, [9.0, 9.0], [8.0, 8.0], [9.5, 9.5], converged=False),
     ],
     "stretches": {"anterior": {"along": [0.9, 1.0, 1.07], "across": [0.95, 1.1, 1.2]}},
     "fits": [
@@ -80,6 +94,13 @@ RECORD = {
 }  # fmt: skip
 
 
+def record(**changes):
+    return record_from(stored(DATA | changes, "law"), Findings, "made up")
+
+
+RECORD = record()
+
+
 def test_the_table_has_both_fits_and_says_which_did_not_converge():
     text = law_text(RECORD)
     assert "| exponential | c0.anterior (MPa) | 0.06 | 0.03 | 0.0612 | 0.004 | 0.003 |" in text
@@ -100,15 +121,15 @@ def test_repeats_are_counted_without_those_that_gave_no_estimate():
 
 
 def test_published_files_come_out_of_the_record_again(tmp_path):
-    keep_record(tmp_path / "results", RECORD)
-    written = write_law_tables(tmp_path / "results", RECORD)
+    (tmp_path / "results").mkdir()
+    written = write_law(tmp_path / "results", {"law": RECORD}, {})
     names = {path.name for path in written}
     assert {"law.csv", "law.md", "law.png", "law.pdf", "law_biaxial.png"} <= names
     table = pd.read_csv(tmp_path / "results" / "law.csv")
     assert list(table.parameter) == ["c0.anterior", "c2.anterior", "E_f.anterior"]
     assert table.chi_square_per_number.tolist() == [0.996, 0.996, 1.44]
-    stored = json.loads((tmp_path / "results" / "law.json").read_text())
-    again = write_law_tables(tmp_path, stored)
+    write_record(tmp_path / "law.json", RECORD)
+    again = write_law(tmp_path, {"law": read_record(tmp_path / "law.json", Findings)}, {})
     for path in again:
         if path.suffix in (".csv", ".md"):
             assert path.read_text() == (tmp_path / "results" / path.name).read_text()
@@ -116,24 +137,22 @@ def test_published_files_come_out_of_the_record_again(tmp_path):
 
 
 def test_the_figure_shows_truth_estimates_band_and_what_was_seen():
-    along, across = curves_figure(RECORD).axes
+    along, across = curves_figure(RECORD.findings).axes
     for k, axes in enumerate((along, across)):
         lines = {line.get_label().split(",")[0]: line.get_ydata() for line in axes.get_lines()}
         assert set(lines) == {"truth", "exponential law", "linear law"}
         np.testing.assert_allclose(lines["truth"], np.array(curve(1.0))[:, k])
         np.testing.assert_allclose(lines["linear law"], np.array(curve(2.0))[:, k])
-        seen = RECORD["stretches"]["anterior"]["along" if k == 0 else "across"]
+        stretches = RECORD.findings.stretches["anterior"]
+        seen = stretches.along if k == 0 else stretches.across
         assert axes.patches[0].get_x() == seen[0]
         assert axes.patches[0].get_width() == pytest.approx(seen[2] - seen[0])
     assert "across" in across.get_title()
 
 
 def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
-    record = copy.deepcopy(RECORD) | {
-        "fits": [], "curves": {}, "stretches": {}, "chi_square_band": None,
-        "repeats": [],
-    }  # fmt: skip
-    names = {path.name for path in write_law_tables(tmp_path, record)}
+    bare = record(fits=[], curves={}, stretches={}, chi_square_band=None, samples=[])
+    names = {path.name for path in write_law(tmp_path, {"law": bare}, {})}
     assert "law.md" in names
     assert "law.png" not in names
 
@@ -141,4 +160,4 @@ def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        keep_record(tmp_path / "file", RECORD)
+        write_law(tmp_path / "file", {"law": RECORD}, {})

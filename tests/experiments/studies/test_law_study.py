@@ -1,13 +1,13 @@
 """The study of the material laws in a size that takes seconds."""
 
-import json
 import sys
 
 import numpy as np
 import pytest
 
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
+from experiments.studies.law.findings import Findings
 
 SMALL = (
     "experiment=law",
@@ -46,7 +46,7 @@ def run(tmp_path, monkeypatch, capsys):
         status = main()
         folder = tmp_path / "here"
         file = folder / "result.json"
-        record = flat(json.loads(file.read_text())) if file.is_file() else None
+        record = read_record(file, Findings) if file.is_file() else None
         return status, record, folder, capsys.readouterr()
 
     return call
@@ -55,27 +55,29 @@ def run(tmp_path, monkeypatch, capsys):
 def test_the_study_fits_both_laws_to_the_same_data(run):
     status, record, folder, said = run()
     assert status == 0, said.err
-    own, other = record["fits"]
-    assert (own["law"], other["law"]) == ("exponential", "linear")
-    for p in own["parameters"]:
-        assert abs(p["estimate"] - p["truth"]) < 4 * p["std"], p
+    found = record.findings
+    own, other = found.fits
+    assert (own.law, other.law) == ("exponential", "linear")
+    for p in own.parameters:
+        assert abs(p.estimate - p.truth) < 4 * p.std, p
         # A wide prior adds next to nothing to what the data say.
-        assert p["std"] == pytest.approx(p["bound"], rel=0.1)
-    # The linear law has no true values, nor is it told any.
-    assert [p["truth"] for p in other["parameters"]] == [None, None]
-    assert [p["name"] for p in other["parameters"]] == ["E_f.anterior", "E_f.posterior"]
-    assert own["distance_mm"]["mean"] < other["distance_mm"]["mean"]
-    # The first repeat is the fit itself, and the second saw other errors.
-    first, second = (r["estimate"] for r in record["repeats"])
-    assert first == pytest.approx([p["estimate"] for p in own["parameters"]], rel=1e-6)
+        assert p.std == pytest.approx(p.bound, rel=0.1)
+    # The linear law has no true values, nor is it given any.
+    assert [p.truth for p in other.parameters] == [None, None]
+    assert [p.name for p in other.parameters] == ["E_f.anterior", "E_f.posterior"]
+    assert own.distance_mm.mean < other.distance_mm.mean
+    # The first sample is the fit itself, and the second saw other errors.
+    first, second = (sample.estimate for sample in found.samples)
+    assert first == pytest.approx([p.estimate for p in own.parameters], rel=1e-6)
     assert first != second
-    low, high = record["chi_square_band"]
-    assert low < own["chi_square"] < high
-    for curves in record["curves"].values():
-        band = [np.array(curves["exponential"][k]) for k in ("low", "estimate", "high")]
+    low, high = found.chi_square_band
+    assert low < own.chi_square < high
+    for curves in found.curves.values():
+        law = curves.exponential
+        band = [np.array(side) for side in (law.low, law.estimate, law.high)]
         assert np.all(band[0] <= band[1] + 1e-9)
         assert np.all(band[1] <= band[2] + 1e-9)
-        assert np.array(curves["truth"]).shape == (len(curves["stretch"]), 2)
+        assert np.array(curves.truth).shape == (len(curves.stretch), 2)
     names = {path.name for path in folder.iterdir()}
     assert {"law.csv", "law.md", "law.png", "law_biaxial.png", "result.json"} <= names
     # Both fits say how they go on.

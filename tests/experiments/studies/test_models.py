@@ -1,14 +1,15 @@
 """The study of the sheet in two codes, in a size that takes seconds: record, tables, figure."""
 
-import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
-from experiments.studies.models.report import models_text, write_models_tables
+from experiments.studies.models.findings import Findings
+from experiments.studies.models.report import models_text, write_models
 from experiments.studies.models.study import OTHER_LAW, OWN, PROGRAM, PROGRAM_ALONE, SECOND
 from tests.experiments.runner.logged import logged
 
@@ -38,48 +39,51 @@ def done(tmp_path_factory):
         patch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)
         patch.setattr(sys, "argv", ["experiments.run", *SMALL])
         assert main() == 0
-    return flat(json.loads((folder / "here" / "result.json").read_text())), folder / "here"
+    return read_record(folder / "here" / "result.json", Findings), folder / "here"
 
 
 def test_every_model_estimates_from_the_data(done):
     record, folder = done
     assert logged(folder)["failed"] == 0
-    found = {(row["data"], row["model"]): row for row in record["rows"]}
+    truth = record.findings.truth
+    found = {(row.data, row.model): row for row in record.findings.rows}
     assert set(found) == {
         *((OWN, model) for model in (OWN, SECOND, OTHER_LAW, PROGRAM, PROGRAM_ALONE)),
         *((SECOND, model) for model in (OWN, SECOND, OTHER_LAW)),
     }
-    assert all(row["converged"] for row in record["rows"])
+    assert all(row.converged for row in record.findings.rows)
     # Each code finds the truth in its own data, to its standard deviations; not by hard-coding: the
     # errors of 1 micrometre are seen.
     for code in (OWN, SECOND):
         row = found[code, code]
-        error = (np.array(row["estimate"]) - record["truth"]) / np.array(row["std"])
+        error = (np.array(row.estimate) - truth) / np.array(row.std)
         assert np.all(np.abs(error) < 4)
         assert np.all(error != 0)
     # A program is the library behind files, and its differences are derivatives.
-    second = found[OWN, SECOND]["estimate"]
+    second = found[OWN, SECOND].estimate
     # Another process may add up in another order.
-    np.testing.assert_allclose(found[OWN, PROGRAM]["estimate"], second, rtol=1e-12)
-    np.testing.assert_allclose(found[OWN, PROGRAM_ALONE]["estimate"], second, rtol=1e-3)
-    assert found[OWN, PROGRAM]["program_runs"] == found[OWN, PROGRAM]["forward_solves"]
+    np.testing.assert_allclose(found[OWN, PROGRAM].estimate, second, rtol=1e-12)
+    np.testing.assert_allclose(found[OWN, PROGRAM_ALONE].estimate, second, rtol=1e-3)
+    assert found[OWN, PROGRAM].program_runs == found[OWN, PROGRAM].forward_solves
     alone = found[OWN, PROGRAM_ALONE]
-    assert alone["program_runs"] == 5 * alone["forward_solves"]
+    assert alone.program_runs == 5 * alone.forward_solves
     # Another law is another model, and gives other moduli.
-    other = np.array(found[SECOND, OTHER_LAW]["estimate"]) / record["truth"]
+    other = np.array(found[SECOND, OTHER_LAW].estimate) / truth
     assert np.abs(other - 1).max() > 0.03
 
 
 def test_the_tables_and_the_figure_follow_from_the_record(done, tmp_path):
     record, folder = done
-    names = {path.name for path in write_models_tables(tmp_path, record)}
+    names = {path.name for path in write_models(tmp_path, {"models": record}, {})}
     assert names == {"models.csv", "models.md", "models.png", "models.pdf"}
     assert names <= {path.name for path in folder.iterdir()}
     assert (tmp_path / "models.csv").read_text() == (folder / "models.csv").read_text()
     text = models_text(record)
     assert text.count("\n| scikit-fem | ") == 3
     assert "| 2 × 2 × 1 |" in text
-    nothing = models_text(record | {"rows": [], "reason": "it buckled"})
+    nothing = models_text(
+        replace(record, findings=replace(record.findings, rows=()), reason="it buckled")
+    )
     assert nothing == "No estimate: it buckled."
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from experiments.studies.models.settings import ModelsSettings
 from experiments.studies.models.sheet.second import SecondSheet
 from experiments.studies.models.sheet.sheet import PARAMETERS, Sheet
 from experiments.studies.models.sheet.solver import main
@@ -13,18 +14,18 @@ pytest.importorskip("skfem")
 
 TINY = Sheet(cells=(2, 2), observed=(2, 3), load_steps=2)
 M = np.array([4.0, 1.5])
-ABOUT = {"time_limit_s": 60.0, "relative_step": 1e-3, "processes": 2}
+ABOUT = ModelsSettings(sheet=TINY, time_limit_s=60.0, relative_step=1e-3, processes=2)
 
 
 def test_the_program_predicts_what_the_library_predicts(tmp_path):
     expected = SecondSheet(TINY)(M)
-    program = sheet_program(TINY, tmp_path, ABOUT, derivatives=True)
-    told = program(M)
-    assert told.converged, told.reason
+    program = sheet_program(ABOUT, tmp_path, derivatives=True)
+    answer = program(M)
+    assert answer.converged, answer.reason
     # Another process may add up in another order; files that lose digits would show at 1e-7.
-    np.testing.assert_allclose(told.y, expected.y, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(told.jacobian, expected.jacobian, rtol=1e-10, atol=1e-12)
-    alone = sheet_program(TINY, tmp_path, ABOUT, derivatives=False)
+    np.testing.assert_allclose(answer.y, expected.y, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(answer.jacobian, expected.jacobian, rtol=1e-10, atol=1e-12)
+    alone = sheet_program(ABOUT, tmp_path, derivatives=False)
     found = alone(M)
     assert (program.runs, alone.runs) == (1, 5)
     # Central differences of a relative step s err by about s^2.

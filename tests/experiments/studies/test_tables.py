@@ -3,8 +3,18 @@ import io
 import pandas as pd
 import pytest
 
-from experiments.studies.twin.tables import frame, readable, text_table, write_tables
-from tests.reporting.records import failed_record, record
+from experiments.studies.twin.report import frame, readable, text_table, write_tables
+from tests.reporting.records import failed_record as failed_data
+from tests.reporting.records import record as data
+from tests.reporting.records import twin
+
+
+def record(**changes):
+    return twin(data(**changes))
+
+
+def failed_record(**changes):
+    return twin(failed_data(**changes))
 
 
 def test_our_row_stands_below_the_papers() -> None:

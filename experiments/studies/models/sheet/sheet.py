@@ -1,4 +1,4 @@
-"""A thin sheet, clamped at three of its sides and pressed from below: what the two codes are told.
+"""A thin sheet, clamped at three of its sides and pressed from below: what both codes are given.
 
 The sheet occupies ``[0, length] x [0, width] x [0, thickness]``. The sides x = 0, y = 0 and
 y = width are clamped, the side x = length is free, as a leaflet hangs on its annulus and ends in a

@@ -3,7 +3,7 @@
 Started as ``python -m experiments.studies.models.sheet.solver REQUEST FOLDER``.
 
 Reads a request of :mod:`mvest.external` whose settings name the sheet, its law and whether its
-derivatives are to be told, and writes the answer into the folder.
+derivatives are wanted, and writes the answer into the folder.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         request, folder = read_request(Path(given[0])), Path(given[1])
         model = SecondSheet(sheet_of(request), str(request.settings["law"]))
-        told = request.jacobian and request.settings["derivatives"]
+        wanted = request.jacobian and request.settings["derivatives"]
         prediction = model(np.array(request.values))
-        write_answer(folder, prediction, request.names if told else None)
+        write_answer(folder, prediction, request.names if wanted else None)
     except MvestError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

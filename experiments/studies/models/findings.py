@@ -1,0 +1,111 @@
+"""Findings of the sheet in two finite-element codes, with p moduli in MPa."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from experiments.common.estimates import Vector
+from experiments.studies.models.sheet.sheet import Sheet
+
+__all__ = ["Apart", "Difference", "Findings", "Row"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What one model estimates from the data of one code.
+
+    Attributes
+    ----------
+    data, model : str
+        The code, and the model of the filter.
+    converged : bool
+    reason : str
+    estimate, std, relative_error : (p,)
+    residual_mm : float or None
+        Root mean square.
+    iterations, forward_solves : int
+    program_runs : int or None
+        Where the model is a program.
+    seconds : float
+    iterates : (i, p)
+    """
+
+    data: str
+    model: str
+    converged: bool
+    reason: str
+    estimate: Vector
+    std: Vector
+    relative_error: Vector
+    residual_mm: float | None
+    iterations: int
+    forward_solves: int
+    program_runs: int | None
+    seconds: float
+    iterates: tuple[Vector, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far apart two predictions of the same points are.
+
+    Attributes
+    ----------
+    rms_mm, max_mm : float
+    derivatives : float
+        Relative to their size.
+    """
+
+    rms_mm: float
+    max_mm: float
+    derivatives: float
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How far others are from scikit-fem with the Biot law on one mesh; None where one failed.
+
+    Attributes
+    ----------
+    cells : (3,)
+        Along, across, through the thickness.
+    hex18, hex27, st_venant_kirchhoff : Apart or None
+        This project's solid-shells, its triquadratic bricks, and scikit-fem with another law.
+    """
+
+    cells: tuple[int, ...]
+    hex18: Apart | None
+    hex27: Apart | None
+    st_venant_kirchhoff: Apart | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What the codes differ by, and what each estimates.
+
+    Attributes
+    ----------
+    truth : (p,)
+    noise_mm : float
+        Standard deviation of an observed coordinate.
+    rows : tuple of Row
+        Empty if a code gave no data, as what follows.
+    differences : tuple of Difference
+    shapes : mapping
+        Code -> observed points ``(n, 3)`` mm.
+    sheet : Sheet
+    library : mapping
+        Package -> version.
+    seconds : float
+        Of all estimates.
+    """
+
+    truth: Vector
+    noise_mm: float
+    rows: tuple[Row, ...]
+    differences: tuple[Difference, ...]
+    shapes: Mapping[str, tuple[Vector, ...]]
+    sheet: Sheet
+    library: Mapping[str, str | None]
+    seconds: float
