@@ -17,6 +17,8 @@ from experiments.common.estimates import (
     SeedRun,
     Spread,
     Vector,
+    matrix,
+    vector,
 )
 from mvest.estimation.estimate import Estimate
 from mvest.problem.estimate import StudyResult
@@ -32,8 +34,6 @@ __all__ = [
     "moduli_of",
     "seed_run",
     "spread",
-    "vector",
-    "vectors",
 ]
 
 SCHEMA = 1
@@ -70,7 +70,7 @@ def make_record(
         "table": config["table"],
         "paper": config["paper"],
         "parameters": list(result.parameters),
-        "truth": vector(truth_values),
+        "truth": _known(truth_values),
         "initial": list(config["filter"]["initial"]),
         **{name: run[name] for name in kept},
         "moduli": [asdict(modulus) for modulus in moduli_of(result)],
@@ -108,9 +108,9 @@ def seed_run(seed: int, result: StudyResult) -> SeedRun:
         status="converged" if result.converged else "failed",
         reason=result.reason,
         detail=result.detail,
-        estimate=vector(result.estimate),
-        std=vector(result.std),
-        relative_error=vector(result.relative_error),
+        estimate=_known(result.estimate),
+        std=_known(result.std),
+        relative_error=_known(result.relative_error),
         bound=None if identified is None else identified.cramer_rao_std,
         distance_mm=spread(result.distance),
         distance_to_truth_mm=spread(result.distance_to_truth),
@@ -118,20 +118,14 @@ def seed_run(seed: int, result: StudyResult) -> SeedRun:
         nis_band=None if innovation is None else innovation.nis_band,
         iterations=None if filtered is None else filtered.iterations,
         forward_solves=None if filtered is None else filtered.forward_solves,
-        iterates=None if filtered is None else vectors(filtered.iterates),
-        iterate_std=None if filtered is None else vectors(filtered.iterate_std),
+        iterates=None if filtered is None else matrix(filtered.iterates),
+        iterate_std=None if filtered is None else matrix(filtered.iterate_std),
         seconds=result.seconds,
     )
 
 
-def vector(values: FloatArray | None) -> Vector | None:
-    """Numbers ``(p,)``, if there are any."""
-    return None if values is None else tuple(values.tolist())
-
-
-def vectors(values: FloatArray) -> tuple[Vector, ...]:
-    """Rows ``(i, p)``."""
-    return tuple(map(tuple, values.tolist()))
+def _known(values: FloatArray | None) -> Vector | None:
+    return None if values is None else vector(values)
 
 
 def spread(values: FloatArray | None) -> Spread | None:
@@ -148,7 +142,7 @@ def spread(values: FloatArray | None) -> Spread | None:
 def moduli_of(result: StudyResult) -> tuple[EstimatedModulus, ...]:
     """All moduli that follow from the estimated ones."""
     return tuple(
-        EstimatedModulus(m.region, m.name, m.truth, m.estimate, m.std, m.relative_error)
+        EstimatedModulus(m.region, m.name, m.estimate, m.std, m.truth, m.relative_error)
         for m in result.moduli
     )
 

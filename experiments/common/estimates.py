@@ -5,19 +5,43 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from experiments.common.record import Status
+from mvest.typing import FloatArray
 
 __all__ = [
     "Confounded",
+    "Data",
     "EstimatedModulus",
     "Identified",
     "Innovation",
+    "Matrix",
     "Paper",
     "SeedRun",
     "Spread",
     "Vector",
+    "matrix",
+    "vector",
 ]
 
 Vector = tuple[float, ...]
+Matrix = tuple[Vector, ...]
+
+
+def vector(values: FloatArray) -> Vector:
+    """Numbers ``(n,)`` as a record holds them."""
+    return tuple(values.tolist())
+
+
+def matrix(values: FloatArray) -> Matrix:
+    """Rows ``(m, n)`` as a record holds them."""
+    return tuple(map(tuple, values.tolist()))
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """A recording, and the SHA-256 of its file."""
+
+    citation: str | None
+    sha256: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +67,7 @@ class Paper:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean, standard deviation and largest of some values.
-
-    Attributes
-    ----------
-    mean, std, max : float
-    """
+    """Mean, standard deviation and largest of some values."""
 
     mean: float
     std: float
@@ -62,18 +81,16 @@ class EstimatedModulus:
     Attributes
     ----------
     region, name : str
-    truth : float or None
     estimate : float
-    std : float or None
-    relative_error : float or None
+    std, truth, relative_error : float or None
     """
 
     region: str
     name: str
-    truth: float | None
     estimate: float
     std: float | None
-    relative_error: float | None
+    truth: float | None = None
+    relative_error: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +191,8 @@ class SeedRun:
     nis_band: tuple[float, float] | None = None
     iterations: int | None = None
     forward_solves: int | None = None
-    iterates: tuple[Vector, ...] | None = None
-    iterate_std: tuple[Vector, ...] | None = None
+    iterates: Matrix | None = None
+    iterate_std: Matrix | None = None
     seconds: float | None = None
 
     @property

@@ -7,23 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.common.estimates import SeedRun
+from experiments.common.estimates import Data, SeedRun
 from experiments.common.record import Record, record_from
 from experiments.runner.folder import last_record
 
-__all__ = ["Compared", "Data", "compared", "last_compared"]
+__all__ = ["Compared", "compared", "last_compared"]
 
 SINGLE = ("estimate", "std", "relative_error", "distance_mm", "distance_to_truth_mm",
           "iterations", "iterates", "iterate_std")  # fmt: skip
 """Findings of one estimate that are called as in `SeedRun`."""
-
-
-@dataclass(frozen=True, slots=True)
-class Data:
-    """A recording, by the hash of its file."""
-
-    sha256: str
-    citation: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

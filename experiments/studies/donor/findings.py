@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Rows, Vector
+from experiments.common.estimates import (
+    Data,
+    EstimatedModulus,
+    Identified,
+    Innovation,
+    Matrix,
+    Spread,
+    Vector,
+)
 from experiments.common.record import Status
 
 __all__ = [
-    "Data",
     "Distances",
     "Findings",
-    "Identified",
-    "Innovation",
-    "Modulus",
     "Row",
-    "Spread",
     "Summary",
 ]
 
@@ -74,90 +77,6 @@ class Row:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class Data:
-    """The recording.
-
-    Attributes
-    ----------
-    citation, sha256 : str
-    """
-
-    citation: str
-    sha256: str
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Distances of the vertices of the first fit from the recording, in mm.
-
-    Attributes
-    ----------
-    mean, std, max : float
-    """
-
-    mean: float
-    std: float
-    max: float
-
-
-@dataclass(frozen=True, slots=True)
-class Modulus:
-    """One modulus of a leaflet, estimated or following from one that is.
-
-    Attributes
-    ----------
-    region, name : str
-    estimate : float
-    std : float or None
-    """
-
-    region: str
-    name: str
-    estimate: float
-    std: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class Innovation:
-    """What of the recording the first prediction leaves over, in standard deviations.
-
-    Attributes
-    ----------
-    size : int
-        Numbers of the observation.
-    rms, max_abs : float
-    nis : float
-        Normalised innovation squared.
-    nis_band : (2,)
-        Where 95 % of such values lie.
-    """
-
-    size: int
-    rms: float
-    max_abs: float
-    nis: float
-    nis_band: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Identified:
-    """What the recording alone could tell at best.
-
-    Attributes
-    ----------
-    cramer_rao_std : (p,)
-        None where it determines a modulus not at all.
-    condition_number : float or None
-    flat : tuple of str
-        Combinations that are known badly.
-    """
-
-    cramer_rao_std: tuple[float | None, ...]
-    condition_number: float | None
-    flat: tuple[str, ...]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
     """What the run is for, in numbers; None where a closure is missing.
@@ -194,9 +113,11 @@ class Findings:
     ----------
     estimate, std : (p,) or None
     iterates, iterate_std : (i, p) or None
-    moduli : tuple of Modulus
+    moduli : tuple of EstimatedModulus
     distance_mm : Spread or None
+        Of the vertices of the first fit from the recording.
     innovation : Innovation or None
+        In standard deviations.
     identifiability : Identified or None
     iterations : int
     seconds : float
@@ -213,9 +134,9 @@ class Findings:
 
     estimate: Vector | None
     std: Vector | None
-    iterates: Rows | None
-    iterate_std: Rows | None
-    moduli: tuple[Modulus, ...]
+    iterates: Matrix | None
+    iterate_std: Matrix | None
+    moduli: tuple[EstimatedModulus, ...]
     distance_mm: Spread | None
     innovation: Innovation | None
     identifiability: Identified | None

@@ -18,20 +18,21 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter, mechanics_of
-from experiments.common.findings import finite, vector
+from experiments.common.estimate_record import (
+    identified_of,
+    innovation_of,
+    moduli_of,
+    seed_run,
+)
+from experiments.common.estimates import Data, vector
 from experiments.common.progress import SolveBar
 from experiments.common.record import Mesh, Outcome
 from experiments.common.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.donor.findings import (
-    Data,
     Distances,
     Findings,
-    Identified,
-    Innovation,
-    Modulus,
     Row,
-    Spread,
     Summary,
 )
 from experiments.studies.donor.report import donor_answer, donor_words, write_donor
@@ -213,17 +214,17 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
             fitted=first.fitted[-1],
         )
     recording = donor_file(job.values["paths"]["donor"]).read_bytes()
-    filtered = first.filtered
+    run = seed_run(job.values["seed"], first)
     findings = Findings(
-        estimate=None if first.estimate is None else vector(first.estimate),
-        std=None if first.std is None else vector(first.std),
-        iterates=None if filtered is None else tuple(map(vector, filtered.iterates)),
-        iterate_std=None if filtered is None else tuple(map(vector, filtered.iterate_std)),
-        moduli=tuple(Modulus(m.region, m.name, m.estimate, m.std) for m in first.moduli),
-        distance_mm=_spread(first),
-        innovation=_innovation(first),
-        identifiability=_identified(first),
-        iterations=0 if filtered is None else filtered.iterations,
+        estimate=run.estimate,
+        std=run.std,
+        iterates=run.iterates,
+        iterate_std=run.iterate_std,
+        moduli=moduli_of(first),
+        distance_mm=run.distance_mm,
+        innovation=innovation_of(first.filtered),
+        identifiability=identified_of(first),
+        iterations=run.iterations or 0,
         seconds=sum(row.seconds for row in rows),
         memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         claim=CLAIM,
@@ -240,29 +241,6 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         detail=first.detail,
         mesh=Mesh(study.mesh.sha256, len(study.mesh.nodes), len(study.mesh.elements)),
         forward_solves=sum(row.forward_solves for row in rows),
-    )
-
-
-def _spread(result: StudyResult) -> Spread | None:
-    d = result.distance
-    return None if d is None else Spread(float(d.mean()), float(d.std()), float(d.max()))
-
-
-def _innovation(result: StudyResult) -> Innovation | None:
-    found = None if result.filtered is None else result.filtered.innovation
-    if found is None:
-        return None
-    return Innovation(found.size, found.rms, found.max_abs, found.nis, found.nis_band)
-
-
-def _identified(result: StudyResult) -> Identified | None:
-    found = result.identifiability
-    if found is None:
-        return None
-    return Identified(
-        tuple(map(finite, found.std)),
-        finite(found.condition_number),
-        tuple(found.flat()),
     )
 
 
@@ -368,7 +346,7 @@ def _fit_row(
         closure=name,
         status="converged" if result.converged else "failed",
         reason=result.reason,
-        start=vector(start),
+        start=tuple(start.tolist()),
         estimate=None if result.estimate is None else vector(result.estimate),
         std=None if result.std is None else vector(result.std),
         distance_mm=None if fitted is None else _distances(study, fitted[-1]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.estimates import Innovation, Spread, Vector
+from experiments.common.estimates import Innovation, Matrix, Spread, Vector
 
 __all__ = ["Findings", "Program"]
 
@@ -58,8 +58,8 @@ class Findings:
     prior_std: Vector
     estimate: Vector | None
     std: Vector | None
-    iterates: tuple[Vector, ...]
-    iterate_std: tuple[Vector, ...]
+    iterates: Matrix
+    iterate_std: Matrix
     distance_mm: Spread | None
     innovation: Innovation | None
     iterations: int

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
-from experiments.common.estimate_record import innovation_of, spread, vector, vectors
+from experiments.common.estimate_record import innovation_of, spread
+from experiments.common.estimates import matrix, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
 from experiments.common.schema import build
@@ -190,12 +191,12 @@ def run_external(job: Job[Settings]) -> Outcome[Findings]:
     known = estimate.converged
     findings = Findings(
         units=model.units,
-        initial=tuple(estimate.prior.mean.tolist()),
-        prior_std=tuple(estimate.prior.std.tolist()),
+        initial=vector(estimate.prior.mean),
+        prior_std=vector(estimate.prior.std),
         estimate=vector(estimate.mean) if known else None,
         std=vector(estimate.std) if known else None,
-        iterates=vectors(estimate.iterates),
-        iterate_std=vectors(estimate.iterate_std),
+        iterates=matrix(estimate.iterates),
+        iterate_std=matrix(estimate.iterate_std),
         distance_mm=spread(distance),
         innovation=innovation_of(estimate),
         iterations=estimate.iterations,

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from experiments.common.estimates import Vector
+from experiments.common.estimates import Matrix, Vector
 
 __all__ = ["Band", "Curves", "Distance", "Excised", "Findings", "Fit", "Parameter", "Sample",
            "Stretches"]  # fmt: skip
-
-Curve = tuple[Vector, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +108,9 @@ class Band:
     estimate, low, high : (n, 2)
     """
 
-    estimate: Curve
-    low: Curve
-    high: Curve
+    estimate: Matrix
+    low: Matrix
+    high: Matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +125,9 @@ class Curves:
     """
 
     stretch: Vector
-    truth: Curve
+    truth: Matrix
     exponential: Band
-    linear: Curve
+    linear: Matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +160,7 @@ class Excised:
     """
 
     stretch: Vector
-    stress: Curve
+    stress: Matrix
     slope_at_rest: float
     slope: float | None
     reached: tuple[float | None, ...]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_twin
-from experiments.common.estimate_record import vectors
+from experiments.common.estimates import matrix, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -68,7 +68,7 @@ def run_law_study(job: Job[Settings]) -> Outcome[Findings]:
     twin, linear = build_twin(values), build_twin(_linear(values, settings))
     seed, mesh = values["seed"], twin.model.mesh
     findings = Findings(
-        truth=tuple(twin.truth_values.tolist()),
+        truth=vector(twin.truth_values),
         noise_mm=values["observation"]["noise_mm"],
         excised=_excised(settings.excised),
     )
@@ -148,7 +148,7 @@ def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Stretches]:
     for k, region in enumerate(model.mesh.region_names):
         own = np.sqrt(1 + 2 * green[model.mesh.region == k][:, :, :2].reshape(-1, 2))
         quantiles = np.percentile(own, [5, 50, 95], axis=0)
-        found[region] = Stretches(*vectors(quantiles.T))
+        found[region] = Stretches(*matrix(quantiles.T))
     return found
 
 
@@ -206,7 +206,7 @@ def _samples(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> tuple[Samp
             assert data.observation is not None
             filtered = estimate(problem, data.observation, on_iterate=bar.iterate).filtered
             assert filtered is not None
-            mean, low, high = vectors(np.stack([filtered.mean, *filtered.interval()]))
+            mean, low, high = matrix(np.stack([filtered.mean, *filtered.interval()]))
             samples.append(
                 Sample(seed, mean, low, high, filtered.converged, filtered.forward_solves)
             )
@@ -235,10 +235,10 @@ def _curves(
         low, high = np.percentile(many, [2.5, 97.5], axis=0)
         estimated = biaxial_stress(_law(model, exponential.mean), stretches, k)
         found[region] = Curves(
-            tuple(CURVE.tolist()),
-            vectors(biaxial_stress(_law(model, truth), stretches, k)),
-            Band(vectors(estimated), vectors(low), vectors(high)),
-            vectors(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
+            vector(CURVE),
+            matrix(biaxial_stress(_law(model, truth), stretches, k)),
+            Band(matrix(estimated), matrix(low), matrix(high)),
+            matrix(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
         )
     return found
 
@@ -259,8 +259,8 @@ def _excised(coefficients: Mapping[str, tuple[float, ...]]) -> dict[str, Excised
         reached = [_first_above(stress[:, k]) for k in (0, 1)]
         shown = stress.max(axis=1) < 2.0  # MPa; far beyond what is drawn
         found[region] = Excised(
-            tuple(EXCISED_CURVE[shown].tolist()),
-            vectors(stress[shown]),
+            vector(EXCISED_CURVE[shown]),
+            matrix(stress[shown]),
             float(slopes[0]),
             None if reached[0] is None else float(slopes[reached[0] - 1]),
             tuple(None if i is None else float(EXCISED_CURVE[i]) for i in reached),

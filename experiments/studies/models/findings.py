@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.estimates import Vector
+from experiments.common.estimates import Matrix, Vector
 from experiments.studies.models.sheet.sheet import Sheet
 
 __all__ = ["Apart", "Difference", "Findings", "Row"]
@@ -43,7 +43,7 @@ class Row:
     forward_solves: int
     program_runs: int | None
     seconds: float
-    iterates: tuple[Vector, ...]
+    iterates: Matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class Findings:
     noise_mm: float
     rows: tuple[Row, ...]
     differences: tuple[Difference, ...]
-    shapes: Mapping[str, tuple[Vector, ...]]
+    shapes: Mapping[str, Matrix]
     sheet: Sheet
     library: Mapping[str, str | None]
     seconds: float

@@ -15,7 +15,7 @@ import numpy as np
 
 import mvest
 from experiments.common.build import build_filter
-from experiments.common.estimate_record import vectors
+from experiments.common.estimates import matrix, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
 from experiments.common.study import Job, Section, Study
@@ -73,7 +73,7 @@ def run_models(job: Job[Settings]) -> Outcome[Findings]:
     problem = SheetProblem(filter_, transform, prior, float(values["filter"]["R"]), truth)
     own, second = OwnSheet(sheet), SecondSheet(sheet)
     findings = Findings(
-        truth=tuple(truth.tolist()),
+        truth=vector(truth),
         noise_mm=noise,
         rows=(),
         differences=(),
@@ -105,7 +105,7 @@ def run_models(job: Job[Settings]) -> Outcome[Findings]:
         findings=replace(
             findings,
             rows=rows,
-            shapes={name: vectors(p.y.reshape(-1, 3)) for name, p in clean.items()},
+            shapes={name: matrix(p.y.reshape(-1, 3)) for name, p in clean.items()},
             differences=tuple(_difference(sheet, cells, truth) for cells in about.refinements),
             seconds=sum(row.seconds for row in rows),
         ),
@@ -166,15 +166,15 @@ def _estimate(
         model=name,
         converged=found.converged,
         reason=found.reason.value,
-        estimate=tuple(found.mean.tolist()),
-        std=tuple(found.std.tolist()),
-        relative_error=tuple((found.mean / problem.truth - 1.0).tolist()),
+        estimate=vector(found.mean),
+        std=vector(found.std),
+        relative_error=vector(found.mean / problem.truth - 1.0),
         residual_mm=found.residual_rms(y),
         iterations=found.iterations,
         forward_solves=found.forward_solves,
         program_runs=model.runs - runs if isinstance(model, ProcessModel) else None,
         seconds=time.perf_counter() - began,
-        iterates=vectors(found.iterates),
+        iterates=matrix(found.iterates),
     )
 
 

@@ -10,6 +10,7 @@ from experiments.common.estimates import (
     EstimatedModulus,
     Identified,
     Innovation,
+    Matrix,
     Paper,
     SeedRun,
     Spread,
@@ -66,8 +67,8 @@ class Findings:
     closure: Mapping[str, ClosureMeasurements | str] | None
     iterations: int
     seconds: float
-    iterates: tuple[Vector, ...] | None
-    iterate_std: tuple[Vector, ...] | None
+    iterates: Matrix | None
+    iterate_std: Matrix | None
     innovation: Innovation | None
     identifiability: Identified | None
     repeats: tuple[SeedRun, ...]

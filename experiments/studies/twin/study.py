@@ -20,7 +20,7 @@ from experiments.common.estimate_record import (
     moduli_of,
     seed_run,
 )
-from experiments.common.estimates import Paper
+from experiments.common.estimates import Paper, vector
 from experiments.common.expectation import TwinExpectation
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Mesh, Outcome
@@ -72,7 +72,7 @@ def run_twin(job: Job[Settings]) -> Outcome[Findings]:
     mesh = twin.model.mesh
     findings = Findings(
         paper=paper and Paper(**paper),
-        truth=tuple(twin.truth_values.tolist()),
+        truth=vector(twin.truth_values),
         initial=tuple(values["filter"]["initial"]),
         estimate=first.estimate,
         std=first.std,
