@@ -28,6 +28,7 @@ __all__ = [
     "Provenance",
     "Record",
     "Status",
+    "here_and_now",
     "model_of_values",
     "read_data",
     "read_record",
@@ -244,7 +245,6 @@ def stamp(
     started : float
         Seconds since the epoch.
     """
-    source = provenance()
     return Record(
         schema=SCHEMA,
         study=values["study"],
@@ -261,14 +261,22 @@ def stamp(
         forward_solves=outcome.forward_solves,
         model=model_of_values(values),
         mesh=outcome.mesh,
-        provenance=Provenance(
-            **{**source, "git": GitState(**source["git"])},
-            config_hash=config_hash,
-            mesh_hash="none" if outcome.mesh is None else outcome.mesh.sha256,
-            seed=values["seed"],
-            finished=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        provenance=here_and_now(
+            config_hash, "none" if outcome.mesh is None else outcome.mesh.sha256, values["seed"]
         ),
         findings=outcome.findings,
+    )
+
+
+def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
+    """The provenance of what is written by this process."""
+    source = provenance()
+    return Provenance(
+        **{**source, "git": GitState(**source["git"])},
+        config_hash=config_hash,
+        mesh_hash=mesh_hash,
+        seed=seed,
+        finished=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
 
 

@@ -18,10 +18,10 @@ from markupsafe import Markup
 import mvest
 from experiments.common.study import Section, Study, load_study, study_names
 from experiments.results.keep import records_of
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.report import COST, pictures_of, read_sweeps
 from experiments.sweeps.rows import (
-    Sweep,
     factor_label,
     factor_names,
     factor_text,
@@ -93,12 +93,11 @@ def write_report(results: Path) -> Path:
 
 
 def _place(sweep: Sweep) -> tuple[int, str]:
-    kind = sweep["sweep"]["kind"]
-    return (ORDER.index(kind) if kind in ORDER else len(ORDER)), str(sweep["sweep"]["name"])
+    return (ORDER.index(sweep.kind) if sweep.kind in ORDER else len(ORDER)), sweep.name
 
 
 def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
-    base = f"sweep_{sweep['sweep']['name']}"
+    base = f"sweep_{sweep.name}"
     found = [
         (picture, embedded(path, picture.caption))
         for picture in pictures_of(sweep)
@@ -108,20 +107,20 @@ def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
     endings = (".csv", "_table.csv", "_table.md", "_table.tex", "_cost.csv")
     return {
         "anchor": base,
-        "title": str(sweep["title"]),
+        "title": sweep.title,
         "question": question(sweep),
         "conclusions": conclusions(sweep),
         "pictures": [shown for picture, shown in found if picture is not COST],
         "cost": [shown for picture, shown in found if picture is COST],
         "table": summary(sweep)[1],
-        "has_paper": bool(sweep.get("paper")),
+        "has_paper": sweep.paper is not None,
         "note": table_note(sweep),
         "failures": failures[:MAX_FAILURES],
         "more_failures": max(len(failures) - MAX_FAILURES, 0),
         "failed": sum(not run.converged for run in runs_of(sweep)),
         "runs": len(runs_of(sweep)),
         "factors": _factors(sweep),
-        "settings": _settings(sweep.get("settings") or {}),
+        "settings": _settings(sweep.settings),
         "provenance": sweep_line(sweep),
         "cache": _cache(sweep),
         "files": [
@@ -133,7 +132,7 @@ def _sweep_section(results: Path, sweep: Sweep) -> dict[str, Any]:
 def _factors(sweep: Sweep) -> list[dict[str, str]]:
     rows = []
     for name in factor_names(sweep):
-        values = dict.fromkeys(factor_text(job["factors"].get(name)) for job in sweep["jobs"])
+        values = dict.fromkeys(factor_text(job.factors.get(name)) for job in sweep.jobs)
         rows.append({"factor": factor_label(name), "values": ", ".join(values)})
     seeds = {run.seed for run in runs_of(sweep) if run.seed is not None}
     if len(seeds) > 1:
@@ -164,8 +163,8 @@ def _setting_text(value: Any) -> str:
 
 def _cache(sweep: Sweep) -> str:
     """How often a simulated truth was taken from the store."""
-    hits, misses = sweep.get("truth_hits"), sweep.get("truth_misses")
-    if hits is None or misses is None or not hits + misses:
+    hits, misses = sweep.truth_hits, sweep.truth_misses
+    if not hits + misses:
         return ""
     return f"Of {hits + misses} requests for a simulated truth, {hits} were served from the store."
 

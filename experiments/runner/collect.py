@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
-from experiments.common.record import Record, model_of_values
+from experiments.common.estimates import Paper
+from experiments.common.record import Record, here_and_now, model_of_values
 from experiments.runner.compared import Compared, last_compared
 from experiments.runner.plan import Plan, PlannedJob
-from mvest.provenance import config_hash, provenance
+from experiments.sweeps.collected import SCHEMA, Cost, Sweep, SweepJob
+from mvest.provenance import config_hash
 
 __all__ = ["NOT_RUN", "collect", "overheads"]
-
-SCHEMA = 1
-"""Version of the layout of ``sweep.json``."""
 
 UNSAID = ("factors", "paths", "tracking")
 """Settings that are no part of what a sweep has in common, or belong to a machine."""
@@ -27,8 +24,8 @@ NOT_RUN = "not run"
 
 def collect(
     plan: Plan, returned: Mapping[str, Mapping[str, Any]], earlier: Mapping[str, float]
-) -> dict[str, Any]:
-    """What all jobs of a sweep found, in their order, failed and missing ones included.
+) -> Sweep:
+    """What all jobs of a sweep gave, in their order, failed and missing ones included.
 
     Parameters
     ----------
@@ -41,42 +38,40 @@ def collect(
     records = [last_compared(job.folder, job.config_hash) for job in plan.jobs]
     ended = [record for record in records if record is not None]
     stored = [record.findings.truth_store for record in ended]
-    entries = [
-        _entry(job, record, returned.get(job.config_hash[:16]))
+    jobs = tuple(
+        _collected(job, record, returned.get(job.config_hash[:16]))
         for job, record in zip(plan.jobs, records, strict=True)
-    ]
+    )
     first = plan.jobs[0].values
     run_again = {job.config_hash[:16] for job in plan.to_run}
     kept = {key: value for key, value in earlier.items() if key not in run_again}
     spent = kept | overheads(plan, returned)
-    return {
-        "schema": SCHEMA,
-        "sweep": plan.sweep or {"name": plan.name, "size": None, "kind": None},
-        "title": first["title"],
-        "parameters": first["parameters"],
-        "paper": first["paper"],
-        "truth_hits": stored.count("hit"),
-        "truth_misses": stored.count("miss"),
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash({"jobs": [job.config_hash for job in plan.jobs]}),
-            "mesh_hash": next((r.provenance.mesh_hash for r in ended), "none"),
-            "seed": first["seed"],
-            "commits": sorted({str(r.provenance.git.sha) for r in ended}),
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-        "settings": {key: value for key, value in first.items() if key not in UNSAID},
-        "jobs": entries,
-        "cost": [
-            {
-                "hash": entry["hash"],
-                "seconds": sum(run["seconds"] or 0.0 for run in entry["runs"]),
-                "seconds_total": None if record is None else record.seconds_total,
-                "overhead": spent.get(entry["hash"]),
-            }
-            for entry, record in zip(entries, records, strict=True)
-        ],
-    }
+    return Sweep(
+        schema=SCHEMA,
+        sweep=plan.sweep or {"name": plan.name, "size": None, "kind": None},
+        title=first["title"],
+        parameters=tuple(first["parameters"]),
+        paper=first["paper"] and Paper(**first["paper"]),
+        truth_hits=stored.count("hit"),
+        truth_misses=stored.count("miss"),
+        provenance=here_and_now(
+            config_hash({"jobs": [job.config_hash for job in plan.jobs]}),
+            next((r.provenance.mesh_hash for r in ended), "none"),
+            first["seed"],
+        ),
+        commits=tuple(sorted({str(r.provenance.git.sha) for r in ended})),
+        settings={key: value for key, value in first.items() if key not in UNSAID},
+        jobs=jobs,
+        cost=tuple(
+            Cost(
+                job.hash,
+                sum(run.seconds or 0.0 for run in job.runs),
+                None if record is None else record.seconds_total,
+                spent.get(job.hash),
+            )
+            for job, record in zip(jobs, records, strict=True)
+        ),
+    )
 
 
 def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
@@ -107,26 +102,25 @@ def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str
     return spent
 
 
-def _entry(
+def _collected(
     job: PlannedJob, record: Record[Compared] | None, end: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """A job's part of the file, with what each seed gave."""
+) -> SweepJob:
+    """A job with what each seed gave."""
     values, settings = job.values, job.values["filter"]
-    runs = record.findings.repeats if record and not record.findings.died else ()
-    return {
-        "hash": job.config_hash[:16],
-        "row": values["row"],
-        "factors": values["factors"],
-        "seed": values["seed"],
-        "repeats": values["repeats"],
-        "status": "failed" if record is None else record.status,
-        "reason": record.reason if record else (end["reason"] if end else NOT_RUN),
-        "model": asdict(model_of_values(values)),
-        "initial": settings["initial"],
-        "truth": values["truth"]["values"],
-        "P0": settings["P0"],
-        "Q": settings["Q"],
-        "R": settings["R"],
-        "filter": settings["mode"],
-        "runs": [asdict(run) for run in runs],
-    }
+    return SweepJob(
+        hash=job.config_hash[:16],
+        row=values["row"],
+        factors=values["factors"],
+        seed=values["seed"],
+        repeats=values["repeats"],
+        status="failed" if record is None else record.status,
+        reason=record.reason if record else (end["reason"] if end else NOT_RUN),
+        model=model_of_values(values),
+        initial=settings["initial"],
+        truth=values["truth"]["values"],
+        P0=settings["P0"],
+        Q=settings["Q"],
+        R=settings["R"],
+        filter=settings["mode"],
+        runs=record.findings.repeats if record and not record.findings.died else (),
+    )

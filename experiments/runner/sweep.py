@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -28,6 +29,7 @@ from experiments.runner.plan import Plan, PlannedJob, make_plan
 from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request, as_published
 from experiments.runner.sync import log_sweep, open_early
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
@@ -110,7 +112,7 @@ def run_plan(config: DictConfig, plan: Plan, context: HydraContext) -> int:
             lost = f"{type(error).__name__}: {_first_sentence(error)}"
     path = plan.folder / FILE
     found = collect(plan, returned, _measured(path))
-    write_json(path, found)
+    write_json(path, asdict(found))
     if lost is not None:
         print(
             f"error: the launcher lost its jobs ({lost}); run the same command again to go on",
@@ -124,7 +126,7 @@ def run_plan(config: DictConfig, plan: Plan, context: HydraContext) -> int:
         log_sweep(config, plan, store)
     if lost is None:
         _publish(config, plan, found)
-    done = all(job["status"] == "converged" for job in found["jobs"])
+    done = all(job.converged for job in found.jobs)
     return 0 if done and lost is None else 1
 
 
@@ -165,23 +167,23 @@ def _completed(end: JobReturn) -> bool:
     return end.status == JobStatus.COMPLETED
 
 
-def _outcome(plan: Plan, found: Mapping[str, Any]) -> str:
+def _outcome(plan: Plan, found: Sweep) -> str:
     """How a sweep ended, in one line."""
     total, ran = len(plan.jobs), len(plan.to_run)
-    failed = [job for job in found["jobs"] if job["status"] != "converged"]
-    missing = sum(job["reason"] == NOT_RUN for job in failed)
+    failed = [job for job in found.jobs if not job.converged]
+    missing = sum(job.reason == NOT_RUN for job in failed)
     text = f"{plan.name}: {total - len(failed)} of {total} jobs done ({total - ran} before), "
     text += f"{len(failed) - missing} without an estimate"
     if missing:
         text += f", {missing} not finished"
-    text += f"; stored truths used {found['truth_hits']} times, {found['truth_misses']} simulated"
-    overheads = [cost["overhead"] for cost in found["cost"] if cost["overhead"] is not None]
+    text += f"; stored truths used {found.truth_hits} times, {found.truth_misses} simulated"
+    overheads = [cost.overhead for cost in found.cost if cost.overhead is not None]
     if overheads:
         text += f"; overhead {median(overheads):.2f} s per job"
     return text
 
 
-def _publish(config: DictConfig, plan: Plan, found: Mapping[str, Any]) -> None:
+def _publish(config: DictConfig, plan: Plan, found: Sweep) -> None:
     """Let the results take over a sweep that was run as it is configured."""
     if not config.publish or not plan.sweep:
         return
@@ -194,7 +196,7 @@ def _publish(config: DictConfig, plan: Plan, found: Mapping[str, Any]) -> None:
         return
     folder = results / "sweeps"
     require_writable(folder)
-    write_json(folder / f"{plan.sweep['name']}.json", found)
+    write_json(folder / f"{found.name}.json", asdict(found))
     write_sweep(results, found)
     write_report(results)
     print(f"Results in {results}")

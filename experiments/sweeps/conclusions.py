@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.families import (
     covariance_lines,
     discrepancies,
@@ -17,7 +18,6 @@ from experiments.sweeps.families import (
 from experiments.sweeps.rows import (
     FACTORS,
     Run,
-    Sweep,
     factor_names,
     kind_of,
     runs_of,
@@ -109,7 +109,7 @@ def _initial_guess(sweep: Sweep, runs: list[Run]) -> list[str]:
         ranges = [
             f"{number(low)} to {number(high)} ({name})"
             for name, low, high in zip(
-                short_names(sweep["parameters"]), starts.min(0), starts.max(0), strict=True
+                short_names(sweep.parameters), starts.min(0), starts.max(0), strict=True
             )
         ]
         sentences.append(f"The starts range over {_listed(ranges)}.")
@@ -142,7 +142,7 @@ def _covariance(sweep: Sweep, runs: list[Run]) -> list[str]:
     for line in covariance_lines(runs):
         good = [(value, group) for value, group in line.points if converged(group)]
         errors = [
-            max(accuracy(group, k).rmse_percent for k in range(len(sweep["parameters"])))
+            max(accuracy(group, k).rmse_percent for k in range(len(sweep.parameters)))
             for _, group in good
         ]
         if len(good) < 2 or not np.isfinite(errors).all():
@@ -180,7 +180,7 @@ def _quantity(name: str) -> str:
 
 
 def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     ratios: list[tuple[float, str]] = []
     shares: list[tuple[float, str]] = []
     verdicts: Counter[str] = Counter()
@@ -233,7 +233,7 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 
 def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     effects = []
     groups = discrepancies(runs)
     for what, group in groups.items():
@@ -279,7 +279,7 @@ def _filter(sweep: Sweep, runs: list[Run]) -> list[str]:
         entries = []
         for name, group in filters.items():
             good = converged(group)
-            errors = [accuracy(group, k).rmse_percent for k in range(len(sweep["parameters"]))]
+            errors = [accuracy(group, k).rmse_percent for k in range(len(sweep.parameters))]
             if good and np.isfinite(errors).all():
                 solves = spread_of([run.forward_solves for run in good])["mean"]
                 entries.append((max(errors), solves, name))
@@ -306,7 +306,7 @@ def _filter(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 def _anything(sweep: Sweep, runs: list[Run]) -> list[str]:
     worst = _worst(runs)
-    kind, needed = sweep["sweep"]["kind"], FACTORS.get(str(sweep["sweep"]["kind"]))
+    kind, needed = sweep.kind, FACTORS.get(sweep.kind)
     missing = sorted(needed[0] - set(factor_names(sweep))) if needed else []
     why = (
         f"This sweep of the kind “{kind}” lacks the factor {_listed(missing)} in a job and has"

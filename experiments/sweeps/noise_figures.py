@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.families import NoiseGroup, noise_groups
-from experiments.sweeps.rows import Run, Sweep, runs_of, short_names
+from experiments.sweeps.rows import Run, runs_of, short_names
 from experiments.sweeps.statistics import (
     BOUND_FACTOR,
     LEVELS,
@@ -77,7 +78,7 @@ def noise_figure(sweep: Sweep) -> Figure | None:
     runs = runs_of(sweep)
     if not any(np.isfinite(run.error).any() for run in runs if run.converged):
         return None
-    families, names = _families(runs), short_names(sweep["parameters"])
+    families, names = _families(runs), short_names(sweep.parameters)
     figure, axes = _grid(families, names)
     top = np.zeros((len(names), len(families)))
     for column, family in enumerate(families):
@@ -189,7 +190,7 @@ def _beside(n: int, width: float) -> FloatArray:
 
 def calibration_figure(sweep: Sweep) -> Figure | None:
     """Observed against nominal coverage, a row per parameter and a column per kind of noise."""
-    parameters = range(len(sweep["parameters"]))
+    parameters = range(len(sweep.parameters))
     families = [
         family
         for family in _families(runs_of(sweep), noisy=True)
@@ -197,7 +198,7 @@ def calibration_figure(sweep: Sweep) -> Figure | None:
     ]
     if not families:
         return None
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     strengths = sorted({g.level for family in families if family.is_curve for g in family.groups})
     by_level = dict(zip(strengths, levels(len(strengths)), strict=True))
     figure, axes = panels(

@@ -6,7 +6,6 @@ made again without running anything.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from experiments.common.record import read_data
+from experiments.sweeps.collected import Sweep, check_sweep
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.noise_figures import calibration_figure, noise_figure
 from experiments.sweeps.rows import (
-    Sweep,
-    check_sweep,
     cost_rows,
     csv_text,
     factor_label,
@@ -110,13 +109,7 @@ def read_sweeps(results: Path) -> list[Sweep]:
     """
     found = []
     for path in sorted((results / SWEEPS).glob("*.json")):
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror}") from error
-        except ValueError as error:
-            raise InputError(f"{path} is not JSON: {error}") from error
-        found.append(check_sweep(content, str(path)))
+        found.append(check_sweep(read_data(path), str(path)))
     return found
 
 
@@ -128,16 +121,14 @@ def write_sweep(results: Path, sweep: Sweep) -> list[Path]:
     results : Path
         Existing folder; gets ``sweep_NAME.csv`` (one row per run), ``sweep_NAME_table.csv``,
         ``.md`` and ``.tex``, ``sweep_NAME_cost.csv``, and each figure as PNG and PDF.
-    sweep : mapping
-        The content of a ``sweep.json``.
+    sweep : Sweep
 
     Raises
     ------
     InputError
-        If the mapping is no collected sweep, or a file cannot be written.
+        If its name is none for a file, or a file cannot be written.
     """
-    check_sweep(sweep, "this sweep")
-    name = str(sweep["sweep"]["name"])
+    name = sweep.name
     if not name.replace("_", "").replace("-", "").isalnum():
         raise InputError(f"a sweep's name must be letters, digits, - and _, not {name!r}")
     base = results / f"sweep_{name}"
@@ -169,7 +160,7 @@ def _markdown(sweep: Sweep, reading: list[dict[str, str]], line: str) -> str:
     table = markdown_rows(reading) if reading else "The sweep has no jobs."
     found = "\n".join(f"- {markdown_text(sentence)}" for sentence in conclusions(sweep))
     return (
-        f"# {markdown_text(str(sweep['title']))}\n\n{markdown_text(question(sweep))}\n\n{found}\n\n"
+        f"# {markdown_text(sweep.title)}\n\n{markdown_text(question(sweep))}\n\n{found}\n\n"
         f"{table}\n\n{markdown_text(table_note(sweep))}\n\n<sub>{markdown_text(line)}</sub>\n"
     )
 
@@ -177,7 +168,7 @@ def _markdown(sweep: Sweep, reading: list[dict[str, str]], line: str) -> str:
 def _latex(sweep: Sweep, reading: list[dict[str, str]], line: str) -> str:
     comments = f"% {' '.join(line.split())}\n% {table_note(sweep)}\n"
     if not reading:
-        return f"{comments}% {latex_text(str(sweep['title']))}: the sweep has no jobs.\n"
+        return f"{comments}% {latex_text(sweep.title)}: the sweep has no jobs.\n"
     return comments + latex_rows(reading)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import norm
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.families import (
     Line,
     covariance_lines,
@@ -18,7 +19,6 @@ from experiments.sweeps.families import (
 )
 from experiments.sweeps.rows import (
     Run,
-    Sweep,
     cost_rows,
     factor_label,
     factor_names,
@@ -122,7 +122,7 @@ def discrepancy_figure(sweep: Sweep) -> Figure | None:
     """Signed error of each modulus per discrepancy, sorted by size, with the 95 % interval."""
     runs = runs_of(sweep)
     groups = discrepancies(runs)
-    p = len(sweep["parameters"])
+    p = len(sweep.parameters)
     size = {
         what: max((abs(accuracy(g, k).bias_percent) for k in range(p)), default=np.nan)
         for what, g in groups.items()
@@ -131,7 +131,7 @@ def discrepancy_figure(sweep: Sweep) -> Figure | None:
         return None
     # Smallest first from the bottom; what failed stands below everything.
     order = sorted(groups, key=lambda what: (np.isfinite(size[what]), np.nan_to_num(size[what])))
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     figure, axes = panels(1, p, 0.36 * len(order) + 1.5, sharey=True, sharex=True)
     for k, one in enumerate(axes.flat):
         one.axvline(0, color="black", linewidth=1)
@@ -181,7 +181,7 @@ def filter_figure(sweep: Sweep) -> Figure | None:
     if not any(np.isfinite(run.error).any() for run in runs if run.converged):
         return None
     repeated = any(len(g) > 1 for filters in conditions.values() for g in filters.values())
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     rows = [len(filters) for filters in conditions.values()]
     figure = Figure(
         figsize=(WIDTH, 0.36 * sum(rows) + 0.75 * len(rows) + 0.8), layout="constrained"
@@ -289,10 +289,10 @@ def cost_figure(sweep: Sweep) -> Figure | None:
     for y, group in enumerate(order):
         jobs = [rows[k] for k in groups[group]]
         solves = [
-            run["forward_solves"]
+            run.forward_solves
             for k in groups[group]
-            for run in sweep["jobs"][k]["runs"]
-            if run.get("forward_solves")
+            for run in sweep.jobs[k].runs
+            if run.forward_solves
         ]
         seconds = [row["whole job [s]"] for row in jobs if row["whole job [s]"] is not None]
         for one, values, colour in ((axes[0, 0], solves, 0), (axes[0, 1], seconds, 2)):
@@ -319,7 +319,7 @@ def _splitting_factor(sweep: Sweep) -> str | None:
     """The filter if it is varied, else the first factor with two to twelve values."""
     names = factor_names(sweep)
     for name in [*(n for n in names if n == "filter"), *names]:
-        values = {factor_text(job["factors"].get(name)) for job in sweep["jobs"]}
+        values = {factor_text(job.factors.get(name)) for job in sweep.jobs}
         if 2 <= len(values) <= 12:
             return name
     return None

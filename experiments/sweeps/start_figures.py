@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullLocator
 
-from experiments.sweeps.rows import Run, Sweep, factor_names, runs_of, short_names
+from experiments.sweeps.collected import Sweep
+from experiments.sweeps.rows import Run, factor_names, runs_of, short_names
 from experiments.sweeps.statistics import BASIN_PERCENT, converged, grouped, in_basin
 from mvest.reporting.style import (
     BAD,
@@ -187,7 +188,7 @@ def paths_figure(sweep: Sweep) -> Figure | None:
     groups = grouped(runs, ["filter"])
     if not groups:
         return None
-    names = short_names(sweep["parameters"])
+    names = short_names(sweep.parameters)
     figure, axes = panels(len(names), len(groups), 2.5 * len(names) + 0.4, sharey="row")
     for column, ((mode,), group) in enumerate(groups.items()):
         for k, name in enumerate(names):
@@ -217,7 +218,7 @@ def paths_figure(sweep: Sweep) -> Figure | None:
 
 
 def _moduli(sweep: Sweep) -> bool:
-    return all(name.startswith("E_f.") for name in sweep["parameters"])
+    return all(name.startswith("E_f.") for name in sweep.parameters)
 
 
 def _paths(axes: Any, runs: Sequence[Run], k: int) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.families import SEED, noise_groups, setting_words, varied_names
 from experiments.sweeps.rows import (
     Run,
-    Sweep,
     factor_label,
     factor_names,
     factor_text,
@@ -90,13 +90,13 @@ def table_note(sweep: Sweep) -> str:
 
 def _paper_rows(sweep: Sweep, like: Reading) -> tuple[list[Row], list[Reading]]:
     """The paper's numbers in the columns that the sweep's own table has."""
-    paper = sweep.get("paper")
-    if not paper:
+    paper = sweep.paper
+    if paper is None:
         return [], []
-    label = f"paper, {paper.get('table', 'as published')}"
-    names = sweep["parameters"]
-    estimate = paper.get("estimate") or [None] * len(names)
-    error = paper.get("error_percent") or [None] * len(names)
+    label = f"paper, {paper.table}"
+    names = sweep.parameters
+    absent = [None] * len(names)
+    estimate, error = paper.estimate or absent, paper.error_percent or absent
     if "parameter" in like:
         plain: list[Row] = [
             {
@@ -153,7 +153,7 @@ def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
             "converged": str(len(good)),
             f"within {BASIN_PERCENT:g} %": f"{basin} of {len(group)}",
         }
-        for k, name in enumerate(sweep["parameters"]):
+        for k, name in enumerate(sweep.parameters):
             found = accuracy(group, k)
             row[f"estimate {name}{unit_of(name)}"] = found.mean
             row[f"SD over starts {name}{unit_of(name)}"] = found.spread
@@ -173,7 +173,7 @@ def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
 def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     """One row per setting and parameter."""
     names = [name for name in factor_names(sweep) if name != SEED]
-    units = {unit_of(name) for name in sweep["parameters"]}
+    units = {unit_of(name) for name in sweep.parameters}
     mixed = len(units) > 1
     common = "" if mixed else units.pop()
     rows, reading = [], []
@@ -184,7 +184,7 @@ def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
         }
         # Without noise every seed gives the same run, and there is nothing to cover.
         noisy = noise.level > 0
-        for k, name in enumerate(sweep["parameters"]):
+        for k, name in enumerate(sweep.parameters):
             found, levels = accuracy(group, k), [coverage(group, k, level) for level in LEVELS]
             verdicts = {
                 WITHIN_BOUND: _within_bound(found) if noisy else "",
@@ -278,7 +278,7 @@ def _settings(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
         text: Reading = {"setting": words}
         if repeated:
             text["n"] = str(len(good))
-        for k, name in enumerate(sweep["parameters"]):
+        for k, name in enumerate(sweep.parameters):
             found, covered = accuracy(group, k), coverage(group, k)
             row[f"estimate {name}{unit_of(name)}"] = found.mean
             row[f"SD over seeds {name}{unit_of(name)}"] = found.spread
@@ -298,8 +298,9 @@ def _settings(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
             else:
                 row[f"truth within 95 % interval {name}"] = _yes(covered)
                 text[f"within 95 % {name}"] = _yes(covered) or MISSING
-        distance = spread_of([run.distance.get("mean") for run in good])["mean"]
-        spread = spread_of([run.distance.get("std") for run in good])["mean"]
+        known = [run.distance for run in good if run.distance is not None]
+        distance = spread_of([d.mean for d in known])["mean"]
+        spread = spread_of([d.std for d in known])["mean"]
         solves = spread_of([run.forward_solves for run in good])["mean"]
         reasons = _reasons(group)
         row |= {

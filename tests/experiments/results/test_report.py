@@ -1,4 +1,5 @@
 import json
+from dataclasses import asdict
 from html.parser import HTMLParser
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from PIL import Image
 
 from experiments.results.page import write_report
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from experiments.tables import main
 from mvest.errors import InputError
@@ -49,15 +51,15 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def publish(results, whole: dict, *, files: bool = True) -> None:
+def publish(results, whole: Sweep, *, files: bool = True) -> None:
     (results / "sweeps").mkdir(exist_ok=True)
-    path = results / "sweeps" / f"{whole['sweep']['name']}.json"
-    path.write_text(json.dumps(whole), encoding="utf-8")
+    path = results / "sweeps" / f"{whole.name}.json"
+    path.write_text(json.dumps(asdict(whole)), encoding="utf-8")
     if files:
         write_sweep(results, whole)
 
 
-def small(**changes) -> dict:
+def small(**changes) -> Sweep:
     jobs = [job({"filter": name}, [run(1, TRUTH * 1.02, [0.1, 0.1])]) for name in ("ekf", "iekf")]
     return sweep("filter", [*jobs, job({"filter": "lost"}, [], "killed (signal 9)")], **changes)
 

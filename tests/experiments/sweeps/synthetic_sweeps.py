@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+
+from experiments.sweeps.collected import SCHEMA, Cost, Sweep, check_sweep
 
 TRUTH = np.array([6.23, 2.09])
 BOUND_PER_MM = np.array([0.183, 0.058])
@@ -99,11 +102,16 @@ def job(
     return entry | changes
 
 
-def sweep(kind: str, jobs: Iterable[dict[str, Any]], **changes: Any) -> dict[str, Any]:
+def sweep(kind: str, jobs: Iterable[dict[str, Any]], **changes: Any) -> Sweep:
+    return check_sweep(sweep_data(kind, jobs, **changes), "made up")
+
+
+def sweep_data(kind: str, jobs: Iterable[dict[str, Any]], **changes: Any) -> dict[str, Any]:
+    """The same as ``sweep.json`` holds it."""
     jobs = list(jobs)
     seconds = [sum(entry["seconds"] for entry in found["runs"]) for found in jobs]
     entry: dict[str, Any] = {
-        "schema": 1,
+        "schema": SCHEMA,
         "sweep": {"name": kind, "size": "small", "kind": kind},
         "title": f"Sweep over {kind.replace('_', ' ')}",
         "parameters": ["E_f.anterior", "E_f.posterior"],
@@ -116,6 +124,8 @@ def sweep(kind: str, jobs: Iterable[dict[str, Any]], **changes: Any) -> dict[str
             "config_hash": "cd" * 32,
             "mesh_hash": "ab" * 32,
             "seed": 1,
+            **{"threads": {}, "python": "3.12", "platform": "Linux", "machine": "x86_64"},
+            **{"cpu_count": 2, "finished": "2024-01-01T00:00:00Z"},
         },
         "settings": {
             "filter": {"transform": "identity", "tolerance": 1e-4, "max_iterations": 30},
@@ -135,7 +145,7 @@ def sweep(kind: str, jobs: Iterable[dict[str, Any]], **changes: Any) -> dict[str
     return entry | changes
 
 
-def initial_guess() -> dict[str, Any]:
+def initial_guess() -> Sweep:
     rng = np.random.default_rng(1)
     jobs = []
     for mode in ("iterated", "paper"):
@@ -172,7 +182,7 @@ def initial_guess() -> dict[str, Any]:
     return sweep("initial_guess", jobs, paper=paper, title="Initial guess of the moduli")
 
 
-def covariance() -> dict[str, Any]:
+def covariance() -> Sweep:
     jobs = []
     for mode in ("iterated", "paper"):
         for varied in ("P0", "Q", "R", "all"):
@@ -190,7 +200,7 @@ def covariance() -> dict[str, Any]:
     return sweep("covariance", jobs, title="Prior, process and observation covariance")
 
 
-def noise(seeds: int = 40) -> dict[str, Any]:
+def noise(seeds: int = 40) -> Sweep:
     rng = np.random.default_rng(2)
     inflate = {"white": 1.0, "correlated": 2.4, "dropout": 1.15, "annulus": 1.7}
     jobs = []
@@ -214,7 +224,7 @@ def noise(seeds: int = 40) -> dict[str, Any]:
     return sweep("noise", jobs, title="Noise of the observation")
 
 
-def discrepancy() -> dict[str, Any]:
+def discrepancy() -> Sweep:
     percent = {
         "none": (0.0004, 0.0002),
         "finer mesh": (-0.8, 1.3),
@@ -235,7 +245,7 @@ def discrepancy() -> dict[str, Any]:
     return sweep("discrepancy", jobs, title="Discrepancy between the truth and the model")
 
 
-def filters(seeds: int = 12) -> dict[str, Any]:
+def filters(seeds: int = 12) -> Sweep:
     rng = np.random.default_rng(3)
     made = {
         "iterated": (1.0, 5),
@@ -256,12 +266,12 @@ def filters(seeds: int = 12) -> dict[str, Any]:
     return sweep("filter", jobs, title="Filters on the same observations")
 
 
-def unknown() -> dict[str, Any]:
+def unknown() -> Sweep:
     jobs = [job({"moon_phase": phase}, [run(1, TRUTH * 1.01, [0.02, 0.005])]) for phase in (0, 1)]
     return sweep("astrology", jobs, title="Something else")
 
 
-ALL: dict[str, Callable[[], dict[str, Any]]] = {
+ALL: dict[str, Callable[[], Sweep]] = {
     "initial_guess": initial_guess,
     "covariance": covariance,
     "noise": noise,
@@ -271,29 +281,31 @@ ALL: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 
-def all_failed(kind: str) -> dict[str, Any]:
+def all_failed(kind: str) -> Sweep:
     """The sweep of this kind with every job dead."""
     whole = ALL[kind]()
-    jobs = [found | {"runs": [], "status": "failed", "reason": FAILED["memory"]}
-            for found in whole["jobs"]]  # fmt: skip
-    cost = [{"hash": found["hash"], "seconds": None, "seconds_total": None} for found in jobs]
-    return whole | {"jobs": jobs, "cost": cost}
+    jobs = tuple(
+        replace(lost, runs=(), status="failed", reason=FAILED["memory"]) for lost in whole.jobs
+    )
+    return replace(whole, jobs=jobs, cost=tuple(Cost(job.hash, None, None) for job in jobs))
 
 
-def empty(kind: str) -> dict[str, Any]:
+def empty(kind: str) -> Sweep:
     """The sweep of this kind without a job."""
-    return ALL[kind]() | {"jobs": [], "cost": []}
+    return replace(ALL[kind](), jobs=(), cost=())
 
 
-def told_noise(seeds: int = 20) -> dict[str, Any]:
+def correlated_noise(seeds: int = 20) -> Sweep:
     """As `noise`, with one kind over several levels and others at one, two jobs for each."""
     rng = np.random.default_rng(5)
     cases = [("white", level, 0.0, 0.0, 1.0) for level in (0.1, 0.5, 1.0)]
-    cases += [("correlated over 5 mm", 0.0, 0.5, told, 5.0 - 0.8 * told) for told in (0.0, 5.0)]
+    cases += [
+        ("correlated over 5 mm", 0.0, 0.5, length, 5.0 - 0.8 * length) for length in (0.0, 5.0)
+    ]
     cases += [("white, coaptation hidden", 0.5, 0.0, 0.0, 1.1)]
     cases += [("white, annulus 1 mm off", 0.5, 0.0, 0.0, 6.0)]
     jobs = []
-    for kind, level, correlated, told, factor in cases:
+    for kind, level, correlated, length, factor in cases:
         for first in (1, 1 + seeds):
             bound = BOUND_PER_MM * max(level, correlated)
             runs = [
@@ -301,12 +313,12 @@ def told_noise(seeds: int = 20) -> dict[str, Any]:
                 for s in range(first, first + seeds)
             ]
             factors = {"kind": kind, "noise_mm": level, "correlated_mm": correlated}
-            factors |= {"R": max(level, correlated) ** 2, "R_correlation_mm": told}
+            factors |= {"R": max(level, correlated) ** 2, "R_correlation_mm": length}
             jobs.append(job(factors, runs, row=f"{kind} {first}", seed=first, repeats=seeds))
     return sweep("noise", jobs, title="Estimates from noisy observations")
 
 
-def covariance_values() -> dict[str, Any]:
+def covariance_values() -> Sweep:
     """As `covariance`, over values of P0, Q and R."""
     jobs = []
     for mode in ("paper", "iterated"):
@@ -324,7 +336,7 @@ def covariance_values() -> dict[str, Any]:
     return sweep("covariance", jobs, title="Estimates under covariances")
 
 
-def filter_conditions() -> dict[str, Any]:
+def filter_conditions() -> Sweep:
     """As `filters`, in two coordinates, from two starts, without noise and with it."""
     rng = np.random.default_rng(4)
     jobs = []
@@ -345,17 +357,19 @@ def filter_conditions() -> dict[str, Any]:
     return sweep("filter", jobs, title="Filters side by side")
 
 
-def truths() -> dict[str, Any]:
+def truths() -> Sweep:
     """As `discrepancy`, named by the truth."""
     whole = discrepancy()
-    for found in whole["jobs"]:
-        name = found["factors"]["discrepancy"]
-        found["factors"] = {"truth": "same model" if name == "none" else name}
-    return whole
+    names = [job.factors["discrepancy"] for job in whole.jobs]
+    jobs = [
+        replace(job, factors={"truth": "same model" if name == "none" else name})
+        for job, name in zip(whole.jobs, names, strict=True)
+    ]
+    return replace(whole, jobs=tuple(jobs))
 
 
-VARIANTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "told_noise": told_noise,
+VARIANTS: dict[str, Callable[[], Sweep]] = {
+    "correlated_noise": correlated_noise,
     "covariance_values": covariance_values,
     "filter_conditions": filter_conditions,
     "truths": truths,

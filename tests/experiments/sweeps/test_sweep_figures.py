@@ -16,6 +16,7 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     ALL,
     TRUTH,
     all_failed,
+    correlated_noise,
     covariance,
     covariance_values,
     discrepancy,
@@ -28,7 +29,6 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     noise,
     run,
     sweep,
-    told_noise,
 )
 
 
@@ -142,7 +142,7 @@ def test_covariance_panels_show_error_and_reported_deviation() -> None:
     deviation, error = (line.get_ydata() for line in figure.axes[2].lines)
     # R times 100 makes the reported standard deviation ten times larger.
     assert deviation[-1] / deviation[2] == pytest.approx(10)
-    at_scale_one = covariance()["jobs"][12]["runs"][0]["relative_error"]
+    at_scale_one = covariance().jobs[12].runs[0].relative_error
     assert error[2] == pytest.approx(100 * max(abs(e) for e in at_scale_one))
     assert [line.get_marker() for line in figure.axes[6].lines].count("x") == 1
 
@@ -159,12 +159,12 @@ def test_values_of_a_covariance_share_a_panel_zero_included() -> None:
 
 
 def test_kinds_of_a_single_level_stand_side_by_side() -> None:
-    white, others = noise_figure(told_noise(3)).axes[:2]
+    white, others = noise_figure(correlated_noise(3)).axes[:2]
     assert white.get_title() == "white"
     assert others.get_title() == "other errors"
     (rms,) = [line for line in others.lines if line.get_marker() == "o"]
     assert list(rms.get_xdata()) == [0, 1, 2, 3]
-    labels = [axes for axes in calibration_figure(told_noise(3)).axes if len(axes.texts) == 4]
+    labels = [axes for axes in calibration_figure(correlated_noise(3)).axes if len(axes.texts) == 4]
     assert any("coaptation" in text for text in texts(labels[0]))
 
 

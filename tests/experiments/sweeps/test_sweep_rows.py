@@ -1,10 +1,11 @@
 import csv
 import io
+from dataclasses import replace
 
 import pytest
 
+from experiments.sweeps.collected import Sweep, check_sweep
 from experiments.sweeps.rows import (
-    check_sweep,
     cost_rows,
     csv_text,
     factor_label,
@@ -23,12 +24,17 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     noise,
     run,
     sweep,
+    sweep_data,
 )
 
 
-def two_jobs() -> dict:
+def two_jobs() -> Sweep:
     """One job with a good and a bad seed, one that was killed."""
-    return sweep(
+    return check_sweep(two_jobs_data(), "made up")
+
+
+def two_jobs_data() -> dict:
+    return sweep_data(
         "noise",
         [
             job(
@@ -93,8 +99,7 @@ def test_costs_stand_apart() -> None:
 
 
 def test_jobs_from_several_commits_are_all_named() -> None:
-    whole = two_jobs()
-    whole["provenance"]["commits"] = ["a" * 40, "b" * 40]
+    whole = replace(two_jobs(), commits=("a" * 40, "b" * 40))
     assert "commit aaaaaaaaaaaa, bbbbbbbbbbbb, configuration" in sweep_line(whole)
 
 
@@ -116,14 +121,14 @@ def test_a_kind_without_its_factors_is_no_such_kind() -> None:
     ("damage", "words"),
     [
         (lambda s: s.pop("jobs"), "lacks jobs"),
-        (lambda s: s.update(schema=2), "schema 2"),
+        (lambda s: s.update(schema=1), "schema 1"),
         (lambda s: s.update(sweep={"name": "x"}), "its name and its kind"),
         (lambda s: s["jobs"][1].pop("reason"), "job 1 lacks reason"),
         (lambda s: s["jobs"][0]["runs"][0].update(estimate=[1.0]), "1 values for 2 parameters"),
     ],
 )
 def test_a_damaged_sweep_is_named(damage, words: str) -> None:
-    whole = two_jobs()
+    whole = two_jobs_data()
     damage(whole)
     with pytest.raises(InputError, match=words):
         check_sweep(whole, "there.json")

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.families import covariance_lines, discrepancies, noise_groups
 from experiments.sweeps.rows import runs_of
@@ -12,6 +13,7 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     FAILED,
     TRUTH,
     all_failed,
+    correlated_noise,
     empty,
     failed_run,
     filter_conditions,
@@ -20,12 +22,11 @@ from tests.experiments.sweeps.synthetic_sweeps import (
     job,
     run,
     sweep,
-    told_noise,
     truths,
 )
 
 
-def noisy() -> dict:
+def noisy() -> Sweep:
     """White noise near the bound, correlated noise with twice its errors."""
     jobs = []
     for kind, factor in (("white", 1.0), ("correlated", 2.0)):
@@ -91,7 +92,7 @@ def test_starts_are_counted_per_filter_below_the_papers_row() -> None:
     assert {tuple(row) for row in reading} == {tuple(reading[0])}
 
 
-def starts(errors: dict[str, list[float | None]]) -> dict:
+def starts(errors: dict[str, list[float | None]]) -> Sweep:
     """A sweep over guesses with these errors in percent; None is a failure."""
     jobs = []
     for mode, percent in errors.items():
@@ -171,7 +172,7 @@ def test_values_of_a_covariance_are_followed_with_the_others_kept() -> None:
 
 
 def test_noise_of_one_kind_is_parted_by_what_the_filter_is_told() -> None:
-    groups = noise_groups(runs_of(told_noise(2)))
+    groups = noise_groups(runs_of(correlated_noise(2)))
     assert [(group.label, len(group.runs)) for group in groups] == [
         ("white, 0.1 mm", 4),
         ("white, 0.5 mm", 4),
@@ -181,7 +182,7 @@ def test_noise_of_one_kind_is_parted_by_what_the_filter_is_told() -> None:
         ("white, coaptation hidden, 0.5 mm", 4),
         ("white, annulus 1 mm off, 0.5 mm", 4),
     ]
-    rows, _ = summary(told_noise(2))
+    rows, _ = summary(correlated_noise(2))
     assert [row["noise [mm]"] for row in rows[6:8]] == [0.0, 0.0]
     # Correlated errors are errors: what they do to the intervals is judged.
     assert rows[6]["95 % interval covers 90-98 %"] != ""

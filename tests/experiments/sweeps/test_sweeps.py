@@ -1,9 +1,10 @@
-import copy
 import csv
 import json
+from dataclasses import asdict, replace
 
 import pytest
 
+from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import read_sweeps, write_sweep
 from mvest.errors import InputError
 from tests.experiments.sweeps.synthetic_sweeps import (
@@ -20,7 +21,7 @@ from tests.experiments.sweeps.synthetic_sweeps import (
 HOSTILE = r"<b>x</b> | 5 % & $y$ \input{z}_1"
 
 
-def small() -> dict:
+def small() -> Sweep:
     jobs = [
         job({"filter": name}, [run(1, TRUTH * 1.01, [0.1, 0.1])] if name != "c" else [], "dead")
         for name in "abc"
@@ -46,20 +47,23 @@ def test_everything_of_a_sweep_stands_side_by_side(tmp_path) -> None:
 
 
 def test_equal_sweeps_give_equal_files_whenever_they_ran(tmp_path) -> None:
-    first, second = small(), copy.deepcopy(small())
+    first = small()
     # What may differ between an undisturbed sweep and one that was killed and taken up again.
-    second |= {"truth_hits": 7, "truth_misses": 9}
-    second["provenance"] |= {"finished": "2031-01-01T00:00:00Z", "cpu_count": 99, "machine": "x"}
+    source = replace(first.provenance, finished="2031-01-01T00:00:00Z", cpu_count=99, machine="x")
+    second = replace(first, truth_hits=7, truth_misses=9, provenance=source)
     for name, whole in (("a", first), ("b", second)):
         (tmp_path / name).mkdir()
         write_sweep(tmp_path / name, whole)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    for entry in second["cost"]:
-        entry["seconds_total"] = 1e3
-    for found in second["jobs"]:
-        for one in found["runs"]:
-            one["seconds"] = 1e3
-    write_sweep(tmp_path / "b", second)
+    third = replace(
+        second,
+        cost=tuple(replace(entry, seconds_total=1e3) for entry in second.cost),
+        jobs=tuple(
+            replace(job, runs=tuple(replace(run, seconds=1e3) for run in job.runs))
+            for job in second.jobs
+        ),
+    )
+    write_sweep(tmp_path / "b", third)
     before, after = contents(tmp_path / "a"), contents(tmp_path / "b")
     changed = {name for name in before if before[name] != after[name]}
     assert "sweep_filter_cost.csv" in changed
@@ -104,8 +108,7 @@ def test_a_picture_that_no_longer_holds_is_taken_away(tmp_path) -> None:
 
 
 def test_a_sweep_cannot_write_elsewhere(tmp_path) -> None:
-    whole = small()
-    whole["sweep"]["name"] = "../x"
+    whole = replace(small(), sweep={"name": "../x", "kind": "filter"})
     with pytest.raises(InputError, match="letters, digits"):
         write_sweep(tmp_path, whole)
 
@@ -119,7 +122,7 @@ def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
 def test_published_sweeps_are_read_back_and_damage_is_named(tmp_path) -> None:
     assert read_sweeps(tmp_path) == []
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "noise.json").write_text(json.dumps(noise(2)), encoding="utf-8")
+    (tmp_path / "sweeps" / "noise.json").write_text(json.dumps(asdict(noise(2))), encoding="utf-8")
     assert read_sweeps(tmp_path) == [noise(2)]
     (tmp_path / "sweeps" / "a.json").write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match=r"a\.json is not JSON"):
