@@ -7,20 +7,8 @@ from dataclasses import dataclass
 from experiments.common.record import Status
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Confounded",
-    "Data",
-    "EstimatedModulus",
-    "Identified",
-    "Innovation",
-    "Matrix",
-    "Paper",
-    "SeedRun",
-    "Spread",
-    "Vector",
-    "matrix",
-    "vector",
-]
+__all__ = ["Confounded", "Data", "EstimatedModulus", "Identified", "Innovation", "Matrix", "Paper",
+           "SeedRun", "Spread", "Vector", "matrix", "vector"]  # fmt: skip
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -46,16 +34,9 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """What the paper reports for the same experiment; None where it says nothing.
+    """What the paper reports of the same experiment: ``(p,)`` MPa and %, mean and SD of the others.
 
-    Attributes
-    ----------
-    table : str
-    estimate : (p,) or None
-        MPa.
-    error_percent : (p,) or None
-    moduli_error_percent, distance_mm : (2,) or None
-        Mean and standard deviation, over all moduli and over all vertices.
+    Errors of all moduli are in %, distances of all vertices in mm; None where it says nothing.
     """
 
     table: str
@@ -76,14 +57,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class EstimatedModulus:
-    """One modulus of a leaflet, estimated or following from one that is, in MPa.
-
-    Attributes
-    ----------
-    region, name : str
-    estimate : float
-    std, truth, relative_error : float or None
-    """
+    """One modulus of a leaflet in MPa, estimated or following from one that is."""
 
     region: str
     name: str
@@ -95,18 +69,9 @@ class EstimatedModulus:
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """What of the observation the first prediction leaves over.
+    """What of the ``size`` numbers observed the first prediction leaves over, in their unit.
 
-    Attributes
-    ----------
-    size : int
-        Numbers of the observation.
-    rms, max_abs : float
-        In its unit.
-    nis : float
-        Normalised innovation squared.
-    nis_band : (2,)
-        Where 95 % of such values lie.
+    ``nis`` is the normalised innovation squared; 95 % of such values lie in ``nis_band``.
     """
 
     size: int
@@ -118,14 +83,9 @@ class Innovation:
 
 @dataclass(frozen=True, slots=True)
 class Confounded:
-    """Parameters that the data hardly tell apart, and a change of each that hardly shows.
+    """Parameters ``(g,)`` that the data hardly tell apart, and changes of them that hardly show.
 
-    Attributes
-    ----------
-    parameters : tuple of str, (g,)
-    changes, relative : (g,)
-        In units of the parameters, and in parts of their scales.
-    correlation : float
+    Changes ``(g,)`` are in units of the parameters, and relative to their scales.
     """
 
     parameters: tuple[str, ...]
@@ -136,16 +96,9 @@ class Confounded:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """What the data alone could tell at best.
+    """What the data alone could tell at best: the Cramér-Rao bound ``(p,)``.
 
-    Attributes
-    ----------
-    cramer_rao_std : (p,)
-        None where they determine a parameter not at all.
-    condition_number : float or None
-    flat : tuple of str
-        Combinations that are known badly.
-    confounded : tuple of Confounded
+    None where they determine a parameter not at all; ``flat`` are combinations known badly.
     """
 
     cramer_rao_std: tuple[float | None, ...]
@@ -162,16 +115,13 @@ class SeedRun:
     ----------
     seed : int or None
         None where a job was lost that does not say which seeds it had.
-    status : {"converged", "failed"}
-    reason, detail : str
-    estimate, std, relative_error : (p,) or None
-    bound : (p,) or None
-        Cramér-Rao standard deviations.
+    status, reason, detail : str
+    estimate, std, relative_error, bound : (p,) or None
+        The bound is the Cramér-Rao standard deviation.
     distance_mm, distance_to_truth_mm : Spread or None
         Of the fitted vertices from the observed ones, and from the true ones.
-    nis : float or None
-        Normalised innovation squared.
-    nis_band : (2,) or None
+    nis, nis_band : float and (2,), or None
+        Normalised innovation squared, and where 95 % of such values lie.
     iterations, forward_solves : int or None
     iterates, iterate_std : (i, p) or None
     seconds : float or None

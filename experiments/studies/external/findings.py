@@ -11,20 +11,7 @@ __all__ = ["Findings", "Program"]
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """How the program was used.
-
-    Attributes
-    ----------
-    command : tuple of str
-    points : int
-        That it predicts.
-    runs, reused : int
-        Started, and finished ones that served again.
-    seconds : float
-        Of all its runs.
-    own_jacobian : bool
-        Whether it gives derivatives.
-    """
+    """How a program that predicts so many points was used: runs started, and served again."""
 
     command: tuple[str, ...]
     points: int

@@ -13,17 +13,7 @@ __all__ = ["Band", "Curves", "Distance", "Excised", "Findings", "Fit", "Paramete
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of a fit, in its unit; None where it is not known.
-
-    Attributes
-    ----------
-    name, unit : str
-    truth : float or None
-    start : float
-    estimate, std : float or None
-    bound : float or None
-        Cramér-Rao standard deviation.
-    """
+    """One parameter of a fit in its unit, with the Cramér-Rao bound; None where not known."""
 
     name: str
     unit: str
@@ -36,12 +26,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Distance:
-    """Distances of the fitted from the true closed valve, in mm.
-
-    Attributes
-    ----------
-    mean, max : float
-    """
+    """Distances of the fitted from the true closed valve, in mm."""
 
     mean: float
     max: float
@@ -51,18 +36,8 @@ class Distance:
 class Fit:
     """What one law makes of the observation.
 
-    Attributes
-    ----------
-    law : str
-    parameters : tuple of Parameter
-    distance_mm : Distance or None
-        None where nothing was fitted, as what follows.
-    residual_rms_mm, chi_square : float or None
-        Of observed and fitted coordinates; chi-square per coordinate.
-    iterations, forward_solves : int
-    seconds : float
-    reason : str
-    converged : bool
+    Residual (root mean square) and chi-square are per observed coordinate; None where nothing was
+    fitted.
     """
 
     law: str
@@ -79,17 +54,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The exponential law from an observation with other errors.
-
-    Attributes
-    ----------
-    seed : int
-        Of the errors.
-    estimate, low, high : (p,)
-        With its 95 % interval.
-    converged : bool
-    forward_solves : int
-    """
+    """The exponential law ``(p,)`` and its 95 % interval from an observation with other errors."""
 
     seed: int
     estimate: Vector
@@ -101,12 +66,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Stress of an estimated law in MPa, with its 95 % band.
-
-    Attributes
-    ----------
-    estimate, low, high : (n, 2)
-    """
+    """Stress ``(n, 2)`` MPa of an estimated law, with its 95 % band."""
 
     estimate: Matrix
     low: Matrix
@@ -115,14 +75,7 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Nominal stress of a leaflet in MPa under equibiaxial stretch.
-
-    Attributes
-    ----------
-    stretch : (n,)
-    truth, linear : (n, 2)
-    exponential : Band
-    """
+    """Nominal stress ``(n, 2)`` MPa of a leaflet under equibiaxial stretch ``(n,)``."""
 
     stretch: Vector
     truth: Matrix
@@ -132,13 +85,7 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Stretches in a closed leaflet: 5th, 50th and 95th percentile.
-
-    Attributes
-    ----------
-    along, across : (3,)
-        The fibres.
-    """
+    """5th, 50th and 95th percentile ``(3,)`` of the stretches in a closed leaflet, by fibres."""
 
     along: Vector
     across: Vector
@@ -146,17 +93,10 @@ class Stretches:
 
 @dataclass(frozen=True, slots=True)
 class Excised:
-    """The law with the coefficients of an excised leaflet, under equibiaxial stretch.
+    """Stress ``(n, 2)`` MPa by the coefficients of an excised leaflet, equibiaxial stretch ``(n,)``.
 
-    Attributes
-    ----------
-    stretch : (n,)
-    stress : (n, 2)
-        MPa.
-    slope_at_rest, slope : float
-        MPa, along the fibres, the second where `reached` begins; None if it is not.
-    reached : (2,)
-        Stretches at which the stress by which leaflets are compared is reached, or None.
+    Slopes in MPa are those along the fibres, the second at the first of the stretches that are
+    ``reached (2,)`` at the stress by which leaflets are compared; None if it is not.
     """
 
     stretch: Vector
@@ -175,15 +115,11 @@ class Findings:
     truth : (p,)
     noise_mm : float
         Standard deviation of an observed coordinate.
-    excised : mapping
-        Leaflet -> Excised.
+    excised, curves, stretches : mapping
+        Leaflet -> its own; without curves unless both fits have an estimate.
     fits : tuple of Fit
         Exponential and linear; none if the valve did not close, as all that follows.
     samples : tuple of Sample
-    curves : mapping
-        Leaflet -> Curves; empty unless both fits have an estimate.
-    stretches : mapping
-        Leaflet -> Stretches.
     chi_square_band : (2,) or None
         Where chi-square per coordinate of a right model lies in 95 % of cases.
     """

@@ -13,22 +13,9 @@ __all__ = ["Apart", "Difference", "Findings", "Row"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What one model estimates from the data of one code.
+    """What one model estimates, ``(p,)`` and its iterates ``(i, p)``, from the data of one code.
 
-    Attributes
-    ----------
-    data, model : str
-        The code, and the model of the filter.
-    converged : bool
-    reason : str
-    estimate, std, relative_error : (p,)
-    residual_mm : float or None
-        Root mean square.
-    iterations, forward_solves : int
-    program_runs : int or None
-        Where the model is a program.
-    seconds : float
-    iterates : (i, p)
+    The residual is the root mean square; ``program_runs`` is None unless the model is a program.
     """
 
     data: str
@@ -48,14 +35,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """How far apart two predictions of the same points are.
-
-    Attributes
-    ----------
-    rms_mm, max_mm : float
-    derivatives : float
-        Relative to their size.
-    """
+    """How far apart two predictions are: points in mm, derivatives relative to their size."""
 
     rms_mm: float
     max_mm: float
@@ -66,12 +46,8 @@ class Apart:
 class Difference:
     """How far others are from scikit-fem with the Biot law on one mesh; None where one failed.
 
-    Attributes
-    ----------
-    cells : (3,)
-        Along, across, through the thickness.
-    hex18, hex27, st_venant_kirchhoff : Apart or None
-        This project's solid-shells, its triquadratic bricks, and scikit-fem with another law.
+    Cells ``(3,)`` are along, across and through the thickness; ``hex18`` and ``hex27`` this
+    project's solid-shells and triquadratic bricks, the last scikit-fem with another law.
     """
 
     cells: tuple[int, ...]
@@ -89,9 +65,8 @@ class Findings:
     truth : (p,)
     noise_mm : float
         Standard deviation of an observed coordinate.
-    rows : tuple of Row
-        Empty if a code gave no data, as what follows.
-    differences : tuple of Difference
+    rows, differences : tuple
+        Empty if a code gave no data, as the shapes.
     shapes : mapping
         Code -> observed points ``(n, 3)`` mm.
     sheet : Sheet
