@@ -93,7 +93,7 @@ class Stretches:
 
 @dataclass(frozen=True, slots=True)
 class Excised:
-    """Stress ``(n, 2)`` MPa by the coefficients of an excised leaflet, equibiaxial stretch ``(n,)``.
+    """Stress ``(n, 2)`` MPa with the coefficients of an excised leaflet, and stretch ``(n,)``.
 
     Slopes in MPa are those along the fibres, the second at the first of the stretches that are
     ``reached (2,)`` at the stress by which leaflets are compared; None if it is not.
