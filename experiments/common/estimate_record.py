@@ -163,14 +163,14 @@ def innovation_of(filtered: Estimate | None) -> Innovation | None:
 
 def identified_of(result: StudyResult) -> Identified | None:
     """What the data alone could tell."""
-    found = result.identifiability
-    if found is None:
+    known = result.identifiability
+    if known is None:
         return None
-    condition = found.condition_number
+    condition = known.condition_number
     return Identified(
-        tuple(float(v) if np.isfinite(v) else None for v in found.std),
+        tuple(float(v) if np.isfinite(v) else None for v in known.std),
         condition if np.isfinite(condition) else None,
-        tuple(found.flat()),
+        tuple(known.flat()),
         tuple(
             Confounded(
                 tuple(group["parameters"]),
@@ -178,6 +178,6 @@ def identified_of(result: StudyResult) -> Identified | None:
                 tuple(group["relative"]),
                 group["correlation"],
             )
-            for group in confounded_record(found)
+            for group in confounded_record(known)
         ),
     )

@@ -86,19 +86,26 @@ def write_report(
 def write_each(
     table: Callable[[Record[F]], pd.DataFrame],
     words: Callable[[Record[F]], str],
-    figure: Callable[[Record[F]], Figure] | None = None,
+    figure: Callable[[Record[F]], Figure | None] | None = None,
+    **more: Callable[[Record[F]], Figure | None],
 ) -> Callable[[Path, Mapping[str, Record[F]], Mapping[str, Path]], list[Path]]:
-    """How a study writes whose records are each reported by themselves, without arrays."""
+    """How a study writes whose records are each reported by themselves, without arrays.
+
+    ``more`` figures are called ``EXPERIMENT_NAME``; one that returns None has nothing to show.
+    """
 
     def write(
         folder: Path, records: Mapping[str, Record[F]], _arrays: Mapping[str, Path]
     ) -> list[Path]:
-        return [
-            path
-            for record in records.values()
-            for path in write_report(
-                folder, record, table(record), words(record), figure and figure(record)
-            )
-        ]
+        written = []
+        for record in records.values():
+            drawn = figure and figure(record)
+            written += write_report(folder, record, table(record), words(record), drawn)
+            for name, draw in more.items():
+                other = draw(record)
+                if other is not None:
+                    base = folder / f"{record.experiment}_{name}"
+                    written += save_figure_with(base, other, record.line)
+        return written
 
     return write

@@ -31,7 +31,7 @@ def collect(
     ----------
     plan : Plan
     returned : mapping
-        Short hash -> what the job's launcher was told at its end, for those that ended.
+        Short hash -> what the job gave its launcher at its end, for those that ended.
     earlier : mapping
         Short hash -> overhead that was measured when the job was run before.
     """

@@ -60,16 +60,16 @@ FILES = ("*.json", "*.png", "*.csv", "*.md")
 """Files of a job kept with its run; of a figure the picture, not its PDF."""
 
 PARAMETERS_AT_ONCE, VALUES_AT_ONCE = 100, 900
-"""Most parameters, and most values of all kinds, that one call of MLflow takes."""
+"""Parameters, and values of all kinds, that one call of MLflow takes at most."""
 
 LONGEST_TEXT = 5000
-"""Most characters of a tag or parameter that MLflow takes."""
+"""Largest number of characters of a tag or parameter that MLflow takes."""
 
 MANNERS = {
     # A server that is away is given up after seconds, not MLflow's minutes: nothing is lost.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
-    # What is computed here is told to the tracking store and to nobody else.
+    # What is computed here goes to the tracking store and nowhere else.
     "MLFLOW_DISABLE_TELEMETRY": "true",
 }
 """Settings of MLflow's, unless the user has made them; its server inherits them."""

@@ -213,12 +213,12 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
             sentences.append(f"It is above that for {_listed(list(above))}.")
     if shares:
         low, high = COVERAGE_RANGE
-        least = min(shares)
+        smallest = min(shares)
         sentences.append(
             f"The nominal 95 % interval covers the truth in {100 * low:.0f}–{100 * high:.0f} % of "
             f"the runs in {verdicts['yes']} of {len(shares)} combinations, in {verdicts['no']} it "
             f"does not, in {verdicts['too few runs to tell']} there are too few runs to tell; the "
-            f"smallest coverage is {100 * least[0]:.0f} % ({least[1]})."
+            f"smallest coverage is {100 * smallest[0]:.0f} % ({smallest[1]})."
         )
         if outside:
             sentences.append(f"It does not for {_listed(list(outside))}.")
@@ -285,16 +285,16 @@ def _filter(sweep: Sweep, runs: list[Run]) -> list[str]:
                 entries.append((max(errors), solves, name))
         if not entries:
             continue
-        best, least = min(entries), min(entries, key=lambda entry: entry[1])
+        best, cheapest = min(entries), min(entries, key=lambda entry: entry[1])
         where = f" ({condition})" if condition else ""
         sentences.append(
             f"The smallest error{where} is that of “{best[2]}”: {number(best[0])} % (root mean "
             f"square, worst modulus), with {number(best[1])} forward solves."
         )
-        if least[2] != best[2]:
+        if cheapest[2] != best[2]:
             sentences.append(
-                f"“{least[2]}” takes the fewest forward solves{where}: {number(least[1])}, at an "
-                f"error of {number(least[0])} %."
+                f"“{cheapest[2]}” takes the fewest forward solves{where}: "
+                f"{number(cheapest[1])}, at an error of {number(cheapest[0])} %."
             )
         if len(entries) > 2:
             worst = max(entries)

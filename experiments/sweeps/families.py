@@ -97,7 +97,7 @@ def noise_groups(runs: Sequence[Run]) -> list[NoiseGroup]:
     """Groups of runs by kind of noise and level, in the order of the sweep.
 
     Independent and correlated errors add up in the level. Where runs of one kind and level differ
-    in something else, what the filter is told of the noise, say, that becomes part of the kind.
+    in something else, what the filter assumes of the noise, say, that becomes part of the kind.
     """
     names = list(dict.fromkeys(name for run in runs for name in run.factors))
     groups = []

@@ -73,7 +73,7 @@ def noise_figure(sweep: Sweep) -> Figure | None:
     """Error against the noise level: a row per parameter, a column per kind of noise.
 
     Kinds with a single level stand side by side in one column, on a scale of their own: errors that
-    the filter is not told about are larger by an order of magnitude.
+    the filter does not know of are larger by an order of magnitude.
     """
     runs = runs_of(sweep)
     if not any(np.isfinite(run.error).any() for run in runs if run.converged):

@@ -35,7 +35,7 @@ COLOUR_RANGE = (1e-3, 1e2)
 """Percent; smaller and larger errors have the colours of the ends."""
 ZOOM = 5
 """Half height of an inset in standard deviations."""
-MOST_NUMBERS = 8
+MAX_NUMBERS = 8
 """Cells along one side up to which each cell can hold its number."""
 
 
@@ -103,7 +103,7 @@ def _grid(
     shown: ScalarMappable,
 ) -> None:
     edges = [_edges(values) for values in ticks]
-    numbered = max(len(values) for values in ticks) <= MOST_NUMBERS
+    numbered = max(len(values) for values in ticks) <= MAX_NUMBERS
     inside = set()
     for middle, run in places.items():
         i, j = (int(np.searchsorted(values, m)) for values, m in zip(ticks, middle, strict=True))
@@ -128,7 +128,7 @@ def _grid(
     _outline(axes, inside, edges)
     for values, axis in zip(ticks, (axes.xaxis, axes.yaxis), strict=True):
         axis.set_minor_locator(NullLocator())
-        step = 1 if len(values) <= 2 * MOST_NUMBERS else len(values) // MOST_NUMBERS
+        step = 1 if len(values) <= 2 * MAX_NUMBERS else len(values) // MAX_NUMBERS
         axis.set_ticks(values[::step], [plain_number(value) for value in values[::step]])
     axes.set_xlim(edges[0][0], edges[0][-1])
     axes.set_ylim(edges[1][0], edges[1][-1])

@@ -161,8 +161,8 @@ def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
             text[f"{name}{unit_of(name)}"] = with_std(found.mean, found.spread)
             text[f"largest error {name} [%]"] = number(found.worst_percent)
         solves = spread_of([run.forward_solves for run in good])
-        row["forward solves, median"], row["forward solves, most"] = solves["median"], solves["max"]
-        text["forward solves, median (most)"] = (
+        row["forward solves, median"], row["forward solves, max"] = solves["median"], solves["max"]
+        text["forward solves, median (max)"] = (
             f"{number(solves['median'])} ({number(solves['max'])})"
         )
         rows.append(row)

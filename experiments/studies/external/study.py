@@ -14,10 +14,16 @@ from experiments.common.estimate_record import innovation_of, spread
 from experiments.common.estimates import matrix, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
+from experiments.common.report import write_each
 from experiments.common.schema import build
 from experiments.common.study import Job, Study
 from experiments.studies.external.findings import Findings, Program
-from experiments.studies.external.report import external_text, write_external
+from experiments.studies.external.report import (
+    external_table,
+    external_text,
+    external_words,
+    iterates,
+)
 from experiments.studies.external.settings import ExternalSettings, Settings
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
@@ -231,6 +237,6 @@ STUDY = Study(
     findings=Findings,
     run=run_external,
     words=external_text,
-    write=write_external,
+    write=write_each(external_table, external_words, iterates=iterates),
     checks=lambda: (check_external,),
 )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,11 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.common.record import Record
-from experiments.common.report import write_report
-from experiments.studies.law.findings import Excised, Findings
-from mvest.reporting.figures import COLOURS, save_figure_with
+from experiments.studies.law.findings import Findings
+from mvest.reporting.figures import COLOURS
 
-__all__ = ["biaxial_figure", "curves_figure", "law_table", "law_text", "write_law"]
+__all__ = ["biaxial_figure", "curves_figure", "law_table", "law_text", "law_words"]
 
 DIRECTIONS = ("along the fibres", "across the fibres")
 TRUTH, EXPONENTIAL, LINEAR = "black", COLOURS[0], COLOURS[1]
@@ -24,12 +21,19 @@ LAST_STRESS = 0.8
 """MPa; beyond it nothing is drawn."""
 
 
-def curves_figure(found: Findings) -> Figure:
+def curves_figure(record: Record[Findings]) -> Figure | None:
     """Stress against stretch of each leaflet, true and as estimated with either law."""
-    figure = Figure(figsize=(8.6, 3.4 * len(found.curves)), layout="constrained")
-    grid = figure.subplots(len(found.curves), 2, squeeze=False, sharey=True)
-    for axes_of_region, (region, curves) in zip(grid, found.curves.items(), strict=True):
-        seen, stretch, law = found.stretches[region], np.array(curves.stretch), curves.exponential
+    findings = record.findings
+    if not findings.curves:
+        return None
+    figure = Figure(figsize=(8.6, 3.4 * len(findings.curves)), layout="constrained")
+    grid = figure.subplots(len(findings.curves), 2, squeeze=False, sharey=True)
+    for axes_of_region, (region, curves) in zip(grid, findings.curves.items(), strict=True):
+        seen, stretch, law = (
+            findings.stretches[region],
+            np.array(curves.stretch),
+            curves.exponential,
+        )
         for k, (axes, direction) in enumerate(zip(axes_of_region, DIRECTIONS, strict=True)):
             low, _, high = seen.across if k else seen.along
             axes.axvspan(low, high, color="0.9", label="stretches in the closed valve (90 %)")
@@ -62,8 +66,9 @@ def _label(axes: Axes, title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def biaxial_figure(excised: Mapping[str, Excised]) -> Figure:
+def biaxial_figure(record: Record[Findings]) -> Figure:
     """The law with the coefficients of excised leaflets, under equibiaxial stretch."""
+    excised = record.findings.excised
     figure = Figure(figsize=(4.2 * len(excised), 3.6), layout="constrained")
     grid = figure.subplots(1, len(excised), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (region, curves) in zip(grid, excised.items(), strict=True):
@@ -104,12 +109,12 @@ def law_table(record: Record[Findings]) -> pd.DataFrame:
 
 def law_text(record: Record[Findings]) -> str:
     """The tables of both fits and of what other errors make of the exponential law."""
-    found = record.findings
+    findings = record.findings
     lines = [
         "| law | parameter | truth | start | estimate | SD | Cramér-Rao |",
         "|---|---|---|---|---|---|---|",
     ]
-    for fit in found.fits:
+    for fit in findings.fits:
         for p in fit.parameters:
             numbers = (p.truth, p.start, p.estimate, p.std, p.bound)
             cells = ["–" if v is None else f"{v:.3g}" for v in numbers]
@@ -121,7 +126,7 @@ def law_text(record: Record[Findings]) -> str:
         "iterations | time (s) |",
         "|---|---|---|---|---|",
     ]
-    for fit in found.fits:
+    for fit in findings.fits:
         d = fit.distance_mm
         cell = "–" if d is None else f"{d.mean:.3f} / {d.max:.2f}"
         chi = "–" if fit.chi_square is None else f"{fit.chi_square:.3f}"
@@ -129,19 +134,19 @@ def law_text(record: Record[Findings]) -> str:
         lines.append(
             f"| {fit.law}{ended} | {cell} | {chi} | {fit.iterations} | {fit.seconds:.0f} |"
         )
-    if found.chi_square_band is None:
+    if findings.chi_square_band is None:
         return "\n".join(lines)
-    low, high = found.chi_square_band
+    low, high = findings.chi_square_band
     lines += [
         "",
         f"Data: one closed frame of a simulated valve of the exponential law, with independent "
-        f"errors of {found.noise_mm:g} mm of each coordinate. χ² of a right model lies between "
+        f"errors of {findings.noise_mm:g} mm of each coordinate. χ² of a right model lies between "
         f"{low:.3f} and {high:.3f} per coordinate (95 %).",
         "",
         "| leaflet | stretch along the fibres (5th, 50th, 95th percentile) | across |",
         "|---|---|---|",
     ]
-    for region, seen in found.stretches.items():
+    for region, seen in findings.stretches.items():
         cells = [", ".join(f"{v:.2f}" for v in values) for values in (seen.along, seen.across)]
         lines.append(f"| {region} | {cells[0]} | {cells[1]} |")
     return "\n".join([*lines, *_scatter(record)])
@@ -149,18 +154,18 @@ def law_text(record: Record[Findings]) -> str:
 
 def _scatter(record: Record[Findings]) -> list[str]:
     """How the estimates with the exponential law scatter about the truth, in lines of Markdown."""
-    found = record.findings
-    done = [sample for sample in found.samples if sample.converged]
+    findings = record.findings
+    done = [sample for sample in findings.samples if sample.converged]
     if not done:
         return []
-    truth = np.array(found.truth)
+    truth = np.array(findings.truth)
     estimates, low, high = (
         np.array(rows) for rows in zip(*((s.estimate, s.low, s.high) for s in done), strict=True)
     )
     inside = ((low <= truth) & (truth <= high)).sum(axis=0)
     lines = [
         "",
-        f"The exponential law from {len(found.samples)} samples of the errors, of which "
+        f"The exponential law from {len(findings.samples)} samples of the errors, of which "
         f"{len(done)} gave an estimate:",
         "",
         "| parameter | truth | median | smallest to largest | 95 % interval holds the truth |",
@@ -175,16 +180,18 @@ def _scatter(record: Record[Findings]) -> list[str]:
     return lines
 
 
-def _excised(excised: Mapping[str, Excised]) -> str:
-    """What the coefficients of excised leaflets give, beside what was measured in others."""
+def law_words(record: Record[Findings]) -> str:
+    """The tables, and what excised leaflets' coefficients give beside measurements of others."""
     lines = [
+        law_text(record),
+        "",
         "## Coefficients of excised leaflets",
         "",
         "| leaflet | slope along the fibres at rest (MPa) | at 0.1 MPa | stretch at which 0.1 MPa "
         "is reached along / across the fibres |",
         "|---|---|---|---|",
     ]
-    for region, curves in excised.items():
+    for region, curves in record.findings.excised.items():
         reached = " / ".join("–" if v is None else f"{v:.2f}" for v in curves.reached)
         slope = "–" if curves.slope is None else f"{curves.slope:.2g}"
         lines.append(f"| {region} | {curves.slope_at_rest:.2g} | {slope} | {reached} |")
@@ -200,19 +207,3 @@ def _excised(excised: Mapping[str, Excised]) -> str:
             "from May-Newman and Yin (1998); the original was not at hand to compare.",
         ]
     )
-
-
-def write_law(
-    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Table, words and both figures of each record."""
-    written = []
-    for record in records.values():
-        found = record.findings
-        words = f"{law_text(record)}\n\n{_excised(found.excised)}"
-        curves = curves_figure(found) if found.curves else None
-        written += write_report(folder, record, law_table(record), words, curves)
-        written += save_figure_with(
-            folder / f"{record.experiment}_biaxial", biaxial_figure(found.excised), record.line
-        )
-    return written

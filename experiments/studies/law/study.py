@@ -13,6 +13,7 @@ from experiments.common.estimates import matrix, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
+from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.law.findings import (
     Band,
@@ -25,7 +26,13 @@ from experiments.studies.law.findings import (
     Sample,
     Stretches,
 )
-from experiments.studies.law.report import law_text, write_law
+from experiments.studies.law.report import (
+    biaxial_figure,
+    curves_figure,
+    law_table,
+    law_text,
+    law_words,
+)
 from experiments.studies.law.settings import LawSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -144,12 +151,12 @@ def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Stretches]:
     system, _ = model.tuned(values)
     solid = system.solid
     green = solid.evaluate(model.closed.positions, solid.initial_strain(), 0.0).green
-    found = {}
+    by_region = {}
     for k, region in enumerate(model.mesh.region_names):
         own = np.sqrt(1 + 2 * green[model.mesh.region == k][:, :, :2].reshape(-1, 2))
         quantiles = np.percentile(own, [5, 50, 95], axis=0)
-        found[region] = Stretches(*matrix(quantiles.T))
-    return found
+        by_region[region] = Stretches(*matrix(quantiles.T))
+    return by_region
 
 
 def _fit(
@@ -229,18 +236,18 @@ def _curves(
     draws = rng.multivariate_normal(z.mean, z.covariance, DRAWS)
     sampled = [_law(model, exponential.transform.inverse(draw)) for draw in draws]
     stretches = np.column_stack([CURVE, CURVE])
-    found = {}
+    by_region = {}
     for k, region in enumerate(model.mesh.region_names):
         many = np.array([biaxial_stress(law, stretches, k) for law in sampled])
         low, high = np.percentile(many, [2.5, 97.5], axis=0)
         estimated = biaxial_stress(_law(model, exponential.mean), stretches, k)
-        found[region] = Curves(
+        by_region[region] = Curves(
             vector(CURVE),
             matrix(biaxial_stress(_law(model, truth), stretches, k)),
             Band(matrix(estimated), matrix(low), matrix(high)),
             matrix(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
         )
-    return found
+    return by_region
 
 
 def _law(model: ClosureModel, values: FloatArray) -> Law:
@@ -251,21 +258,21 @@ def _law(model: ClosureModel, values: FloatArray) -> Law:
 
 def _excised(coefficients: Mapping[str, tuple[float, ...]]) -> dict[str, Excised]:
     """Curves of the law with coefficients ``[c0 (MPa), c1, c2]`` of each leaflet."""
-    found = {}
+    by_region = {}
     for region, (c0, c1, c2) in coefficients.items():
         law = ExponentialLaw.of([ExponentialTissue(c0, c1, c2)])
         stress = biaxial_stress(law, np.column_stack([EXCISED_CURVE, EXCISED_CURVE]))
         slopes = np.diff(stress[:, 0]) / np.diff(EXCISED_CURVE)
         reached = [_first_above(stress[:, k]) for k in (0, 1)]
         shown = stress.max(axis=1) < 2.0  # MPa; far beyond what is drawn
-        found[region] = Excised(
+        by_region[region] = Excised(
             vector(EXCISED_CURVE[shown]),
             matrix(stress[shown]),
             float(slopes[0]),
             None if reached[0] is None else float(slopes[reached[0] - 1]),
             tuple(None if i is None else float(EXCISED_CURVE[i]) for i in reached),
         )
-    return found
+    return by_region
 
 
 def _first_above(stress: FloatArray) -> int | None:
@@ -278,7 +285,7 @@ STUDY = Study(
     findings=Findings,
     run=run_law_study,
     words=law_text,
-    write=write_law,
+    write=write_each(law_table, law_words, curves_figure, biaxial=biaxial_figure),
     sections=(
         Section(
             "law",

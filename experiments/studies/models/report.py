@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +11,13 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from experiments.common.record import Record
-from experiments.common.report import write_report
 from experiments.studies.models.findings import Apart, Difference, Findings
 from experiments.studies.models.sheet.sheet import Sheet
 from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.markup import MISSING, markdown_rows, number
 from mvest.typing import FloatArray
 
-__all__ = ["models_figure", "models_table", "models_text", "write_models"]
+__all__ = ["models_figure", "models_table", "models_text"]
 
 AGAINST = (
     "this project, the same elements",
@@ -85,9 +82,9 @@ def _estimates(record: Record[Findings]) -> list[dict[str, str]]:
     return rows
 
 
-def _differences(found: Findings) -> list[dict[str, str]]:
+def _differences(findings: Findings) -> list[dict[str, str]]:
     rows = []
-    for row in found.differences:
+    for row in findings.differences:
         cells = {"cells": " × ".join(map(str, row.cells))}
         for name, apart in zip(AGAINST, _against(row), strict=True):
             cells[f"{name}: largest (mm)"] = number(apart and apart.max_mm, 2)
@@ -97,15 +94,15 @@ def _differences(found: Findings) -> list[dict[str, str]]:
 
 
 def _words(record: Record[Findings]) -> str:
-    found, sheet = record.findings, record.findings.sheet
+    findings, sheet = record.findings, record.findings.sheet
     truth = ", ".join(
         f"{name} = {value:g} MPa"
-        for name, value in zip(record.parameters, found.truth, strict=True)
+        for name, value in zip(record.parameters, findings.truth, strict=True)
     )
     return (
         f"Simulated: a sheet of {sheet.length:g} × {sheet.width:g} × "
         f"{sheet.thickness:g} mm, clamped at three sides, under {sheet.pressure_mmHg:g} "
-        f"mmHg; truth {truth}; errors of {found.noise_mm:g} mm SD, the same in both sets of "
+        f"mmHg; truth {truth}; errors of {findings.noise_mm:g} mm SD, the same in both sets of "
         "data. ± is one standard deviation. The estimates that belong to one set of data see the "
         "same numbers, so that what they differ by is the model."
     )
@@ -128,18 +125,20 @@ def models_text(record: Record[Findings]) -> str:
     )
 
 
-def models_figure(record: Record[Findings]) -> Figure:
+def models_figure(record: Record[Findings]) -> Figure | None:
     """The deformed sheet of both codes, the codes' difference, and the estimates of every model."""
-    found = record.findings
+    findings = record.findings
+    if not findings.rows:
+        return None
     figure = Figure(figsize=(11.0, 7.4), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=[1.0, 1.1])
     _draw_sheet(
         figure.add_subplot(grid[0, 0], projection="3d", computed_zorder=False), record.findings
     )
-    _draw_differences(figure.add_subplot(grid[1, 0]), found)
+    _draw_differences(figure.add_subplot(grid[1, 0]), findings)
     panels = [figure.add_subplot(grid[k, 1]) for k in range(len(record.parameters))]
     for k, axes in enumerate(panels):
-        _draw_iterates(axes, found, k)
+        _draw_iterates(axes, findings, k)
         axes.set_ylabel(f"{record.parameters[k]} [MPa]")
     panels[0].set_title("estimates iterate by iterate; the start lies outside", fontsize=10)
     lines, names = panels[0].get_legend_handles_labels()
@@ -147,9 +146,9 @@ def models_figure(record: Record[Findings]) -> Figure:
     return figure
 
 
-def _draw_sheet(axes: Axes3D, found: Findings) -> None:
-    sheet = found.sheet
-    (one, first), (other, second) = found.shapes.items()
+def _draw_sheet(axes: Axes3D, findings: Findings) -> None:
+    sheet = findings.sheet
+    (one, first), (other, second) = findings.shapes.items()
     surface = _with_clamped_sides(np.array(first), sheet)
     middle = surface.shape[0] // 2
     halves = ((surface[: middle + 1], COLOURS[4]), (surface[middle:], COLOURS[5]))
@@ -189,12 +188,12 @@ def _with_clamped_sides(points: FloatArray, sheet: Sheet) -> FloatArray:
     return grid
 
 
-def _draw_iterates(axes: Any, found: Findings, k: int) -> None:
+def _draw_iterates(axes: Any, findings: Findings, k: int) -> None:
     """One modulus iterate by iterate: the colour is the model's, the line the data's."""
-    styles = dict(zip(found.shapes, ("-", ":"), strict=True))
-    models = list(dict.fromkeys(row.model for row in found.rows))
-    shown = [found.truth[k]]
-    for row in found.rows:
+    styles = dict(zip(findings.shapes, ("-", ":"), strict=True))
+    models = list(dict.fromkeys(row.model for row in findings.rows))
+    shown = [findings.truth[k]]
+    for row in findings.rows:
         n = models.index(row.model)
         values = np.array(row.iterates)[:, k]
         shown += values[1:].tolist()
@@ -202,13 +201,13 @@ def _draw_iterates(axes: Any, found: Findings, k: int) -> None:
             np.arange(len(values)), values, linestyle=styles[row.data], color=COLOURS[n],
             marker=MARKERS[n], markersize=10 - 1.5 * n, markerfacecolor="none",
         )  # fmt: skip
-    first = found.rows[0]
+    first = findings.rows[0]
     axes.errorbar(
         len(first.iterates) - 0.85, first.estimate[k], first.std[k], color="black",
         capsize=3, linewidth=1, label="± 1 SD of the noise and the prior",
     )  # fmt: skip
     shown += [first.estimate[k] + sign * first.std[k] for sign in (-1, 1)]
-    axes.axhline(found.truth[k], color="grey", linestyle="--", linewidth=1, label="truth")
+    axes.axhline(findings.truth[k], color="grey", linestyle="--", linewidth=1, label="truth")
     for data, style in styles.items():
         axes.plot([], [], color="black", linestyle=style, label=f"data of {data}")
     for n, model in enumerate(models):
@@ -222,8 +221,8 @@ def _draw_iterates(axes: Any, found: Findings, k: int) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_differences(axes: Axes, found: Findings) -> None:
-    rows = found.differences
+def _draw_differences(axes: Axes, findings: Findings) -> None:
+    rows = findings.differences
     at = np.arange(len(rows))
     for n, name in enumerate(AGAINST):
         column = [_against(row)[n] for row in rows]
@@ -236,14 +235,3 @@ def _draw_differences(axes: Axes, found: Findings) -> None:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="center right")
-
-
-def write_models(
-    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Table, words and, if there are estimates, the figure of each record."""
-    written = []
-    for record in records.values():
-        figure = models_figure(record) if record.findings.rows else None
-        written += write_report(folder, record, models_table(record), models_text(record), figure)
-    return written

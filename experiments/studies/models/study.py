@@ -18,9 +18,10 @@ from experiments.common.build import build_filter
 from experiments.common.estimates import matrix, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
+from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.models.findings import Apart, Difference, Findings, Row
-from experiments.studies.models.report import models_text, write_models
+from experiments.studies.models.report import models_figure, models_table, models_text
 from experiments.studies.models.settings import ModelsSettings, Settings
 from experiments.studies.models.sheet.own import OwnSheet
 from experiments.studies.models.sheet.second import SecondSheet
@@ -152,7 +153,7 @@ def _estimate(
     runs = model.runs if isinstance(model, ProcessModel) else 0
     began = time.perf_counter()
     with SolveBar(name, 0, TYPICAL_SOLVES, PARAMETERS) as bar:
-        found = problem.filter(
+        estimate = problem.filter(
             model,
             problem.prior,
             y,
@@ -164,17 +165,17 @@ def _estimate(
     return Row(
         data=data,
         model=name,
-        converged=found.converged,
-        reason=found.reason.value,
-        estimate=vector(found.mean),
-        std=vector(found.std),
-        relative_error=vector(found.mean / problem.truth - 1.0),
-        residual_mm=found.residual_rms(y),
-        iterations=found.iterations,
-        forward_solves=found.forward_solves,
+        converged=estimate.converged,
+        reason=estimate.reason.value,
+        estimate=vector(estimate.mean),
+        std=vector(estimate.std),
+        relative_error=vector(estimate.mean / problem.truth - 1.0),
+        residual_mm=estimate.residual_rms(y),
+        iterations=estimate.iterations,
+        forward_solves=estimate.forward_solves,
         program_runs=model.runs - runs if isinstance(model, ProcessModel) else None,
         seconds=time.perf_counter() - began,
-        iterates=matrix(found.iterates),
+        iterates=matrix(estimate.iterates),
     )
 
 
@@ -206,7 +207,7 @@ STUDY = Study(
     findings=Findings,
     run=run_models,
     words=models_text,
-    write=write_models,
+    write=write_each(models_table, models_text, models_figure),
     sections=(
         Section(
             "models",

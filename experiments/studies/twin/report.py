@@ -63,19 +63,19 @@ def _paper_row(record: Twin, paper: Paper) -> dict[str, Any]:
 
 
 def _row(record: Twin) -> dict[str, Any]:
-    found, model, mesh = record.findings, record.model, record.mesh
+    findings, model, mesh = record.findings, record.model, record.mesh
     assert model is not None
     assert mesh is not None
     row: dict[str, Any] = {"run": record.row, "source": "mvest"}
-    errors = found.relative_error
+    errors = findings.relative_error
     for k, name in enumerate(record.parameters):
-        row[f"truth {name}{_unit(name)}"] = found.truth[k]
-        row[f"start {name}{_unit(name)}"] = found.initial[k]
-        row[f"estimate {name}{_unit(name)}"] = _at(found.estimate, k)
-        row[f"std {name}{_unit(name)}"] = _at(found.std, k)
+        row[f"truth {name}{_unit(name)}"] = findings.truth[k]
+        row[f"start {name}{_unit(name)}"] = findings.initial[k]
+        row[f"estimate {name}{_unit(name)}"] = _at(findings.estimate, k)
+        row[f"std {name}{_unit(name)}"] = _at(findings.std, k)
         row[f"error {name} [%]"] = None if errors is None else 100.0 * abs(errors[k])
-    moduli, distance = found.moduli_error_percent, found.distance_mm
-    closed = (found.closure or {}).get("closed")
+    moduli, distance = findings.moduli_error_percent, findings.distance_mm
+    closed = (findings.closure or {}).get("closed")
     measured = closed if isinstance(closed, ClosureMeasurements) else None
     return row | {
         "moduli error mean [%]": moduli and moduli.mean,
@@ -91,9 +91,9 @@ def _row(record: Twin) -> dict[str, Any]:
         "nodes": mesh.nodes,
         "filter": model.filter,
         "noise [mm]": model.noise_mm,
-        "iterations": found.iterations,
+        "iterations": findings.iterations,
         "forward solves": record.forward_solves,
-        "time [s]": found.seconds,
+        "time [s]": findings.seconds,
         "status": record.status,
         "reason": record.reason,
     }
@@ -221,14 +221,14 @@ def _figures(iterates: Path, valve: Path, record: Twin, fields: Path | None) -> 
     """How the estimate came about, and the fitted valve if its arrays are there."""
     from mvest.reporting.figures import iterates_figure, save_figure_with, valve_figure
 
-    found, written = record.findings, []
-    if found.iterates:
+    findings, written = record.findings, []
+    if findings.iterates:
         figure = iterates_figure(
             f"{record.title}: {record.row}",
             record.parameters,
-            found.iterates,
-            found.iterate_std,
-            found.truth,
+            findings.iterates,
+            findings.iterate_std,
+            findings.truth,
         )
         written += save_figure_with(iterates, figure, record.line)
     if fields is not None:

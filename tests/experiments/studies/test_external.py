@@ -65,7 +65,7 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     assert program.runs == 5 * record.forward_solves
     assert not program.own_jacobian
     names = {path.name for path in (tmp_path / "here").iterdir()}
-    assert {"external.csv", "external.md", "iterates.png", "fitted.csv", "done"} <= names
+    assert {"external.csv", "external.md", "external_iterates.png", "fitted.csv", "done"} <= names
     assert "N/mm" in said.out
     assert "differences of its predictions" in said.out
     # The runs are kept: the same study again starts no program.

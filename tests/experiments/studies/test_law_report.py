@@ -6,7 +6,8 @@ import pytest
 
 from experiments.common.record import read_record, record_from, write_record
 from experiments.studies.law.findings import Findings
-from experiments.studies.law.report import curves_figure, law_text, write_law
+from experiments.studies.law.report import curves_figure, law_text
+from experiments.studies.law.study import STUDY
 from mvest.errors import InputError
 from tests.reporting.records import stored
 
@@ -122,14 +123,14 @@ def test_repeats_are_counted_without_those_that_gave_no_estimate():
 
 def test_published_files_come_out_of_the_record_again(tmp_path):
     (tmp_path / "results").mkdir()
-    written = write_law(tmp_path / "results", {"law": RECORD}, {})
+    written = STUDY.write(tmp_path / "results", {"law": RECORD}, {})
     names = {path.name for path in written}
     assert {"law.csv", "law.md", "law.png", "law.pdf", "law_biaxial.png"} <= names
     table = pd.read_csv(tmp_path / "results" / "law.csv")
     assert list(table.parameter) == ["c0.anterior", "c2.anterior", "E_f.anterior"]
     assert table.chi_square_per_number.tolist() == [0.996, 0.996, 1.44]
     write_record(tmp_path / "law.json", RECORD)
-    again = write_law(tmp_path, {"law": read_record(tmp_path / "law.json", Findings)}, {})
+    again = STUDY.write(tmp_path, {"law": read_record(tmp_path / "law.json", Findings)}, {})
     for path in again:
         if path.suffix in (".csv", ".md"):
             assert path.read_text() == (tmp_path / "results" / path.name).read_text()
@@ -137,7 +138,7 @@ def test_published_files_come_out_of_the_record_again(tmp_path):
 
 
 def test_the_figure_shows_truth_estimates_band_and_what_was_seen():
-    along, across = curves_figure(RECORD.findings).axes
+    along, across = curves_figure(RECORD).axes
     for k, axes in enumerate((along, across)):
         lines = {line.get_label().split(",")[0]: line.get_ydata() for line in axes.get_lines()}
         assert set(lines) == {"truth", "exponential law", "linear law"}
@@ -152,7 +153,7 @@ def test_the_figure_shows_truth_estimates_band_and_what_was_seen():
 
 def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
     bare = record(fits=[], curves={}, stretches={}, chi_square_band=None, samples=[])
-    names = {path.name for path in write_law(tmp_path, {"law": bare}, {})}
+    names = {path.name for path in STUDY.write(tmp_path, {"law": bare}, {})}
     assert "law.md" in names
     assert "law.png" not in names
 
@@ -160,4 +161,4 @@ def test_a_run_without_a_fit_has_its_words_and_no_figure(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        write_law(tmp_path / "file", {"law": RECORD}, {})
+        STUDY.write(tmp_path / "file", {"law": RECORD}, {})

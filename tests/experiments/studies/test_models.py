@@ -9,8 +9,8 @@ import pytest
 from experiments.common.record import read_record
 from experiments.run import main
 from experiments.studies.models.findings import Findings
-from experiments.studies.models.report import models_text, write_models
-from experiments.studies.models.study import OTHER_LAW, OWN, PROGRAM, PROGRAM_ALONE, SECOND
+from experiments.studies.models.report import models_text
+from experiments.studies.models.study import OTHER_LAW, OWN, PROGRAM, PROGRAM_ALONE, SECOND, STUDY
 from tests.experiments.runner.logged import logged
 
 pytest.importorskip("skfem")
@@ -74,7 +74,7 @@ def test_every_model_estimates_from_the_data(done):
 
 def test_the_tables_and_the_figure_follow_from_the_record(done, tmp_path):
     record, folder = done
-    names = {path.name for path in write_models(tmp_path, {"models": record}, {})}
+    names = {path.name for path in STUDY.write(tmp_path, {"models": record}, {})}
     assert names == {"models.csv", "models.md", "models.png", "models.pdf"}
     assert names <= {path.name for path in folder.iterdir()}
     assert (tmp_path / "models.csv").read_text() == (folder / "models.csv").read_text()

@@ -54,7 +54,7 @@ class OwnSheet:
             return refused
         sheet = self.sheet
         loads = np.arange(1, sheet.load_steps + 1) / sheet.load_steps
-        found = simulate_body(
+        pressed = simulate_body(
             self.nodes,
             self.elements,
             self.element,
@@ -67,8 +67,8 @@ class OwnSheet:
             static=True,
             parameters=[Parameter(f"E_f.{k}", float(E)) for k, E in enumerate(moduli)],
         )
-        if not found.converged:
-            return Prediction.failed(f"own sheet: {found.reason.value}")
-        y = self._observe(found.frames[-1]).ravel()
-        derivatives = [self._observe(d).ravel() for d in found.sensitivities[-1]]
+        if not pressed.converged:
+            return Prediction.failed(f"own sheet: {pressed.reason.value}")
+        y = self._observe(pressed.frames[-1]).ravel()
+        derivatives = [self._observe(d).ravel() for d in pressed.sensitivities[-1]]
         return Prediction(y, np.column_stack(derivatives))
