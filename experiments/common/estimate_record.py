@@ -16,10 +16,8 @@ from experiments.common.estimates import (
     Innovation,
     SeedRun,
     Spread,
-    Vector,
-    matrix,
-    vector,
 )
+from experiments.common.findings import Vector, finite, rows, vector
 from mvest.estimation.estimate import Estimate
 from mvest.problem.estimate import StudyResult
 from mvest.provenance import provenance
@@ -118,8 +116,8 @@ def seed_run(seed: int, result: StudyResult) -> SeedRun:
         nis_band=None if innovation is None else innovation.nis_band,
         iterations=None if filtered is None else filtered.iterations,
         forward_solves=None if filtered is None else filtered.forward_solves,
-        iterates=None if filtered is None else matrix(filtered.iterates),
-        iterate_std=None if filtered is None else matrix(filtered.iterate_std),
+        iterates=None if filtered is None else rows(filtered.iterates),
+        iterate_std=None if filtered is None else rows(filtered.iterate_std),
         seconds=result.seconds,
     )
 
@@ -166,10 +164,9 @@ def identified_of(result: StudyResult) -> Identified | None:
     known = result.identifiability
     if known is None:
         return None
-    condition = known.condition_number
     return Identified(
-        tuple(float(v) if np.isfinite(v) else None for v in known.std),
-        condition if np.isfinite(condition) else None,
+        tuple(map(finite, known.std)),
+        finite(known.condition_number),
         tuple(known.flat()),
         tuple(
             Confounded(

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
-from mvest.typing import FloatArray
 
-__all__ = ["Confounded", "Data", "EstimatedModulus", "Identified", "Innovation", "Matrix", "Paper",
-           "SeedRun", "Spread", "Vector", "matrix", "vector"]  # fmt: skip
-
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
-
-
-def vector(values: FloatArray) -> Vector:
-    """Numbers ``(n,)`` as a record holds them."""
-    return tuple(values.tolist())
-
-
-def matrix(values: FloatArray) -> Matrix:
-    """Rows ``(m, n)`` as a record holds them."""
-    return tuple(map(tuple, values.tolist()))
+__all__ = ["Confounded", "Data", "EstimatedModulus", "Identified", "Innovation", "Paper", "SeedRun",
+           "Spread"]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +128,8 @@ class SeedRun:
     nis_band: tuple[float, float] | None = None
     iterations: int | None = None
     forward_solves: int | None = None
-    iterates: Matrix | None = None
-    iterate_std: Matrix | None = None
+    iterates: Rows | None = None
+    iterate_std: Rows | None = None
     seconds: float | None = None
 
     @property

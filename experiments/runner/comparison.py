@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from experiments.common.estimates import Vector
+from experiments.common.findings import Vector
 from experiments.common.record import Record
 from experiments.runner.compared import Compared
 from mvest.provenance import config_hash

@@ -9,7 +9,8 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from experiments.common.estimates import Paper, SeedRun, Vector
+from experiments.common.estimates import Paper, SeedRun
+from experiments.common.findings import Vector
 from experiments.common.record import Model, Provenance, Status
 from mvest.errors import InputError
 

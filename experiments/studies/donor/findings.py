@@ -5,15 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.estimates import (
-    Data,
-    EstimatedModulus,
-    Identified,
-    Innovation,
-    Matrix,
-    Spread,
-    Vector,
-)
+from experiments.common.estimates import Data, EstimatedModulus, Identified, Innovation, Spread
+from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
 
 __all__ = [
@@ -134,8 +127,8 @@ class Findings:
 
     estimate: Vector | None
     std: Vector | None
-    iterates: Matrix | None
-    iterate_std: Matrix | None
+    iterates: Rows | None
+    iterate_std: Rows | None
     moduli: tuple[EstimatedModulus, ...]
     distance_mm: Spread | None
     innovation: Innovation | None

@@ -24,7 +24,8 @@ from experiments.common.estimate_record import (
     moduli_of,
     seed_run,
 )
-from experiments.common.estimates import Data, vector
+from experiments.common.estimates import Data
+from experiments.common.findings import vector
 from experiments.common.progress import SolveBar
 from experiments.common.record import Mesh, Outcome
 from experiments.common.report import answer_of_main
@@ -346,7 +347,7 @@ def _fit_row(
         closure=name,
         status="converged" if result.converged else "failed",
         reason=result.reason,
-        start=tuple(start.tolist()),
+        start=vector(start),
         estimate=None if result.estimate is None else vector(result.estimate),
         std=None if result.std is None else vector(result.std),
         distance_mm=None if fitted is None else _distances(study, fitted[-1]),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.estimates import Innovation, Matrix, Spread, Vector
+from experiments.common.estimates import Innovation, Spread
+from experiments.common.findings import Rows, Vector
 
 __all__ = ["Findings", "Program"]
 
@@ -45,8 +46,8 @@ class Findings:
     prior_std: Vector
     estimate: Vector | None
     std: Vector | None
-    iterates: Matrix
-    iterate_std: Matrix
+    iterates: Rows
+    iterate_std: Rows
     distance_mm: Spread | None
     innovation: Innovation | None
     iterations: int

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.common.build import build_filter
 from experiments.common.estimate_record import innovation_of, spread
-from experiments.common.estimates import matrix, vector
+from experiments.common.findings import rows, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
@@ -201,8 +201,8 @@ def run_external(job: Job[Settings]) -> Outcome[Findings]:
         prior_std=vector(estimate.prior.std),
         estimate=vector(estimate.mean) if known else None,
         std=vector(estimate.std) if known else None,
-        iterates=matrix(estimate.iterates),
-        iterate_std=matrix(estimate.iterate_std),
+        iterates=rows(estimate.iterates),
+        iterate_std=rows(estimate.iterate_std),
         distance_mm=spread(distance),
         innovation=innovation_of(estimate),
         iterations=estimate.iterations,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from experiments.common.estimates import Matrix, Vector
+from experiments.common.findings import Rows, Vector
 
 __all__ = ["Band", "Curves", "Distance", "Excised", "Findings", "Fit", "Parameter", "Sample",
            "Stretches"]  # fmt: skip
@@ -68,9 +68,9 @@ class Sample:
 class Band:
     """Stress ``(n, 2)`` MPa of an estimated law, with its 95 % band."""
 
-    estimate: Matrix
-    low: Matrix
-    high: Matrix
+    estimate: Rows
+    low: Rows
+    high: Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +78,9 @@ class Curves:
     """Nominal stress ``(n, 2)`` MPa of a leaflet under equibiaxial stretch ``(n,)``."""
 
     stretch: Vector
-    truth: Matrix
+    truth: Rows
     exponential: Band
-    linear: Matrix
+    linear: Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ class Excised:
     """
 
     stretch: Vector
-    stress: Matrix
+    stress: Rows
     slope_at_rest: float
     slope: float | None
     reached: tuple[float | None, ...]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_twin
-from experiments.common.estimates import matrix, vector
+from experiments.common.findings import rows, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -155,7 +155,7 @@ def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Stretches]:
     for k, region in enumerate(model.mesh.region_names):
         own = np.sqrt(1 + 2 * green[model.mesh.region == k][:, :, :2].reshape(-1, 2))
         quantiles = np.percentile(own, [5, 50, 95], axis=0)
-        by_region[region] = Stretches(*matrix(quantiles.T))
+        by_region[region] = Stretches(*rows(quantiles.T))
     return by_region
 
 
@@ -213,7 +213,7 @@ def _samples(twin: Twin, closed: Prediction, seeds: Sequence[int]) -> tuple[Samp
             assert data.observation is not None
             filtered = estimate(problem, data.observation, on_iterate=bar.iterate).filtered
             assert filtered is not None
-            mean, low, high = matrix(np.stack([filtered.mean, *filtered.interval()]))
+            mean, low, high = rows(np.stack([filtered.mean, *filtered.interval()]))
             samples.append(
                 Sample(seed, mean, low, high, filtered.converged, filtered.forward_solves)
             )
@@ -243,9 +243,9 @@ def _curves(
         estimated = biaxial_stress(_law(model, exponential.mean), stretches, k)
         by_region[region] = Curves(
             vector(CURVE),
-            matrix(biaxial_stress(_law(model, truth), stretches, k)),
-            Band(matrix(estimated), matrix(low), matrix(high)),
-            matrix(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
+            rows(biaxial_stress(_law(model, truth), stretches, k)),
+            Band(rows(estimated), rows(low), rows(high)),
+            rows(biaxial_stress(_law(linear, fits["linear"].estimate), stretches, k)),
         )
     return by_region
 
@@ -267,7 +267,7 @@ def _excised(coefficients: Mapping[str, tuple[float, ...]]) -> dict[str, Excised
         shown = stress.max(axis=1) < 2.0  # MPa; far beyond what is drawn
         by_region[region] = Excised(
             vector(EXCISED_CURVE[shown]),
-            matrix(stress[shown]),
+            rows(stress[shown]),
             float(slopes[0]),
             None if reached[0] is None else float(slopes[reached[0] - 1]),
             tuple(None if i is None else float(EXCISED_CURVE[i]) for i in reached),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.estimates import Matrix, Vector
+from experiments.common.findings import Rows, Vector
 from experiments.studies.models.sheet.sheet import Sheet
 
 __all__ = ["Apart", "Difference", "Findings", "Row"]
@@ -30,7 +30,7 @@ class Row:
     forward_solves: int
     program_runs: int | None
     seconds: float
-    iterates: Matrix
+    iterates: Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Findings:
     noise_mm: float
     rows: tuple[Row, ...]
     differences: tuple[Difference, ...]
-    shapes: Mapping[str, Matrix]
+    shapes: Mapping[str, Rows]
     sheet: Sheet
     library: Mapping[str, str | None]
     seconds: float

@@ -15,7 +15,7 @@ import numpy as np
 
 import mvest
 from experiments.common.build import build_filter
-from experiments.common.estimates import matrix, vector
+from experiments.common.findings import rows, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
@@ -97,7 +97,7 @@ def run_models(job: Job[Settings]) -> Outcome[Findings]:
         PROGRAM: sheet_program(about, runs, derivatives=True),
         PROGRAM_ALONE: sheet_program(about, runs, derivatives=False),
     }
-    rows = tuple(
+    estimates = tuple(
         _estimate(data, clean[data].y + error, name, models[name], problem)
         for data, names in ((OWN, list(models)), (SECOND, [OWN, SECOND, OTHER_LAW]))
         for name in names
@@ -105,12 +105,12 @@ def run_models(job: Job[Settings]) -> Outcome[Findings]:
     return Outcome(
         findings=replace(
             findings,
-            rows=rows,
-            shapes={name: matrix(p.y.reshape(-1, 3)) for name, p in clean.items()},
+            rows=estimates,
+            shapes={name: rows(p.y.reshape(-1, 3)) for name, p in clean.items()},
             differences=tuple(_difference(sheet, cells, truth) for cells in about.refinements),
-            seconds=sum(row.seconds for row in rows),
+            seconds=sum(row.seconds for row in estimates),
         ),
-        forward_solves=sum(row.forward_solves for row in rows),
+        forward_solves=sum(row.forward_solves for row in estimates),
     )
 
 
@@ -175,7 +175,7 @@ def _estimate(
         forward_solves=estimate.forward_solves,
         program_runs=model.runs - runs if isinstance(model, ProcessModel) else None,
         seconds=time.perf_counter() - began,
-        iterates=matrix(estimate.iterates),
+        iterates=rows(estimate.iterates),
     )
 
 

@@ -10,12 +10,11 @@ from experiments.common.estimates import (
     EstimatedModulus,
     Identified,
     Innovation,
-    Matrix,
     Paper,
     SeedRun,
     Spread,
-    Vector,
 )
+from experiments.common.findings import Rows, Vector
 from mvest.valve.measure.measurements import ClosureMeasurements
 
 __all__ = ["Findings"]
@@ -67,8 +66,8 @@ class Findings:
     closure: Mapping[str, ClosureMeasurements | str] | None
     iterations: int
     seconds: float
-    iterates: Matrix | None
-    iterate_std: Matrix | None
+    iterates: Rows | None
+    iterate_std: Rows | None
     innovation: Innovation | None
     identifiability: Identified | None
     repeats: tuple[SeedRun, ...]

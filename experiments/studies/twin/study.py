@@ -20,8 +20,9 @@ from experiments.common.estimate_record import (
     moduli_of,
     seed_run,
 )
-from experiments.common.estimates import Paper, vector
+from experiments.common.estimates import Paper
 from experiments.common.expectation import TwinExpectation
+from experiments.common.findings import vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Mesh, Outcome
 from experiments.common.study import Job, Section, Study
