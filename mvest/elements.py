@@ -16,6 +16,12 @@ Conventions
   (thickness locking). The enhanced modes ``zeta * p(xi, eta)`` remove that (Buechter, Ramm and
   Roehl 1994, Int. J. Numer. Meth. Engng 37:2551, enhanced assumed strain of the thickness
   direction).
+* ``hex18_thin`` is ``hex18`` for thin bodies. In a biquadratic element that bends without being
+  stretched the membrane strain cannot vanish (membrane locking), and neither can the transverse
+  shear. Its ``relaxing`` modes take from each strain what is of the degree that does so, P2 the
+  Legendre polynomial: P2(xi) from E11 and E13, P2(eta) from E22 and E23, both from E12. What is
+  left is as if sampled at the points of reduced integration (Bucalem and Bathe 1993, Int. J. Numer.
+  Meth. Engng 36:3729, for the assumed strains; Simo and Rifai 1990, ibid. 29:1595, for modes).
 """
 
 from __future__ import annotations
@@ -60,6 +66,9 @@ class Element:
         is inside.
     face : str
         Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
+    relaxing : callable or None
+        ``(q, 3) ->`` modes that relax membrane and transverse shear strains: each the two axes of
+        the strain and its values ``(q,)``.
     """
 
     name: str
@@ -75,6 +84,7 @@ class Element:
     face: str
     centre: FloatArray
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    relaxing: Callable[[FloatArray], tuple[tuple[int, int, FloatArray], ...]] | None = None
 
     @property
     def layered(self) -> bool:
@@ -158,7 +168,19 @@ _TRIANGLE_POINTS = np.array(
 _TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def _brick(name: str, thickness_order: int) -> Element:
+def _relaxing(xi: FloatArray) -> tuple[tuple[int, int, FloatArray], ...]:
+    """Modes of ``hex18_thin``, all constant in ``zeta``."""
+    x, y, one = xi[:, 0], xi[:, 1], np.ones(xi.shape[0])
+    p, q = 1.5 * x**2 - 0.5, 1.5 * y**2 - 0.5
+    along = [((0, 0), (0, 2), p * f) for f in (one, y, q)]
+    along += [((1, 1), (1, 2), q * f) for f in (one, x, p)]
+    stretch = [(*axes, values) for axes, _, values in along]
+    across = [(*axes, values) for _, axes, values in along]
+    shear = [(0, 1, values) for values in (p, p * y, q, q * x, p * q)]
+    return (*stretch, *shear, *across)
+
+
+def _brick(name: str, thickness_order: int, *, thin: bool = False) -> Element:
     def shape(xi: FloatArray) -> FloatArray:
         a, _ = _lagrange(2, xi[:, 0])
         b, _ = _lagrange(2, xi[:, 1])
@@ -199,6 +221,7 @@ def _brick(name: str, thickness_order: int) -> Element:
         face="quad9",
         centre=np.zeros((1, 3)),
         top_face=np.arange(9) + 9 * (len(zetas) - 1),
+        relaxing=_relaxing if thin else None,
     )
 
 
@@ -355,6 +378,7 @@ ELEMENTS: dict[str, Element] = {
         _tetrahedron("tet4", 1),
         _tetrahedron("tet10", 2),
         _brick("hex18", 1),
+        _brick("hex18_thin", 1, thin=True),
         _brick("hex27", 2),
         _wedge("wedge12", 1),
         _wedge("wedge18", 2),

@@ -38,7 +38,7 @@ def _templates(element_type: str) -> list[list[tuple[int, ...]]]:
     element(element_type)
     if element_type in ("tet4", "tet10"):
         return _tetrahedra(element_type == "tet10")
-    levels = (0, 2) if element_type in ("hex18", "wedge12") else (0, 1, 2)
+    levels = (0, 1, 2) if element_type in ("hex27", "wedge18") else (0, 2)
     plane: Iterable[Iterable[tuple[int, int]]]
     if element_type.startswith("hex"):
         plane = ([(i, j) for j in range(3) for i in range(3)],)

@@ -1,8 +1,8 @@
 """Reading and writing a `SolidMesh` as VTU, without loss.
 
-Elements that VTK or meshio lacks, ``hex18`` and ``wedge12``, are written as four linear ones.
-Pressure faces are a second block of cells. Fibres are stored per element node, as the mesh has
-them, and as one mean direction per element for looking at.
+Elements that VTK or meshio lacks, ``hex18``, ``hex18_thin`` and ``wedge12``, are written as four
+linear ones. Pressure faces are a second block of cells. Fibres are stored per element node, as the
+mesh has them, and as one mean direction per element for looking at.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ QUARTERS: dict[str, tuple[str, list[list[int]]]] = {
     ),
 }
 """meshio's name and the nodes of the four linear elements that stand for one of ours."""
+QUARTERS["hex18_thin"] = QUARTERS["hex18"]
 
 
 def _to_vtk(name: str, cells: IntArray) -> tuple[str, IntArray]:

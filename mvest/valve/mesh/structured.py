@@ -61,7 +61,8 @@ def structured_mesh(
     shape : MaterialSurface
         The template, or any valve in material coordinates.
     element : str
-        ``hex18``, ``hex27`` (one brick per cell) or ``tet4``, ``tet10`` (six tetrahedra per cell).
+        ``hex18``, ``hex18_thin``, ``hex27`` (one brick per cell) or ``tet4``, ``tet10`` (six
+        tetrahedra per cell).
     columns : int
         Cells around the valve; even, so that the leaflets meet at cell boundaries.
     rows, layers : int
@@ -77,11 +78,13 @@ def structured_mesh(
             f"mesh of {columns} x {rows} x {layers} cells, expected an even number >= 6 of "
             "columns, rows >= 1 and layers >= 1"
         )
-    if element in ("hex18", "hex27"):
+    if element in ("hex18", "hex18_thin", "hex27"):
         return _bricks(shape, element, columns, rows, layers)
     if element in ("tet4", "tet10"):
         return _tetrahedra(shape, element, columns, rows, layers)
-    raise InputError(f"no structured mesh of {element!r}; known: hex18, hex27, tet4, tet10")
+    raise InputError(
+        f"no structured mesh of {element!r}; known: hex18, hex18_thin, hex27, tet4, tet10"
+    )
 
 
 def _grid(*sizes: int) -> tuple[IntArray, ...]:
@@ -104,7 +107,7 @@ def _bricks(
     shape: MaterialSurface, element: str, columns: int, rows: int, layers: int
 ) -> SolidMesh:
     n_phi, n_s = 2 * columns, 2 * rows + 1
-    per_cell = 1 if element == "hex18" else 2
+    per_cell = 2 if element == "hex27" else 1
     n_z = per_cell * layers + 1
     k, j, i = _grid(n_z, n_s, n_phi)
     phi, s, zeta = 360.0 * i / n_phi, j / (n_s - 1), -1 + 2.0 * k / (n_z - 1)
