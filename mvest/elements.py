@@ -18,10 +18,10 @@ Conventions
   direction).
 * ``hex18_thin`` is ``hex18`` for thin bodies. In a biquadratic element that bends without being
   stretched the membrane strain cannot vanish (membrane locking), and neither can the transverse
-  shear. Its ``relaxing`` modes take from each strain what is of the degree that does so, P2 the
-  Legendre polynomial: P2(xi) from E11 and E13, P2(eta) from E22 and E23, both from E12. What is
-  left is as if sampled at the points of reduced integration (Bucalem and Bathe 1993, Int. J. Numer.
-  Meth. Engng 36:3729, for the assumed strains; Simo and Rifai 1990, ibid. 29:1595, for modes).
+  shear. Its covariant strains E11 and E13 are projected on what is linear in ``xi``, E22 and E23 on
+  what is linear in ``eta``, E12 on both, as if sampled at the two points of Gauss' rule in that
+  direction (assumed strains: Huang and Hinton 1986, Int. J. Numer. Meth. Engng 22:73; Bucalem and
+  Bathe 1993, ibid. 36:3729, with the same points).
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ class Element:
         is inside.
     face : str
         Name of the face element of the element's outer faces (of the ``zeta`` faces for layers).
-    relaxing : callable or None
-        ``(q, 3) ->`` modes that relax membrane and transverse shear strains: each the two axes of
-        the strain and its values ``(q,)``.
+    sampling : callable or None
+        Points ``(q, 3)`` and weights ``(q,)`` of the quadrature -> ``(6, q, q)`` what the covariant
+        strains 11, 22, 33, 23, 13, 12 are multiplied by; None where they are as they are.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Element:
     face: str
     centre: FloatArray
     top_face: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    relaxing: Callable[[FloatArray], tuple[tuple[int, int, FloatArray], ...]] | None = None
+    sampling: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     @property
     def layered(self) -> bool:
@@ -168,16 +168,19 @@ _TRIANGLE_POINTS = np.array(
 _TRIANGLE_WEIGHTS = 0.5 * np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def _relaxing(xi: FloatArray) -> tuple[tuple[int, int, FloatArray], ...]:
-    """Modes of ``hex18_thin``, all constant in ``zeta``."""
-    x, y, one = xi[:, 0], xi[:, 1], np.ones(xi.shape[0])
-    p, q = 1.5 * x**2 - 0.5, 1.5 * y**2 - 0.5
-    along = [((0, 0), (0, 2), p * f) for f in (one, y, q)]
-    along += [((1, 1), (1, 2), q * f) for f in (one, x, p)]
-    stretch = [(*axes, values) for axes, _, values in along]
-    across = [(*axes, values) for _, axes, values in along]
-    shear = [(0, 1, values) for values in (p, p * y, q, q * x, p * q)]
-    return (*stretch, *shear, *across)
+def _reduced(xi: FloatArray, weights: FloatArray) -> FloatArray:
+    """Projections ``(6, q, q)`` of ``hex18_thin``, within each layer of points."""
+    same = (xi[:, None, 2] == xi[None, :, 2]) * weights
+
+    def without(axis: int) -> FloatArray:
+        # Along its axis, what is less than quadratic, from the values on the same line.
+        line = same * (xi[:, None, 1 - axis] == xi[None, :, 1 - axis])
+        quadratic = 1.5 * xi[:, axis] ** 2 - 0.5
+        norm = line @ quadratic**2
+        return np.asarray(np.eye(len(xi)) - (quadratic / norm)[:, None] * line * quadratic)
+
+    first, second, all_of_it = without(0), without(1), np.eye(len(xi))
+    return np.stack([first, second, all_of_it, second, first, first @ second])
 
 
 def _brick(name: str, thickness_order: int, *, thin: bool = False) -> Element:
@@ -221,7 +224,7 @@ def _brick(name: str, thickness_order: int, *, thin: bool = False) -> Element:
         face="quad9",
         centre=np.zeros((1, 3)),
         top_face=np.arange(9) + 9 * (len(zetas) - 1),
-        relaxing=_relaxing if thin else None,
+        sampling=_reduced if thin else None,
     )
 
 

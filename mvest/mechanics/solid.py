@@ -14,7 +14,8 @@ Enhanced strains. Solid-shells add ``E = E(u) + M alpha`` with ``M = d p^T``: th
 the element's polynomials p. The parameters alpha of an element solve ``int M^T S dV = 0`` and are
 eliminated inside the element by Newton's method at every evaluation, so that to the outside the
 element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
-modes integrate to zero against constant stress: the patch test holds.
+modes integrate to zero against constant stress: the patch test holds. In elements for thin bodies
+E(u) is sampled at fewer points (:mod:`mvest.mechanics.sampled`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ import numpy as np
 from mvest.elements import Element
 from mvest.errors import InputError
 from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
@@ -152,6 +154,7 @@ class Solid:
         polynomials = reference.enhanced(reference.points)
         self.polynomials = np.ascontiguousarray(polynomials if enhanced else polynomials[:, :0])
         self.n_modes = self.polynomials.shape[1]
+        self.sampling = _sampling(mesh, reference)
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
         self.reset()
 
@@ -167,6 +170,8 @@ class Solid:
         """Strain, stress and tangent at nodal positions ``x (n, 3)`` mm."""
         elements, region = self.mesh.elements, self.mesh.region
         green_u, f = _strains(x, elements, self.gradients)
+        if self.sampling is not None:
+            green_u = self.sampling.strain(green_u)
         if self.n_modes == 0:
             stress, tangent = self.law.response(green_u, region, previous, rate)
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
@@ -191,7 +196,7 @@ class Solid:
 
     def forces(self, state: SolidState) -> FloatArray:
         """Internal forces ``(e, k, 3)`` N."""
-        return _forces(self.gradients, self.volumes, state.deformation, state.stress)
+        return self._forces(state, state.stress)
 
     def add_tangents(self, state: SolidState, positions: IntArray, blocks: FloatArray) -> None:
         """Add the condensed consistent tangents, N/mm, to block data.
@@ -204,10 +209,14 @@ class Solid:
         blocks : ndarray
             ``(n_blocks, 3, 3)``.
         """
+        at = (self.gradients, self.volumes, state.deformation)
+        if self.sampling is not None:
+            modes = self.direction[..., None] * self.polynomials[None, :, None, :]
+            stress = self.sampling.stress(state.stress, self.volumes)
+            self.sampling.add_tangents(*at, stress, state.tangent, modes, positions, blocks)
+            return
         _add_tangents(
-            self.gradients,
-            self.volumes,
-            state.deformation,
+            *at,
             state.stress,
             state.tangent,
             self.direction,
@@ -215,6 +224,11 @@ class Solid:
             positions,
             blocks,
         )
+
+    def _forces(self, state: SolidState, stress: FloatArray) -> FloatArray:
+        if self.sampling is not None:
+            stress = self.sampling.stress(stress, self.volumes)
+        return _forces(self.gradients, self.volumes, state.deformation, stress)
 
     def extrapolated_stress(self, state: SolidState, dx: FloatArray) -> FloatArray:
         """Stress S ``(e, q, 6)`` MPa that a move by ``dx (n, 3)`` mm leads to, to first order."""
@@ -232,7 +246,7 @@ class Solid:
         if self.n_modes:
             change = self._enhanced_change(state, d_stress)
             d_stress = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
-        return _forces(self.gradients, self.volumes, state.deformation, d_stress)
+        return self._forces(state, d_stress)
 
     def green_change(self, state: SolidState, dx: FloatArray, d_stress: FloatArray) -> FloatArray:
         """Total change of the Green-Lagrange strain ``(e, q, 6)``.
@@ -245,6 +259,8 @@ class Solid:
             ``(e, q, 6)`` partial derivative of S at fixed strain.
         """
         d_green = _strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
+        if self.sampling is not None:
+            d_green = self.sampling.strain(d_green)
         if self.n_modes:
             total = d_stress + np.einsum("eqij,eqj->eqi", state.tangent, d_green)
             d_green = d_green + self._enhanced_change(state, total)
@@ -293,6 +309,14 @@ def _fibre_frames(mesh: SolidMesh, reference: Element, jacobian: FloatArray) -> 
         normal = np.cross(fibre, axis)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.stack([fibre, np.cross(normal, fibre), normal], axis=-1)
+
+
+def _sampling(mesh: SolidMesh, reference: Element) -> Sampling | None:
+    if reference.sampling is None:
+        return None
+    x_e, d = mesh.nodes[mesh.elements], reference.gradient(reference.points)
+    jacobian = np.einsum("eai,qaj->eqij", x_e, d)
+    return Sampling.of(reference, jacobian, _fibre_frames(mesh, reference, jacobian))
 
 
 def _enhanced_direction(mesh: SolidMesh, reference: Element) -> FloatArray:

@@ -62,7 +62,10 @@ QUARTERS: dict[str, tuple[str, list[list[int]]]] = {
     ),
 }
 """meshio's name and the nodes of the four linear elements that stand for one of ours."""
-QUARTERS["hex18_thin"] = QUARTERS["hex18"]
+
+
+THIN = "_thin"
+"""Ending of elements that are laid out as those without it; cell data of this name marks them."""
 
 
 def _to_vtk(name: str, cells: IntArray) -> tuple[str, IntArray]:
@@ -86,7 +89,7 @@ def _from_vtk(name: str, cells: IntArray) -> IntArray:
 
 def vtk_cells(mesh: SolidMesh) -> list[tuple[str, IntArray]]:
     """Elements and pressure faces as two blocks of cells in VTK's order."""
-    blocks = [_to_vtk(mesh.element_type, mesh.elements)]
+    blocks = [_to_vtk(mesh.element_type.removesuffix(THIN), mesh.elements)]
     if len(mesh.pressure_faces):
         blocks.append(_to_vtk(mesh.reference.face, mesh.pressure_faces))
     return blocks
@@ -94,7 +97,7 @@ def vtk_cells(mesh: SolidMesh) -> list[tuple[str, IntArray]]:
 
 def vtk_cell_data(mesh: SolidMesh) -> dict[str, list[Any]]:
     """Cell data of those blocks: region (-1 on faces), fibre, and fibres of the element's nodes."""
-    pieces = 4 if mesh.element_type in QUARTERS else 1
+    pieces = 4 if mesh.element_type.removesuffix(THIN) in QUARTERS else 1
     lead = mesh.fibre[:, :1]
     sign = np.where((mesh.fibre * lead).sum(axis=2, keepdims=True) < 0, -1.0, 1.0)
     solid: dict[str, NDArray[np.generic]] = {
@@ -102,6 +105,8 @@ def vtk_cell_data(mesh: SolidMesh) -> dict[str, list[Any]]:
         "fibre": (sign * mesh.fibre).mean(axis=1),
         "node_fibres": mesh.fibre.reshape(len(mesh.elements), -1),
     }
+    if mesh.element_type.endswith(THIN):
+        solid[THIN] = np.ones(len(mesh.elements), dtype=np.int8)
     solid = {name: np.repeat(values, pieces, axis=0) for name, values in solid.items()}
     if not len(mesh.pressure_faces):
         return cell_arrays([solid])
@@ -174,7 +179,7 @@ def read_solid(path: Path | str) -> SolidMesh:
         return SolidMesh(
             nodes=np.asarray(mesh.points, dtype=np.float64),
             elements=elements,
-            element_type=name,
+            element_type=name + THIN if THIN in mesh.cell_data else name,
             region=np.asarray(data["region"][::pieces], dtype=np.int64),
             region_names=region_names(mesh.cell_data, source),
             fibre=data["node_fibres"][::pieces].reshape(len(elements), -1, 3),
