@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -16,6 +16,7 @@ from mvest.reporting.figures import save_figure_with
 __all__ = [
     "answer_of_main",
     "axis_label",
+    "page",
     "parameter_label",
     "percent",
     "write_each",
@@ -58,6 +59,11 @@ def percent(value: float | None, form: str, missing: str) -> str:
 def answer_of_main(answer: Callable[[Record[F]], str]) -> Callable[[Mapping[str, Record[F]]], str]:
     """The answer of a section whose table has one record, or is answered by its main one."""
     return lambda records: answer(next(iter(records.values())))
+
+
+def page(record: Record[Any], words: str) -> str:
+    """Markdown of a record: its title, words, and in small print where it came from."""
+    return f"# {record.title}\n\n{words}\n\n<sub>{record.line}</sub>\n"
 
 
 def write_report(

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from experiments.common.record import Record
+from experiments.common.report import page
 from experiments.studies.donor.findings import Distances, Findings
 from mvest.errors import InputError
 from mvest.files import write_atomically
@@ -228,11 +229,10 @@ def write_donor(
     for name, record in records.items():
         found, base = record.findings, folder / record.experiment
         table = donor_table(record).to_csv(index=False, float_format="%.6g")
-        text = f"# {record.title}\n\n{donor_words(record)}\n\n<sub>{record.line}</sub>\n"
         note = f"# {found.claim}\n# data: {found.data.citation}\n# {record.line}\n"
         written += [
             write_atomically(base.with_suffix(".csv"), note + table),
-            write_atomically(base.with_suffix(".md"), text),
+            write_atomically(base.with_suffix(".md"), page(record, donor_words(record))),
         ]
         if name in arrays:
             written += save_figure_with(base, donor_figure(arrays[name]), record.line)

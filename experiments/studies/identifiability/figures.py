@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,19 +12,19 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from experiments.common.record import Record
 from experiments.common.report import axis_label
-from mvest.reporting.figures import COLOURS, MARKERS, save_figure
+from experiments.studies.identifiability.findings import Findings, Joint, Profile
+from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.style import SMALL, headline, panels, plain_number
 from mvest.typing import FloatArray
 
 __all__ = [
     "designs_figure",
+    "identifiability_figures",
     "profiles_figure",
     "valley_figure",
-    "write_identifiability_figures",
 ]
-
-Record = Mapping[str, Any]
 
 MULTIPLES = (1.0, 2.0, 6.0)
 """Of the target: where a deviation's colour changes."""
@@ -35,31 +33,31 @@ SHADES = ("#0072B2", "#9ECAE1", "#F6E3C5", "#E8A87C")
 """From within the target to far from it; blue is what all figures show as good."""
 
 
-def write_identifiability_figures(folder: Path, record: Record) -> list[Path]:
-    """``identifiability_designs``, ``_profiles`` and ``_valley`` as PNG and PDF."""
-    if not record.get("designs"):
-        return []
-    written = save_figure(folder / "identifiability_designs", designs_figure(record), record)
-    if record["profiles"]:
-        written += save_figure(folder / "identifiability_profiles", profiles_figure(record), record)
-        written += save_figure(folder / "identifiability_valley", valley_figure(record), record)
-    return written
+def identifiability_figures(record: Record[Findings]) -> dict[str, Figure]:
+    """Figures by the ends of their names: designs, and what profiles there are to show."""
+    findings = record.findings
+    figures = {"designs": designs_figure(findings)}
+    if findings.profiles:
+        figures["profiles"] = profiles_figure(findings, record.parameters)
+        figures["valley"] = valley_figure(findings, record.parameters)
+    return figures
 
 
-def designs_figure(record: Record) -> Figure:
+def designs_figure(findings: Findings) -> Figure:
     """Deviation of the first modulus as a table in colours, one panel for each knowledge."""
-    settings = record["settings"]
-    modulus = next(row["parameter"] for row in record["designs"])
-    typical, target = f"{settings['typical_mm']:g}", 100 * settings["target"]
+    settings = findings.settings
+    modulus = findings.designs[0].moduli[0].parameter
+    typical, target = f"{settings.typical_mm:g}", 100 * settings.target
     table = pd.DataFrame(
         {
-            "knowledge": row["knowledge"],
-            "seen": f"{row['vertices_words']}, {row['errors']}",
-            "frames": row["frames"],
-            "percent": np.inf if row["std"][typical] is None else 100 * row["std"][typical],
+            "knowledge": one.knowledge,
+            "seen": f"{design.vertices_words}, {design.errors}",
+            "frames": design.frames,
+            "percent": np.inf if (std := one.std[typical]) is None else 100 * std,
         }
-        for row in record["designs"]
-        if row["parameter"] == modulus
+        for design in findings.designs
+        for one in design.moduli
+        if one.parameter == modulus
     )
     shown, knowledges = _without_twins(table), list(table["knowledge"].unique())
     seen, frames = list(shown["seen"].unique()), list(shown["frames"].unique())
@@ -115,25 +113,27 @@ def _without_twins(table: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-def profiles_figure(record: Record) -> Figure:
+def profiles_figure(findings: Findings, parameters: tuple[str, ...]) -> Figure:
     """The deviance of each parameter, and below it how the others follow."""
-    found = record["profiles"]
-    names = list(dict.fromkeys(one["parameter"] for one in found))
-    labels = list(dict.fromkeys(one["label"] for one in found))
+    profiles = findings.profiles
+    names = list(dict.fromkeys(one.parameter for one in profiles))
+    labels = list(dict.fromkeys(one.label for one in profiles))
     figure = Figure(figsize=(2.9 * len(names), 5.8), layout="constrained")
     grid = figure.subplots(2, len(names), sharex="col", sharey="row", squeeze=False)
     for column, name in enumerate(names):
         upper, lower = grid[:, column]
+        own = {one.label: one for one in profiles if one.parameter == name}
         for k, text in enumerate(labels):
-            one = next(o for o in found if o["parameter"] == name and o["label"] == text)
-            at = one["parameters"].index(name)
-            path = np.array(one["path"])
-            style = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k], "markersize": 3}
-            upper.plot(path[:, at], one["deviance"], label=text, linewidth=1, **style)
-        upper.axhline(one["threshold"], color="black", linestyle="--", linewidth=1)
+            one = own[text]
+            held = np.array(one.path)[:, one.at]
+            upper.plot(
+                held, one.deviance, label=text, linewidth=1, markersize=3,
+                color=COLOURS[k % len(COLOURS)], marker=MARKERS[k],
+            )  # fmt: skip
+        upper.axhline(one.threshold, color="black", linestyle="--", linewidth=1)
         upper.set_ylim(-0.3, 10)
         upper.set_title(axis_label(name), fontsize=10)
-        _draw_followers(lower, record, _first_of(found, name), name)
+        _draw_followers(lower, findings, own[labels[0]], parameters)
         lower.set_xlabel(axis_label(name) + (" [MPa]" if name.startswith("E_f.") else " [factor]"))
         for axes in (upper, lower):
             axes.grid(alpha=0.3)
@@ -158,23 +158,17 @@ def _titled_legend(figure: Figure, axes: Any, title: str, columns: int | None = 
     )  # fmt: skip
 
 
-def _first_of(found: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]:
-    """The first observation's profile."""
-    return next(one for one in found if one["parameter"] == name)
-
-
-def _draw_followers(axes: Any, record: Record, one: Mapping[str, Any], name: str) -> None:
-    path = np.array(one["path"])
-    at = one["parameters"].index(name)
-    for other in one["parameters"]:
-        if other == name:
+def _draw_followers(
+    axes: Any, findings: Findings, one: Profile, parameters: tuple[str, ...]
+) -> None:
+    change = _relative(findings, one, parameters)
+    for k, other in enumerate(one.parameters):
+        if other == one.parameter:
             continue
-        k = one["parameters"].index(other)
-        start = record["assumed"][record["parameters"].index(other)]
-        which = record["parameters"].index(other)
+        which = parameters.index(other)
         axes.plot(
-            path[:, at],
-            100 * (path[:, k] / start - 1),
+            np.array(one.path)[:, one.at],
+            change[:, k],
             color=COLOURS[which % len(COLOURS)],
             linestyle=("-", "--", ":", "-.")[which % 4],
             label=axis_label(other),
@@ -182,26 +176,29 @@ def _draw_followers(axes: Any, record: Record, one: Mapping[str, Any], name: str
     axes.legend(frameon=False, fontsize=7)
 
 
-def valley_figure(record: Record) -> Figure:
+def valley_figure(findings: Findings, parameters: tuple[str, ...]) -> Figure:
     """95 % ellipses of the first modulus against each nuisance, and the profile's valley."""
-    own = [e for e in record["ellipses"] if e["errors"] == "independent"]
-    modulus = next(name for name in own[0]["names"] if name.startswith("E_f."))
-    nuisances = [name for name in own[0]["names"] if not name.startswith("E_f.")]
+    own = [
+        (design.frames, design.joint)
+        for design in findings.designs
+        if design.joint is not None and design.errors == "independent"
+    ]
+    names = own[0][1].names
+    modulus = next(name for name in names if name.startswith("E_f."))
+    nuisances = [name for name in names if not name.startswith("E_f.")]
     figure = Figure(figsize=(4.4 * len(nuisances), 4.4), layout="constrained")
     for axes, nuisance in zip(
         figure.subplots(1, len(nuisances), squeeze=False)[0], nuisances, strict=True
     ):
-        for k, some in enumerate(own):
-            _draw_ellipse(axes, some, modulus, nuisance, COLOURS[k % len(COLOURS)])
-        first = next(
-            (o for o in record["profiles"] if o["parameter"] == nuisance and o["low"]), None
-        )
+        for k, (frames, joint) in enumerate(own):
+            colour = COLOURS[k % len(COLOURS)]
+            _draw_ellipse(axes, frames, joint, (nuisance, modulus), colour)
+        first = next((o for o in findings.profiles if o.parameter == nuisance and o.low), None)
         if first is not None:
-            path = _relative(record, first)
-            i, j = (first["parameters"].index(name) for name in (nuisance, modulus))
+            path = _relative(findings, first, parameters)
             axes.plot(
-                path[:, i], path[:, j], color="black", marker=".", linewidth=1,
-                label=f"floor of the valley, {first['label']}",
+                path[:, first.at], path[:, first.parameters.index(modulus)], color="black",
+                marker=".", linewidth=1, label=f"floor of the valley, {first.label}",
             )  # fmt: skip
         axes.set_xlabel(f"{axis_label(nuisance)} [%]")
         axes.set_ylabel(f"{axis_label(modulus)} [%]")
@@ -211,34 +208,33 @@ def valley_figure(record: Record) -> Figure:
     _titled_legend(
         figure,
         axes,
-        f"95 % regions with {record['settings']['typical_mm']:g} mm of independent noise, all "
+        f"95 % regions with {findings.settings.typical_mm:g} mm of independent noise, all "
         f"vertices; simulated",
         columns=3,
     )
     return figure
 
 
-def _relative(record: Record, one: Mapping[str, Any]) -> FloatArray:
+def _relative(findings: Findings, one: Profile, parameters: tuple[str, ...]) -> FloatArray:
     """Change of each parameter along a profile, %."""
-    start = [record["assumed"][record["parameters"].index(n)] for n in one["parameters"]]
-    return np.asarray(100 * (np.array(one["path"]) / np.array(start) - 1))
+    start = [findings.assumed[parameters.index(name)] for name in one.parameters]
+    return np.asarray(100 * (np.array(one.path) / np.array(start) - 1))
 
 
 def _draw_ellipse(
-    axes: Any, some: Mapping[str, Any], modulus: str, nuisance: str, colour: str
+    axes: Any, frames: str, joint: Joint, names: tuple[str, str], colour: str
 ) -> None:
     """Both parameters together lie in it with 95 %: chi-square with two degrees of freedom."""
-    at = [some["names"].index(name) for name in (nuisance, modulus)]
-    C = np.array(some["covariance"], dtype=float)[np.ix_(at, at)]
+    at = [joint.names.index(name) for name in names]
+    C = np.array(joint.covariance, dtype=float)[np.ix_(at, at)]
     if not np.all(np.isfinite(C)):
         return
     values, vectors = np.linalg.eigh(C * 1e4)
     width, height = 2 * np.sqrt(scipy.stats.chi2.ppf(0.95, 2) * values)
     angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    dashed = some["frames"] == "open and closed"
     axes.add_patch(
         Ellipse(
             (0.0, 0.0), width, height, angle=angle, fill=False, color=colour, linewidth=1.5,
-            linestyle="--" if dashed else "-", label=some["frames"],
+            linestyle="--" if frames == "open and closed" else "-", label=frames,
         )
     )  # fmt: skip

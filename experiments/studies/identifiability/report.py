@@ -5,75 +5,68 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.studies.identifiability.figures import write_identifiability_figures
+from experiments.common.record import Record
+from experiments.common.report import page
+from experiments.studies.identifiability.figures import identifiability_figures
+from experiments.studies.identifiability.findings import Findings, Profile
 from mvest.files import write_atomically
 from mvest.reporting.expectation import alike_words
-from mvest.reporting.files import provenance_line
+from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import MISSING, latex_rows, markdown_rows, number
 
-__all__ = [
-    "identifiability_frame",
-    "identifiability_text",
-    "write_identifiability_study",
-    "write_identifiability_tables",
-]
+__all__ = ["identifiability_table", "identifiability_words", "write_identifiability"]
 
-Record = Mapping[str, Any]
 Rows = list[dict[str, str]]
 
 OPEN = "open"
-NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
-def identifiability_frame(record: Record) -> pd.DataFrame:
-    """Tidy table: one row for each design, knowledge of the nuisances, and modulus."""
-    target = 100 * record["settings"]["target"]
-    typical = record["settings"]["typical_mm"]
-    rows = []
-    for row in record["designs"]:
-        told: dict[str, Any] = {
-            "frames": row["frames"],
-            "number of frames": row["frame_count"],
-            "vertices": row["vertices_words"],
-            "number of vertices": row["points"],
-            "errors": row["errors"],
-            "knowledge of the nuisances": row["knowledge"],
-            "parameter": row["parameter"],
+def identifiability_table(findings: Findings) -> pd.DataFrame:
+    """One row for each design, knowledge of the nuisances, and modulus."""
+    settings = findings.settings
+    target, typical = f"{100 * settings.target:g} %", f"{settings.typical_mm:g} mm"
+    return pd.DataFrame(
+        {
+            "frames": design.frames,
+            "number of frames": design.frame_count,
+            "vertices": design.vertices_words,
+            "number of vertices": design.points,
+            "errors": design.errors,
+            "knowledge of the nuisances": one.knowledge,
+            "parameter": one.parameter,
+            **{
+                f"std at {noise} mm [%]": None if std is None else 100 * std
+                for noise, std in one.std.items()
+            },
+            f"noise for {target} [mm]": one.needed_noise_mm,
+            f"observations of {typical} for {target}": one.needed_repeats,
         }
-        for noise, std in row["std"].items():
-            told[f"std at {noise} mm [%]"] = None if std is None else 100 * std
-        told[f"noise for {target:g} % [mm]"] = row["needed_noise_mm"]
-        told[f"observations of {typical:g} mm for {target:g} %"] = row["needed_repeats"]
-        rows.append(told)
-    return pd.DataFrame(rows)
+        for design in findings.designs
+        for one in design.moduli
+    )
 
 
-def _design_rows(record: Record) -> Rows:
+def _design_rows(findings: Findings) -> Rows:
     """One row for each design, one column for each knowledge: deviations and the needed noise."""
-    typical = f"{record['settings']['typical_mm']:g}"
-    key = ("vertices", "errors", "frames")
-    found = []
-    for (_, errors, frames), group in groupby(
-        record["designs"], key=lambda row: tuple(row[k] for k in key)
-    ):
-        rows = list(group)
-        told = {
-            "vertices": f"{rows[0]['vertices_words']} ({rows[0]['points']})",
-            "errors": errors,
-            "frames": frames,
+    typical = f"{findings.settings.typical_mm:g}"
+    shown = []
+    for design in findings.designs:
+        row = {
+            "vertices": f"{design.vertices_words} ({design.points})",
+            "errors": design.errors,
+            "frames": design.frames,
         }
-        for knowledge, same in groupby(rows, key=lambda row: row["knowledge"]):
-            moduli = list(same)
-            stds = " / ".join(_percent(row["std"][typical]) for row in moduli)
-            needed = min(_or_any(row["needed_noise_mm"]) for row in moduli)
-            told[knowledge] = f"{stds} ({_noise(needed)})"
-        found.append(told)
-    return found
+        for knowledge, group in groupby(design.moduli, key=lambda one: one.knowledge):
+            moduli = list(group)
+            stds = " / ".join(_percent(one.std[typical]) for one in moduli)
+            needed = min(_or_any(one.needed_noise_mm) for one in moduli)
+            row[knowledge] = f"{stds} ({_noise(needed)})"
+        shown.append(row)
+    return shown
 
 
 def _percent(std: float | None) -> str:
@@ -90,45 +83,37 @@ def _noise(value: float) -> str:
     return "no noise" if value == 0.0 else number(value, 2)
 
 
-def _profile_rows(record: Record) -> Rows:
-    rows = []
-    for found in record["profiles"]:
-        at = found["parameters"].index(found["parameter"])
-        values = [point[at] for point in found["path"]]
-        rows.append(
-            {
-                "observed": found["label"],
-                "parameter": found["parameter"],
-                "95 % interval": f"{_end(found['low'])} to {_end(found['high'])}",
-                "followed from": f"{number(values[0], 4)} to {number(values[-1], 4)}",
-                "identifiable": "yes"
-                if found["low"] is not None and found["high"] is not None
-                else "NO: " + _why_open(found),
-            }
-        )
-    return rows
+def _profile_rows(findings: Findings) -> Rows:
+    return [
+        {
+            "observed": one.label,
+            "parameter": one.parameter,
+            "95 % interval": f"{_end(one.low)} to {_end(one.high)}",
+            "followed from": f"{number(one.path[0][one.at], 4)} to "
+            f"{number(one.path[-1][one.at], 4)}",
+            "identifiable": "yes" if None not in (one.low, one.high) else "NO: " + _why_open(one),
+        }
+        for one in findings.profiles
+    ]
 
 
 def _end(value: float | None) -> str:
     return OPEN if value is None else number(value, 4)
 
 
-def _why_open(found: Mapping[str, Any]) -> str:
-    ends = zip((found["low"], found["high"]), ("below", "above"), found["ends"], strict=True)
+def _why_open(one: Profile) -> str:
+    ends = zip((one.low, one.high), ("below", "above"), one.ends, strict=True)
     return "; ".join(f"{side}, {end}" for value, side, end in ends if value is None)
 
 
-def _pressure_rows(record: Record) -> Rows:
+def _pressure_rows(findings: Findings) -> Rows:
     """How well the pressure must be known, with all vertices."""
-    rows = []
-    for found in record["pressure"]:
-        if found["vertices"] != "all" or not found["needed"]:
-            continue
-        row = {"frames": found["frames"], "errors": found["errors"]}
-        for name, needed in found["needed"].items():
-            row[name] = _knowledge(needed)
-        rows.append(row)
-    return rows
+    return [
+        {"frames": design.frames, "errors": design.errors}
+        | {name: _knowledge(needed) for name, needed in design.pressure.items()}
+        for design in findings.designs
+        if design.vertices == "all" and design.pressure
+    ]
 
 
 def _knowledge(needed: float | None) -> str:
@@ -137,60 +122,65 @@ def _knowledge(needed: float | None) -> str:
     return "not even if known exactly" if needed == 0.0 else f"to {100 * needed:.2g} %"
 
 
-def _alike(record: Record) -> list[str]:
+def _alike(findings: Findings) -> list[str]:
     """Sentences on what all vertices, with independent errors, hardly tell apart."""
     lines = []
-    for found in record["ellipses"]:
-        if found["errors"] != "independent":
+    for design in findings.designs:
+        if design.joint is None or design.errors != "independent":
             continue
-        words = [alike_words(group) for group in found["confounded"]]
-        told = " ".join(words) or "The data tell all parameters apart."
-        lines.append(f"* {found['frames'][0].upper()}{found['frames'][1:]}: {told}")
+        words = " ".join(alike_words(group) for group in design.joint.confounded)
+        frames = f"{design.frames[0].upper()}{design.frames[1:]}"
+        lines.append(f"* {frames}: {words or 'The data tell all parameters apart.'}")
     return lines
 
 
-def _readable(record: Record) -> list[str]:
-    told = record["settings"]
-    target, typical = f"{100 * told['target']:g} %", f"{told['typical_mm']:g} mm"
-    moduli = [name for name in record["parameters"] if name.startswith("E_f.")]
+def _readable(record: Record[Findings]) -> list[str]:
+    findings = record.findings
+    settings = findings.settings
+    target, typical = f"{100 * settings.target:g} %", f"{settings.typical_mm:g} mm"
+    moduli = [name for name in record.parameters if name.startswith("E_f.")]
+    assumed = ", ".join(
+        f"{name} {number(value)}"
+        for name, value in zip(record.parameters, findings.assumed, strict=True)
+    )
     lines = [
-        f"Cramér-Rao bounds at the assumed values ({_assumed(record)}), from one run of the model "
+        f"Cramér-Rao bounds at the assumed values ({assumed}), from one run of the model "
         f"for each set of frames. Each cell: relative standard deviation of "
         f"{' / '.join(moduli)} [%] at {typical} of noise in each coordinate, and in parentheses "
         f"the noise [mm] at which the worse of them would be known to {target} (“no noise”: not "
-        f"even without noise). {_known_words(told['knowledge'])} The open frame is the model's "
+        f"even without noise). {_known_words(settings.knowledge)} The open frame is the model's "
         f"shape at rest, which no parameter changes, so it adds nothing. N independent "
         f"observations averaged have the noise divided by √N. Simulated.",
         "",
-        markdown_rows(_design_rows(record)),
+        markdown_rows(_design_rows(findings)),
         "",
         "## What makes up for what",
         "",
         f"All vertices, independent errors of {typical}, "
-        f"{_listed_known(told['known'])}, nothing known of the other nuisances:",
+        f"{_listed_known(settings.known)}, nothing known of the other nuisances:",
         "",
-        *_alike(record),
+        *_alike(findings),
         "",
     ]
-    pressures = _pressure_rows(record)
+    pressures = _pressure_rows(findings)
     if pressures:
         lines += [
             "## How well the pressure must be known",
             "",
             f"Relative standard deviation of the pressure beforehand with which a modulus is known "
             f"to {target} ({typical}, all vertices; rest length and chordal stiffness as in “"
-            f"{told['believed']}”):",
+            f"{settings.believed}”):",
             "",
             markdown_rows(pressures),
             "",
         ]
-    profiles = _profile_rows(record)
+    profiles = _profile_rows(findings)
     if profiles:
         lines += [
             "## How far the valleys go",
             "",
             f"Profile likelihoods of the noise-free observation, weighed as if with independent "
-            f"errors of {typical}, {_listed_known(told['known'])}. An interval is open where the "
+            f"errors of {typical}, {_listed_known(settings.known)}. An interval is open where the "
             f"profile does not reach the threshold as far as it was followed.",
             "",
             markdown_rows(profiles),
@@ -198,57 +188,50 @@ def _readable(record: Record) -> list[str]:
     return lines
 
 
-def _assumed(record: Record) -> str:
-    return ", ".join(
-        f"{name} {number(value)}"
-        for name, value in zip(record["parameters"], record["assumed"], strict=True)
-    )
-
-
 def _known_words(knowledge: Mapping[str, Mapping[str, float]]) -> str:
     half = {
-        words: {name: std for name, std in stds.items() if std > 0}
+        words: [f"{name} to {100 * std:g} %" for name, std in stds.items() if std > 0]
         for words, stds in knowledge.items()
     }
-    told = [
-        f"“{words}”: " + ", ".join(f"{name} to {100 * std:g} %" for name, std in stds.items())
-        for words, stds in half.items()
-        if stds
-    ]
-    return "; ".join(told) + "." if told else ""
+    said = [f"“{words}”: {', '.join(known)}" for words, known in half.items() if known]
+    return "; ".join(said) + "." if said else ""
 
 
 def _listed_known(known: Sequence[str]) -> str:
     return f"{', '.join(known)} known" if known else "nothing known beforehand"
 
 
-def identifiability_text(record: Record) -> str:
+def identifiability_words(record: Record[Findings]) -> str:
     """The tables for the terminal."""
-    if not record.get("designs"):
-        return f"{record['title']}: {record['reason']}"
-    designs = pd.DataFrame(_design_rows(record)).to_string(index=False)
-    profiles = pd.DataFrame(_profile_rows(record)).to_string(index=False)
-    return f"{designs}\n\n{profiles}"
+    if not record.findings.designs:
+        return f"{record.title}: {record.reason}"
+    rows = _design_rows(record.findings), _profile_rows(record.findings)
+    return "\n\n".join(pd.DataFrame(some).to_string(index=False) for some in rows)
 
 
-def write_identifiability_tables(folder: Path, record: Record) -> list[Path]:
-    """``identifiability.csv``, ``.md`` and ``.tex`` in ``folder``; none of a failed run."""
-    if not record.get("designs"):
-        return []
-    line = provenance_line(record)
-    csv = f"# {line}\n" + identifiability_frame(record).to_csv(index=False)
-    text = "\n".join([f"# {record['title']}", "", *_readable(record), "", f"<sub>{line}</sub>", ""])
-    tex = f"% {line}\n{latex_rows(_design_rows(record))}"
-    return [
-        write_atomically(folder / "identifiability.csv", csv),
-        write_atomically(folder / "identifiability.md", text),
-        write_atomically(folder / "identifiability.tex", tex),
-    ]
+def write_identifiability(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Tables and figures of each record; none of a failed run.
 
-
-def write_identifiability_study(folder: Path, record: Record) -> list[Path]:
-    """Tables and figures."""
-    return [
-        *write_identifiability_tables(folder, record),
-        *write_identifiability_figures(folder, record),
-    ]
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    written = []
+    for record in records.values():
+        if not record.findings.designs:
+            continue
+        base, line = folder / record.experiment, record.line
+        words = "\n".join(_readable(record))
+        csv = identifiability_table(record.findings).to_csv(index=False)
+        tex = latex_rows(_design_rows(record.findings))
+        written += [
+            write_atomically(base.with_suffix(".csv"), f"# {line}\n{csv}"),
+            write_atomically(base.with_suffix(".md"), page(record, words)),
+            write_atomically(base.with_suffix(".tex"), f"% {line}\n{tex}"),
+        ]
+        for name, figure in identifiability_figures(record).items():
+            written += save_figure_with(base.with_name(f"{base.name}_{name}"), figure, line)
+    return written

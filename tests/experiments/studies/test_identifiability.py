@@ -1,6 +1,5 @@
 """The study of designs in a size that takes seconds, and what ``check=true`` says of studies."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -9,11 +8,12 @@ import pandas as pd
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
 from experiments.studies.identifiability.figures import designs_figure
+from experiments.studies.identifiability.findings import Findings
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
-from experiments.studies.identifiability.report import write_identifiability_study
+from experiments.studies.identifiability.report import write_identifiability
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation import Design, Prediction
@@ -67,12 +67,23 @@ def made(tmp_path_factory):
             ["run", *SMALL, "experiment=identifiability", *TINY, "hydra.run.dir=here"],
         )  # fmt: skip
         assert main() == 0
-    record = flat(json.loads((place / "here" / "result.json").read_text()))
+    record = read_record(place / "here" / "result.json", Findings)
     return record, place / "here", seen
 
 
 def rows_of(record, **wanted):
-    return [r for r in record["designs"] if all(r[k] == v for k, v in wanted.items())]
+    """What designs that are like this tell of each modulus."""
+    return [
+        one
+        for design in record.findings.designs
+        if all(getattr(design, k) == v for k, v in wanted.items())
+        for one in design.moduli
+    ]
+
+
+def designs_of(record, **wanted):
+    designs = record.findings.designs
+    return [d for d in designs if all(getattr(d, k) == v for k, v in wanted.items())]
 
 
 def test_the_open_frame_adds_nothing_and_a_second_pressure_does(made):
@@ -82,11 +93,14 @@ def test_the_open_frame_adds_nothing_and_a_second_pressure_does(made):
     more = rows_of(record, frames="closed at 4 and 5 mmHg")
     assert len(closed) == len(both) == len(more) == len(SETS) * 2 * 5 * 2
     for one, other, further in zip(closed, both, more, strict=True):
-        assert other["frame_count"] == 2 * one["frame_count"]
-        for noise, std in one["std"].items():
-            assert other["std"][noise] == (None if std is None else pytest.approx(std, rel=1e-6))
-            assert std is None or further["std"][noise] < std
-    assert {r["frames"] for r in record["designs"]} >= {"whole cycle, 2 frames"}
+        for noise, std in one.std.items():
+            assert other.std[noise] == (None if std is None else pytest.approx(std, rel=1e-6))
+            assert std is None or further.std[noise] < std
+    counts = [
+        {d.frame_count for d in designs_of(record, frames=frames)}
+        for frames in ("closed", "open and closed", "whole cycle, 2 frames")
+    ]
+    assert counts == [{1}, {2}, {2}]
 
 
 def test_a_row_is_the_design_of_its_vertices_and_frames(made):
@@ -96,29 +110,33 @@ def test_a_row_is_the_design_of_its_vertices_and_frames(made):
     halves = [H[len(H) // 2 :] for _, _, H in seen[:2]]
     members = np.repeat(vertex_set("edge", COLUMNS, ROWS), 3)
     H = np.concatenate([half[members] for half in halves])
-    design = Design.of(H, 1.0, np.array(record["truth"]), record["parameters"])
-    (row,) = rows_of(
-        record, vertices="edge", errors="independent", frames="closed at 4 and 5 mmHg",
-        knowledge="all else half known", parameter="E_f.posterior",
-    )  # fmt: skip
+    design = Design.of(H, 1.0, np.array(record.findings.assumed), record.parameters)
+    (found,) = designs_of(
+        record, vertices="edge", errors="independent", frames="closed at 4 and 5 mmHg"
+    )
+    (row,) = (
+        one
+        for one in found.moduli
+        if (one.knowledge, one.parameter) == ("all else half known", "E_f.posterior")
+    )
     believed = {"chord_rest_length": 0.02, "pressure_scale": 0.1, "chord_stiffness": 0.2}
-    assert row["points"] == COLUMNS
-    assert row["std"]["0.25"] == pytest.approx(design.std("E_f.posterior", 0.25, believed))
-    needed = row["needed_noise_mm"]
+    assert found.points == COLUMNS
+    assert row.std["0.25"] == pytest.approx(design.std("E_f.posterior", 0.25, believed))
+    needed = row.needed_noise_mm
     assert needed == 0.0 or design.std("E_f.posterior", needed, believed) == pytest.approx(0.05)
 
 
 def test_profiles_start_at_the_truth_and_hold_what_is_known(made):
     record, _, seen = made
-    assert [p["parameter"] for p in record["profiles"]] == [
+    assert [p.parameter for p in record.findings.profiles] == [
         "E_f.anterior", "E_f.posterior", "chord_rest_length",
     ]  # fmt: skip
-    for found in record["profiles"]:
-        path = np.array(found["path"])
-        at = int(np.argmin(found["deviance"]))
-        np.testing.assert_allclose(path[at], record["truth"][:3], rtol=1e-6)
-        assert found["deviance"][at] == 0.0
-        held = path[:, record["parameters"].index(found["parameter"])]
+    for found in record.findings.profiles:
+        path = np.array(found.path)
+        at = int(np.argmin(found.deviance))
+        np.testing.assert_allclose(path[at], record.findings.assumed[:3], rtol=1e-6)
+        assert found.deviance[at] == 0.0
+        held = path[:, record.parameters.index(found.parameter)]
         assert np.all(np.diff(held) > 0)
     # The models of profiles were given three parameters: the others are no unknowns of theirs.
     assert {m.size for _, m, _ in seen[2:]} <= {3, 5}
@@ -129,12 +147,12 @@ def test_tables_and_figures_come_from_the_record_alone(made, tmp_path):
     names = {path.name for path in folder.iterdir()}
     assert {"identifiability.csv", "identifiability.md", "identifiability.tex"} <= names
     assert {f"identifiability_{n}.png" for n in ("designs", "profiles", "valley")} <= names
-    written = write_identifiability_study(tmp_path, record)
+    written = write_identifiability(tmp_path, {"identifiability": record}, {})
     for path in written:
         if path.suffix in (".csv", ".md", ".tex"):
             assert path.read_text() == (folder / path.name).read_text()
     table = pd.read_csv(tmp_path / "identifiability.csv", comment="#")
-    assert len(table) == len(record["designs"])
+    assert len(table) == len(rows_of(record))
     text = (tmp_path / "identifiability.md").read_text()
     assert "How well the pressure must be known" in text
     assert "nan" not in text.lower().replace("annulus", "")
@@ -142,15 +160,20 @@ def test_tables_and_figures_come_from_the_record_alone(made, tmp_path):
 
 def test_the_figure_of_designs_shows_each_deviation_and_counts_those_within_the_target(made):
     record, _, _ = made
-    figure = designs_figure(record)
-    rows = [r for r in record["designs"] if r["parameter"] == "E_f.anterior"]
+    figure = designs_figure(record.findings)
     # The open frame adds nothing: it is shown together with the closed one.
-    rows = [r for r in rows if r["frames"] != "open and closed"]
+    rows = [
+        one
+        for design in record.findings.designs
+        if design.frames != "open and closed"
+        for one in design.moduli
+        if one.parameter == "E_f.anterior"
+    ]
     assert sum(len(axes.texts) for axes in figure.axes) == len(rows)
     for axes in figure.axes:
         *words, counted = axes.get_title().split("\n")
-        own = [r["std"]["0.5"] for r in rows if r["knowledge"] == " ".join(words)]
-        within = sum(std is not None and std <= record["settings"]["target"] for std in own)
+        own = [r.std["0.5"] for r in rows if r.knowledge == " ".join(words)]
+        within = sum(std is not None and std <= record.findings.settings.target for std in own)
         assert counted == f"{within} of {len(own)}"
 
 
@@ -161,7 +184,9 @@ def test_a_valve_that_does_not_close_is_a_failed_record(tmp_path, monkeypatch, c
     )
     assert status == 1
     assert "closed at 4 mmHg: no equilibrium" in said.err
-    assert flat(json.loads((tmp_path / "here" / "result.json").read_text()))["status"] == "failed"
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    assert record.status == "failed"
+    assert record.findings.designs == ()
 
 
 def test_sets_of_vertices():
