@@ -6,7 +6,7 @@ drawn as tissue, and what is left open in the colour of blood.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from experiments.studies.prediction.findings import Findings, Patient
 from mvest.errors import InputError
 from mvest.reporting.case.drawing import (
     ATRIUM,
@@ -33,8 +34,6 @@ from mvest.valve.measure.gap import Gap, find_gap
 
 __all__ = ["prediction_figure"]
 
-Record = Mapping[str, Any]
-
 PANELS = (
     ("gap_mm2", "regurgitant gap (mm²)"),
     ("coaptation_length_mm", "coaptation length (mm)"),
@@ -46,13 +45,12 @@ PANELS = (
 OTHER = "0.55"
 
 
-def prediction_figure(record: Record, fields: Path) -> Figure:
+def prediction_figure(findings: Findings, fields: Path) -> Figure:
     """Valves by scenario above dots with 95 % intervals, the truth beside them.
 
     Parameters
     ----------
-    record : mapping
-        Of the study.
+    findings : Findings
     fields : Path
         An ``.npz`` file with ``shapes (s, n, 3)`` mm in the order of the scenarios, ``rest
         (n, 3)`` mm, ``triangles``, ``region``, ``annulus``, ``free_edge`` and ``tips``.
@@ -69,12 +67,12 @@ def prediction_figure(record: Record, fields: Path) -> Figure:
         shapes = arrays["shapes"].astype(float)
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{fields}: no fields of a prediction ({error})") from error
-    titles = list(record["scenarios"].values())
+    titles = list(findings.scenarios.values())
     figure = Figure(figsize=(max(2.7 * len(titles), 8.0), 8.6), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=[1.0, 1.75])
     upper, lower = parts
-    _draw_valves(upper, valve, shapes, titles, record)
-    _draw_measures(lower, record)
+    _draw_valves(upper, valve, shapes, findings)
+    _draw_measures(lower, findings)
     figure.suptitle(
         "An estimated valve as observed and under changed conditions (simulated)\n", fontsize=12
     )
@@ -99,22 +97,19 @@ def _valve(arrays: Mapping[str, Any]) -> CaseFields:
 
 
 # -- pictures -------------------------------------------------------------------------------------
-def _draw_valves(
-    part: Any, valve: CaseFields, shapes: FloatArray, titles: list[str], record: Record
-) -> None:
-    panels = part.subplots(1, len(titles))
-    panels = np.atleast_1d(panels)
-    found = record["patients"][0]["scenarios"]
+def _draw_valves(part: Any, valve: CaseFields, shapes: FloatArray, findings: Findings) -> None:
+    panels = np.atleast_1d(part.subplots(1, len(shapes)))
+    scenarios = findings.patients[0].scenarios
     colours = leaflet_colours(valve.region)
-    for panel, name, title, shape in zip(panels, record["scenarios"], titles, shapes, strict=True):
+    for panel, (name, title), shape in zip(panels, findings.scenarios.items(), shapes, strict=True):
         if not np.isfinite(shape).all():
             panel.set_axis_off()
-            panel.set_title(f"{title}\nnot closed: {found[name]['failure']}", fontsize=9)
+            panel.set_title(f"{title}\nnot closed: {scenarios[name].failure}", fontsize=9)
             continue
-        gap, origin = _gap(valve, shape, record["reach_mm"])
+        gap, origin = _gap(valve, shape, findings.reach_mm)
         draw_valve(panel, valve, shape, colours, ATRIUM, 0)
         paint_gap(panel, gap, origin)
-        area = found[name]["measures"]["gap_mm2"]["estimate"]
+        area = scenarios[name].measures["gap_mm2"].estimate
         panel.set_title(f"{title}\ngap {area:.1f} mm²", fontsize=10)
     name_leaflets(panels[0], valve, ("anterior", "posterior"))
     known = [shape for shape in shapes if np.isfinite(shape).all()]
@@ -140,15 +135,14 @@ def _gap(valve: CaseFields, shape: FloatArray, reach: float) -> tuple[Gap, Float
 
 
 # -- measures -------------------------------------------------------------------------------------
-def _draw_measures(part: Any, record: Record) -> None:
+def _draw_measures(part: Any, findings: Findings) -> None:
     panels = part.subplots(2, 3).ravel()
-    names = list(record["scenarios"])
-    patients = record["patients"]
+    names = list(findings.scenarios)
     for panel, (measure, label) in zip(panels, PANELS, strict=True):
-        for number, patient in enumerate(patients):
+        for number, patient in enumerate(findings.patients):
             shift = 0.0 if number == 0 else 0.14 + 0.13 * number
             _dots(panel, patient, names, measure, shift, COLOURS[0] if number == 0 else OTHER)
-        panel.set_xticks(range(len(names)), list(record["scenarios"].values()))
+        panel.set_xticks(range(len(names)), list(findings.scenarios.values()))
         panel.set_xticklabels(panel.get_xticklabels(), fontsize=8, rotation=20, ha="right")
         panel.set_ylabel(label, fontsize=9)
         panel.set_ylim(bottom=min(0.0, panel.get_ylim()[0]))
@@ -172,23 +166,24 @@ def _draw_measures(part: Any, record: Record) -> None:
 
 def _dots(
     panel: Any,
-    patient: Mapping[str, Any],
-    names: list[str],
+    patient: Patient,
+    names: Sequence[str],
     measure: str,
     shift: float,
     colour: str,
 ) -> None:
     for place, name in enumerate(names):
-        row = patient["scenarios"].get(name, {}).get("measures", {}).get(measure)
+        scenario = patient.scenarios.get(name)
+        row = None if scenario is None else scenario.measures.get(measure)
         if row is None:
             continue
         x = place + shift - 0.12
-        if row["wide_low"] is not None:
-            panel.plot([x, x], [row["wide_low"], row["wide_high"]], color=colour, linewidth=0.8)
-        if row["low"] is not None:
-            panel.plot([x, x], [row["low"], row["high"]], color=colour, linewidth=2.5)
-        panel.plot([x], [row["estimate"]], "o", color=colour, markersize=5)
-        if row["truth_own_mesh"] is not None:
-            panel.plot([x], [row["truth_own_mesh"]], "x", color=COLOURS[1], markersize=6, zorder=4)
-        if row["truth_same_mesh"] is not None:
-            panel.plot([x], [row["truth_same_mesh"]], "_", color="black", markersize=9, zorder=4)
+        if row.wide_low is not None:
+            panel.plot([x, x], [row.wide_low, row.wide_high], color=colour, linewidth=0.8)
+        if row.low is not None:
+            panel.plot([x, x], [row.low, row.high], color=colour, linewidth=2.5)
+        panel.plot([x], [row.estimate], "o", color=colour, markersize=5)
+        if row.truth_own_mesh is not None:
+            panel.plot([x], [row.truth_own_mesh], "x", color=COLOURS[1], markersize=6, zorder=4)
+        if row.truth_same_mesh is not None:
+            panel.plot([x], [row.truth_same_mesh], "_", color="black", markersize=9, zorder=4)

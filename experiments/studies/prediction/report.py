@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import pandas as pd
 
-from experiments.common.plain import Plain, flat
-from experiments.common.record import Record as Run
+from experiments.common.record import Record
+from experiments.common.report import page
+from experiments.studies.prediction.figure import prediction_figure
+from experiments.studies.prediction.findings import Findings, Predicted
 from mvest.files import write_atomically
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line
+from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import MISSING, markdown_rows, number
 
 __all__ = [
     "SHOWN",
     "coverage",
-    "prediction_text",
+    "prediction_table",
+    "prediction_words",
     "write_prediction",
-    "write_prediction_tables",
 ]
-
-Record = Mapping[str, Any]
 
 SHOWN = {
     "gap_mm2": "regurgitant gap (mm²)",
@@ -47,270 +47,251 @@ PRESCRIBED = ("ap_diameter_mm", "annulus_circumference_mm")
 
 
 # -- rows -----------------------------------------------------------------------------------------
-def _predicted(record: Record) -> Iterator[tuple[int, str, str, Mapping[str, Any]]]:
+def _predicted(findings: Findings) -> Iterator[tuple[int, str, str, Predicted]]:
     """Seed of the patient, scenario, measure and its numbers."""
-    for patient in record["patients"]:
-        for scenario, found in patient["scenarios"].items():
-            for measure, row in found["measures"].items():
-                yield patient["seed"], scenario, measure, row
+    for patient in findings.patients:
+        for scenario, predicted in patient.scenarios.items():
+            for measure, row in predicted.measures.items():
+                yield patient.seed, scenario, measure, row
 
 
-INTERVALS = {
-    "wide": ("wide_low", "wide_high", "truth_own_mesh", "inside_wide"),
-    "own": ("low", "high", "truth_own_mesh", "inside_own_mesh"),
-    "same": ("low", "high", "truth_same_mesh", "inside_same_mesh"),
-}
-"""Intervals with and without the mesh's error, the truth they are to hold, and whether they do."""
+Kind = Literal["wide", "own", "same"]
+"""Of an interval: with the mesh's error, and without it on the truth's and on the same mesh."""
 
 
-def coverage(record: Record, measure: str, kind: str) -> tuple[int, int]:
-    """How many intervals of a kind (see `INTERVALS`) hold the truth, and of how many.
+def coverage(findings: Findings, measure: str, kind: Kind) -> tuple[int, int]:
+    """How many intervals of a kind hold the truth, and of how many.
 
     Where all samples and the truth are one number (no gap at all) there is no uncertainty that
     could be right or wrong: such an interval is not counted.
     """
-    low, high, truth, held = INTERVALS[kind]
-    inside = [
-        row[held]
-        for _, _, name, row in _predicted(record)
-        if name == measure and row[held] is not None and not row[low] == row[high] == row[truth]
-    ]
+    inside = []
+    for _, _, name, row in _predicted(findings):
+        if name != measure:
+            continue
+        low, high, truth, held = {
+            "wide": (row.wide_low, row.wide_high, row.truth_own_mesh, row.inside_wide),
+            "own": (row.low, row.high, row.truth_own_mesh, row.inside_own_mesh),
+            "same": (row.low, row.high, row.truth_same_mesh, row.inside_same_mesh),
+        }[kind]
+        if held is not None and not low == high == truth:
+            inside.append(held)
     return sum(inside), len(inside)
 
 
-def _frame(record: Record) -> pd.DataFrame:
-    rows = [
-        {"patient": seed, "scenario": scenario, "measure": measure, **row}
-        for seed, scenario, measure, row in _predicted(record)
-    ]
-    return pd.DataFrame(rows)
+def prediction_table(findings: Findings) -> pd.DataFrame:
+    """Every patient, condition and measure."""
+    return pd.DataFrame(
+        {"patient": seed, "scenario": scenario, "measure": measure, **asdict(row)}
+        for seed, scenario, measure, row in _predicted(findings)
+    )
 
 
 # -- words ----------------------------------------------------------------------------------------
-def _cell(row: Mapping[str, Any] | None) -> str:
+def _cell(row: Predicted | None) -> str:
     if row is None:
         return MISSING
-    known = row["wide_low"] is not None
-    low, high, *_ = INTERVALS["wide" if known else "own"]
-    interval = f" [{number(row[low])}, {number(row[high])}]" + ("" if known else "°")
-    truth = f", true {number(row['truth_own_mesh'])}"
-    return f"{number(row['estimate'])}{interval}{truth}"
+    known = row.wide_low is not None
+    low, high = (row.wide_low, row.wide_high) if known else (row.low, row.high)
+    interval = f" [{number(low)}, {number(high)}]" + ("" if known else "°")
+    return f"{number(row.estimate)}{interval}, true {number(row.truth_own_mesh)}"
 
 
-def _scenario_table(record: Record) -> str:
+def _scenario_table(findings: Findings) -> str:
     """Measures of the first patient by scenario: estimate, interval and truth."""
-    found = record["patients"][0]["scenarios"]
+    scenarios = findings.patients[0].scenarios
     rows = []
     for measure, label in SHOWN.items():
         row = {"measure": label}
-        for name, title in record["scenarios"].items():
-            entry = found[name]["measures"].get(measure)
+        for name, title in findings.scenarios.items():
+            entry = scenarios[name].measures.get(measure)
             if entry is not None and measure in PRESCRIBED:
-                row[title] = f"{entry['estimate']:.1f}"
+                row[title] = f"{entry.estimate:.1f}"
             else:
                 row[title] = _cell(entry)
         rows.append(row)
     return markdown_rows(rows)
 
 
-def _moduli_table(record: Record) -> str:
+def _moduli_table(record: Record[Findings]) -> str:
     rows = []
-    for patient in record["patients"]:
-        row = {"patient": str(patient["seed"])}
-        for k, name in enumerate(record["parameters"]):
-            if patient["estimate"] is None:
-                row[name] = f"none: {patient['reason']}"
+    for patient in record.findings.patients:
+        row = {"patient": str(patient.seed)}
+        for k, name in enumerate(record.parameters):
+            if patient.estimate is None or patient.std is None:
+                row[name] = f"none: {patient.reason}"
                 continue
-            value, std = patient["estimate"][k], patient["std"][k]
-            row[name] = f"{value:.4g} ± {std:.2g}, true {patient['truth'][k]:.4g}"
+            value, std = patient.estimate[k], patient.std[k]
+            row[name] = f"{value:.4g} ± {std:.2g}, true {patient.truth[k]:.4g}"
         rows.append(row)
     return markdown_rows(rows)
 
 
-HEADS = {
+HEADS: dict[Kind, str] = {
     "wide": "truth inside",
     "own": "without the mesh's error",
     "same": "inside, same mesh",
 }
 
 
-def _uncertainty_table(record: Record) -> str:
+def _uncertainty_table(findings: Findings) -> str:
     """Standard deviations by sampling and to first order, and how often the truth is inside."""
-    scenarios = record["patients"][0]["scenarios"]
+    scenarios = findings.patients[0].scenarios
     rows = []
     for measure, label in SHOWN.items():
         if measure in PRESCRIBED:
             continue
         row = {"measure": label}
-        for name, title in record["scenarios"].items():
-            entry = scenarios[name]["measures"].get(measure)
+        for name, title in findings.scenarios.items():
+            entry = scenarios[name].measures.get(measure)
             row[title] = (
                 MISSING
                 if entry is None
-                else f"{number(entry['std'], 2)} / {number(entry['first_order_std'], 2)} / "
-                f"{number(entry['mesh_error'], 2)}"
+                else f"{number(entry.std, 2)} / {number(entry.first_order_std, 2)} / "
+                f"{number(entry.mesh_error, 2)}"
             )
         for kind, head in HEADS.items():
-            if kind == "wide" and not record["check_mesh"]:
+            if kind == "wide" and not findings.check_mesh:
                 continue
-            inside, of = coverage(record, measure, kind)
+            inside, of = coverage(findings, measure, kind)
             row[head] = f"{inside} of {of}"
         rows.append(row)
     return markdown_rows(rows)
 
 
-def _mesh_table(record: Record) -> str:
+def _mesh_table(findings: Findings) -> str:
     rows = []
-    for entry in record["stress_meshes"]:
-        row = {"cells": " × ".join(map(str, entry["cells"]))}
-        if entry["reason"]:
-            row |= {"gap (mm²)": f"not closed: {entry['reason']}"}
-        else:
-            row |= {"gap (mm²)": number(entry["gap_mm2"])}
+    for entry in findings.stress_meshes:
+        gap = f"not closed: {entry.reason}" if entry.reason else number(entry.gap_mm2)
+        row = {"cells": " × ".join(map(str, entry.cells)), "gap (mm²)": gap}
         for region in ("anterior", "posterior"):
             for which, label in (("p95", "95 %"), ("p99", "99 %"), ("max", "largest")):
-                value = entry.get(f"stress_{which}_{region}_mpa")
+                value = entry.stress.get(f"stress_{which}_{region}_mpa")
                 row[f"{region} {label} (MPa)"] = number(value)
         rows.append(row)
     return markdown_rows(rows) if rows else "Not computed."
 
 
-def _failures(record: Record) -> str:
+def _failures(findings: Findings) -> str:
     """Samples without a closed valve, by name; a sentence if there is none."""
     said = []
     attempted = 0
-    for patient in record["patients"]:
-        if not patient["scenarios"]:
-            said.append(f"patient {patient['seed']}: no estimate ({patient['reason']})")
-        for name, found in patient["scenarios"].items():
-            attempted += found["samples"]
-            title = record["scenarios"][name]
-            if found["failure"]:
-                said.append(f"patient {patient['seed']}, {title}: {found['failure']}")
-            if found["failures"]:
-                reasons = "; ".join(sorted(set(found["failures"])))
-                said.append(
-                    f"patient {patient['seed']}, {title}: {len(found['failures'])} of "
-                    f"{found['samples']} samples ({reasons})"
-                )
-            if found["finer_failure"]:
-                said.append(
-                    f"patient {patient['seed']}, {title}, finer mesh: {found['finer_failure']}"
-                )
-            if found["truth_failure"]:
-                said.append(
-                    f"patient {patient['seed']}, {title}, true valve: {found['truth_failure']}"
-                )
+    for patient in findings.patients:
+        if not patient.scenarios:
+            said.append(f"patient {patient.seed}: no estimate ({patient.reason})")
+        for name, scenario in patient.scenarios.items():
+            attempted += scenario.samples
+            where = f"patient {patient.seed}, {findings.scenarios[name]}"
+            if scenario.failure:
+                said.append(f"{where}: {scenario.failure}")
+            if scenario.failures:
+                reasons = "; ".join(sorted(set(scenario.failures)))
+                count = f"{len(scenario.failures)} of {scenario.samples}"
+                said.append(f"{where}: {count} samples ({reasons})")
+            if scenario.finer_failure:
+                said.append(f"{where}, finer mesh: {scenario.finer_failure}")
+            if scenario.truth_failure:
+                said.append(f"{where}, true valve: {scenario.truth_failure}")
     if not said:
         return f"All {attempted} samples gave a closed valve."
     return f"Of {attempted} samples, not closed: " + "; ".join(said) + "."
 
 
-def _totals(record: Record, kind: str) -> str:
-    counts = [coverage(record, name, kind) for name in SHOWN if name not in PRESCRIBED]
+def _totals(findings: Findings, kind: Kind) -> str:
+    counts = [coverage(findings, name, kind) for name in SHOWN if name not in PRESCRIBED]
     inside, of = (sum(column) for column in zip(*counts, strict=True))
     return f"{inside} of {of} ({100 * inside / of:.0f} %)" if of else "none"
 
 
-def _coverage_words(record: Record) -> str:
-    own, same = _totals(record, "own"), _totals(record, "same")
-    if not record["check_mesh"]:
+def _coverage_words(findings: Findings) -> str:
+    own, same = _totals(findings, "own"), _totals(findings, "same")
+    if not findings.check_mesh:
         return (
             f"Over all these measures {own} of the intervals hold the truth of its own mesh and "
             f"{same} that of the same mesh; 95 % would be right. The intervals carry the "
             "uncertainty of the estimated parameters and not the error of the mesh."
         )
-    cells = " × ".join(map(str, record["check_mesh"]))
-    truth = " × ".join(map(str, record["observed"]["truth_cells"]))
+    cells = " × ".join(map(str, findings.check_mesh))
+    truth = " × ".join(map(str, findings.observed.truth_cells))
     return (
-        f"Over all these measures {_totals(record, 'wide')} of the intervals hold the truth of its "
-        f"own mesh, {own} without the mesh's error; on the same mesh {same} do. 95 % would be "
-        f"right; measures depend on each other, and patients are {len(record['patients'])}. The "
+        f"Over all these measures {_totals(findings, 'wide')} of the intervals hold the truth of "
+        f"its own mesh, {own} without the mesh's error; on the same mesh {same} do. 95 % would be "
+        f"right; measures depend on each other, and patients are {len(findings.patients)}. The "
         f"error of the mesh is the difference to one of {cells} cells, at the estimate, taken as a "
         f"standard deviation; the truth's mesh has {truth}."
     )
 
 
-def _readable(record: Record) -> str:
-    seen = record["observed"]
-    columns, rows = seen["truth_cells"]
-    cells = " × ".join(map(str, record["model"]["cells"][:2]))
-    first = record["patients"][0]
+def prediction_words(record: Record[Findings]) -> str:
+    """The tables for readers, and what they say."""
+    findings = record.findings
+    if not findings.measures:
+        return f"no prediction: {record.reason}"
+    seen, first = findings.observed, findings.patients[0]
+    columns, rows = seen.truth_cells
+    assert record.model is not None
+    cells = " × ".join(map(str, record.model.cells[:2]))
     return "\n".join(
         [
             f"Simulated throughout. Each patient's closed valve ({columns} × {rows} cells) is seen "
-            f"at {seen['vertices']} vertices with errors of {seen['correlated_mm']:g} mm that are "
-            f"alike over {seen['correlation_length_mm']:g} mm; the estimate ({cells} cells) knows "
+            f"at {seen.vertices} vertices with errors of {seen.correlated_mm:g} mm that are "
+            f"alike over {seen.correlation_length_mm:g} mm; the estimate ({cells} cells) knows "
             "nothing else of it.",
             "",
             _moduli_table(record),
             "",
-            f"Patient {first['seed']} under each condition: at the estimate [95 % interval, of the "
+            f"Patient {first.seed} under each condition: at the estimate [95 % interval, of the "
             "samples and of the mesh; °: of the samples alone], and the true valve, which was "
             "computed afterwards on its own mesh.",
             "",
-            _scenario_table(record),
+            _scenario_table(findings),
             "",
             "Standard deviation of the samples / to first order (derivative of the closed shape) / "
             f"error of the mesh, of the same patient; and how many intervals of all "
-            f"{len(record['patients'])} patients and conditions hold the truth: computed on its "
+            f"{len(findings.patients)} patients and conditions hold the truth: computed on its "
             "own mesh, by intervals with and without the mesh's error, and on the mesh of the "
             "estimate, where only the uncertainty of the parameters is left. Intervals in which "
             "all samples and the truth are the same number are not counted.",
             "",
-            _uncertainty_table(record),
+            _uncertainty_table(findings),
             "",
-            _coverage_words(record),
+            _coverage_words(findings),
             "",
             "Peak stress of the first patient as observed, with its true parameters, by mesh: the "
             "largest value belongs to insertions of chordae and to the hinge.",
             "",
-            _mesh_table(record),
+            _mesh_table(findings),
             "",
-            _failures(record),
+            _failures(findings),
             "",
-            f"The regurgitant gap is the {record['measures']['gap_mm2'].partition(': ')[2]} "
-            f"(reach {record['reach_mm']:.2f} mm). A higher pressure acts on leaflets, annulus and "
+            f"The regurgitant gap is the {findings.measures['gap_mm2'].partition(': ')[2]} "
+            f"(reach {findings.reach_mm:.2f} mm). A higher pressure acts on leaflets, annulus and "
             "papillary tips that stay where they are prescribed; a ventricle that dilates with it "
             "is not part of the model.",
         ]
     )
 
 
-def prediction_text(record: Record) -> str:
-    """The tables for the terminal."""
-    return _readable(record) if record["measures"] else f"no prediction: {record['reason']}"
-
-
 # -- files ----------------------------------------------------------------------------------------
-def write_prediction_tables(folder: Path, record: Record) -> list[Path]:
-    """``prediction.csv`` (every patient, condition and measure) and ``prediction.md``.
+def write_prediction(
+    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Tables of each run, and its figure where its valves are still there.
 
     Raises
     ------
     InputError
-        If a file cannot be written.
+        If a file cannot be written, or the valves cannot be read.
     """
-    line = provenance_line(record)
-    table = _frame(record).to_csv(index=False, float_format="%.6g")
-    text = f"# {record['title']}\n\n{prediction_text(record)}\n\n<sub>{line}</sub>\n"
-    return [
-        write_atomically(folder / "prediction.csv", table),
-        write_atomically(folder / "prediction.md", text),
-    ]
-
-
-def write_prediction(
-    folder: Path, records: Mapping[str, Run[Plain]], arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Tables of each run, and its figure where its valves are still there."""
-    from experiments.studies.prediction.figure import prediction_figure
-
     written = []
-    for name, run in records.items():
-        record = flat(run)
-        written += write_prediction_tables(folder, record)
+    for name, record in records.items():
+        base = folder / record.experiment
+        table = prediction_table(record.findings).to_csv(index=False, float_format="%.6g")
+        written += [
+            write_atomically(base.with_suffix(".csv"), table),
+            write_atomically(base.with_suffix(".md"), page(record, prediction_words(record))),
+        ]
         if name in arrays:
-            figure = prediction_figure(record, arrays[name])
-            written += save_figure(folder / "prediction", figure, record)
+            figure = prediction_figure(record.findings, arrays[name])
+            written += save_figure_with(base, figure, record.line)
     return written

@@ -7,7 +7,6 @@ its posterior. Only then are the same scenarios computed with the true parameter
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,22 +15,31 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
-from experiments.common.forward import forward_record
-from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.findings import Rows, rows, vector
+from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
-from experiments.common.schema import build
-from experiments.common.study import Section, Study
-from experiments.studies.prediction.report import prediction_text, write_prediction
-from experiments.studies.prediction.settings import Settings
+from experiments.common.record import Outcome
+from experiments.common.study import Job, Section, Study
+from experiments.studies.prediction.findings import (
+    Findings,
+    MeshStress,
+    Observed,
+    Patient,
+    Predicted,
+    Scenario,
+)
+from experiments.studies.prediction.report import prediction_words, write_prediction
+from experiments.studies.prediction.settings import PredictionSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
+from mvest.scenarios import scenario as conditions
 from mvest.scenarios.measures import contact_reach, meaning_of
 from mvest.scenarios.posterior import posterior_samples
 from mvest.scenarios.predict import PredictedScenario, Sample, closed_valve
 from mvest.scenarios.predict import predict_scenario as predict
-from mvest.scenarios.scenario import Scenario, model_under
+from mvest.scenarios.scenario import model_under
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.solid_mesh import SolidMesh
@@ -39,20 +47,22 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 __all__ = ["STUDY", "run_prediction"]
 
 Values = Mapping[str, Any]
-Outcome = tuple[dict[str, Any], list[Path]]
+Asked = Mapping[str, conditions.Scenario]
 
 MEASURED_ON = (96, 22)
 """Vertices around and along the leaflets of the surface on which shapes are measured."""
+
+FIELDS = "fields.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Asked:
     """What is asked of every patient."""
 
-    scenarios: dict[str, Scenario]
+    scenarios: Asked
     spread: FloatArray  # of the logarithms of true parameters
     valve: Valve  # the surface that is measured
-    finer: SolidMesh | None  # on which the mesh's error is told
+    finer: SolidMesh | None  # on which the mesh's error is seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,81 +76,90 @@ class _Patient:
     models: dict[str, ClosureModel]
 
 
-def run_prediction(config: Values, config_hash: str, folder: Path, started: float) -> Outcome:
-    """Estimate and predict every patient, then compare with the truth."""
-    from experiments.studies.prediction.figure import prediction_figure
-    from mvest.reporting.figures import save_figure
+def run_prediction(job: Job[Settings]) -> Outcome[Findings]:
+    """Estimate and predict every patient, then compare with the truth.
 
-    settings = config["prediction"]
-    scenarios = _scenarios(settings)
+    Raises
+    ------
+    ConfigurationError
+        If scenarios, samples, patients or the spread of their parameters make no sense.
+    """
+    config, settings = job.values, job.settings.prediction
+    _require(settings)
+    scenarios = settings.scenarios
     twin = build_twin(config)
     # Measured on more points than are observed, which cost time where their errors are correlated.
     valve = template_of(config).valve(*MEASURED_ON)
     asked = _Asked(
         scenarios,
-        np.array(settings["spread"], dtype=float),
+        np.array(settings.spread, dtype=float),
         valve,
-        _mesh_of(config, settings["check_mesh"]) if settings["check_mesh"] else None,
+        _mesh_of(config, settings.check_mesh) if settings.check_mesh else None,
     )
-    seeds = [config["seed"] + k for k in range(settings["patients"])]
-    patients = []
-    total = sum(len(scenarios) * (2 + _count(settings, k == 0)) + 1 for k in range(len(seeds)))
+    counts = [settings.samples, *[settings.further_samples] * (settings.patients - 1)]
+    total = sum(len(scenarios) * (2 + count) + 1 for count in counts)
     with PartBar("prediction", total, "closure") as bar:
-        for number, seed in enumerate(seeds):
-            count = _count(settings, number == 0)
-            patients.append(_predicted(twin, seed, asked, count, bar.step))
-        truths = {p.seed: _true_scenarios(twin, p, scenarios, bar.step) for p in patients}
+        patients = [
+            _predicted(twin, config["seed"] + k, asked, count, bar.step)
+            for k, count in enumerate(counts)
+        ]
+        truths = [_true_scenarios(twin, p, scenarios, bar.step) for p in patients]
     usual = replace(twin.model, valve=valve)
-    record = forward_record(config, config_hash, twin.model, patients[0].truth, started, 0)
-    record |= {
-        "patients": [_told(p, truths[p.seed]) for p in patients],
-        "scenarios": {name: scenario.title for name, scenario in scenarios.items()},
-        "stress_meshes": _stress_on_meshes(config, usual, patients[0].truth),
-        "reach_mm": contact_reach(usual),
-        "check_mesh": list(settings["check_mesh"]),
-        "observed": {
-            "vertices": len(twin.valve.surface.vertices),
-            "truth_cells": [config["truth"][k] for k in ("columns", "rows")],
-            "truth_element": config["truth"]["element"] or config["mechanics"]["element"],
-            "noise_mm": config["observation"]["noise_mm"],
-            "correlated_mm": config["observation"]["correlated_mm"],
-            "correlation_length_mm": config["observation"]["correlation_length_mm"],
-        },
-    }
     first = patients[0]
-    record |= _summary(first)
-    record["forward_solves"] = sum(
-        (p.result.filtered.forward_solves if p.result.filtered else 0)
-        + sum(1 + len(s.samples) + (s.finer is not None) for s in p.scenarios.values())
-        for p in patients
+    names = {
+        name for p in patients for s in p.scenarios.values() for name in s.at_estimate.measures
+    }
+    described = tuple(_patient(p, truth) for p, truth in zip(patients, truths, strict=True))
+    findings = Findings(
+        patients=described,
+        estimate=described[0].estimate,
+        std=described[0].std,
+        relative_error=described[0].relative_error,
+        scenarios={name: scenario.title for name, scenario in scenarios.items()},
+        stress_meshes=tuple(
+            _stress_on_mesh(_on_mesh(usual, _mesh_of(config, cells)), cells, first.truth)
+            for cells in settings.stress_meshes
+        ),
+        reach_mm=contact_reach(usual),
+        check_mesh=settings.check_mesh,
+        observed=_observed(config, len(twin.valve.surface.vertices)),
+        measures={name: meaning_of(name) for name in names},
     )
-    names = sorted({name for p in patients for s in p.scenarios.values() for name in _names(s)})
-    record["measures"] = {name: meaning_of(name) for name in names}
-    record["seconds"] = record["seconds_total"] = time.time() - started
-    if not first.scenarios:
-        return record | {"status": "failed", "reason": first.result.reason}, []
-    fields = folder / "fields.npz"
-    _write_fields(fields, valve, first, scenarios)
-    if not config["figures"]:
-        return record, []
-    return record, save_figure(folder / "prediction", prediction_figure(record, fields), record)
+    if first.scenarios:
+        _write_fields(job.folder / FIELDS, valve, first, scenarios)
+    return outcome_of(
+        findings,
+        twin.model.mesh,
+        sum(
+            (p.result.filtered.forward_solves if p.result.filtered else 0)
+            + sum(1 + len(s.samples) + (s.finer is not None) for s in p.scenarios.values())
+            for p in patients
+        ),
+        () if first.scenarios else (first.result.reason,),
+    )
 
 
-def _scenarios(settings: Values) -> dict[str, Scenario]:
-    if not settings["scenarios"]:
+def _require(settings: PredictionSettings) -> None:
+    if not settings.scenarios:
         raise ConfigurationError("prediction.scenarios is empty, expected at least one")
-    for name in ("samples", "further_samples"):
-        if settings[name] < 2 or settings[name] & (settings[name] - 1):
-            raise ConfigurationError(
-                f"prediction.{name} = {settings[name]}, expected a power of two > 1"
-            )
-    if settings["patients"] < 1:
-        raise ConfigurationError(f"prediction.patients = {settings['patients']}, expected >= 1")
-    return {name: build(Scenario, value) for name, value in settings["scenarios"].items()}
+    counts = {"samples": settings.samples, "further_samples": settings.further_samples}
+    for name, count in counts.items():
+        if count < 2 or count & (count - 1):
+            raise ConfigurationError(f"prediction.{name} = {count}, expected a power of two > 1")
+    if settings.patients < 1:
+        raise ConfigurationError(f"prediction.patients = {settings.patients}, expected >= 1")
 
 
-def _count(settings: Values, first: bool) -> int:
-    return int(settings["samples"] if first else settings["further_samples"])
+def _observed(config: Values, vertices: int) -> Observed:
+    truth, errors = config["truth"], config["observation"]
+    return Observed(
+        vertices=vertices,
+        truth_cells=(truth["columns"], truth["rows"]),
+        truth_element=truth["element"] or config["mechanics"]["element"],
+        noise_mm=errors["noise_mm"],
+        correlated_mm=errors["correlated_mm"],
+        correlation_length_mm=errors["correlation_length_mm"],
+    )
 
 
 # -- estimate and predict -------------------------------------------------------------------------
@@ -180,41 +199,31 @@ def _predicted(
     samples = posterior_samples(result.filtered, count, seed)
     measured = replace(twin.model, valve=asked.valve)
     models = {name: model_under(measured, scenario) for name, scenario in asked.scenarios.items()}
-    found = {}
+    predicted = {}
     for name, model in models.items():
         finer = None if asked.finer is None else _on_mesh(model, asked.finer)
-        found[name] = predict(model, result.filtered, samples, lambda _: step(), finer=finer)
+        predicted[name] = predict(model, result.filtered, samples, lambda _: step(), finer=finer)
         step()
-    return _Patient(seed, truth, result, found, models)
+    return _Patient(seed, truth, result, predicted, models)
 
 
 def _true_scenarios(
-    twin: Twin, patient: _Patient, scenarios: Mapping[str, Scenario], step: Callable[[], None]
-) -> dict[str, dict[str, Sample]]:
+    twin: Twin, patient: _Patient, scenarios: Asked, step: Callable[[], None]
+) -> dict[str, tuple[Sample, Sample]]:
     """Every scenario with the true parameters: on the truth's mesh, and on the estimator's."""
-    found = {}
+    closed = {}
     for name, model in patient.models.items():
         own = model_under(replace(twin.truth_model, valve=model.valve), scenarios[name])
-        found[name] = {
-            "own": closed_valve(own, patient.truth)[0],
-            "same": closed_valve(model, patient.truth)[0],
-        }
+        closed[name] = closed_valve(own, patient.truth)[0], closed_valve(model, patient.truth)[0]
         step()
-    return found
+    return closed
 
 
-def _stress_on_meshes(
-    config: Values, usual: ClosureModel, truth: FloatArray
-) -> list[dict[str, Any]]:
-    """Peak stress of the first patient as observed, on finer and finer meshes."""
-    rows = []
-    for columns, count in config["prediction"]["stress_meshes"]:
-        model = _on_mesh(usual, _mesh_of(config, [columns, count]))
-        sample = closed_valve(model, truth)[0]
-        stress = {k: v for k, v in sample.measures.items() if k.startswith("stress")}
-        gap = sample.measures.get("gap_mm2")
-        rows.append({"cells": [columns, count], "gap_mm2": gap, **stress, "reason": sample.reason})
-    return rows
+def _stress_on_mesh(model: ClosureModel, cells: Sequence[int], truth: FloatArray) -> MeshStress:
+    """Peak stress of the first patient as observed, on another mesh."""
+    sample = closed_valve(model, truth)[0]
+    stress = {k: v for k, v in sample.measures.items() if k.startswith("stress")}
+    return MeshStress(tuple(cells), sample.measures.get("gap_mm2"), stress, sample.reason)
 
 
 def _mesh_of(config: Values, cells: Sequence[int]) -> SolidMesh:
@@ -233,93 +242,43 @@ def _on_mesh(model: ClosureModel, mesh: SolidMesh) -> ClosureModel:
     return replace(model.fresh(), mesh=mesh, guide=None)
 
 
-# -- record ---------------------------------------------------------------------------------------
-def _summary(patient: _Patient) -> dict[str, Any]:
+# -- findings -------------------------------------------------------------------------------------
+def _patient(patient: _Patient, truths: Mapping[str, tuple[Sample, Sample]]) -> Patient:
     result = patient.result
-    estimated = result.estimate
-    return {
-        "estimate": None if estimated is None else estimated.tolist(),
-        "std": None if result.std is None else result.std.tolist(),
-        "relative_error": None
-        if estimated is None
-        else ((estimated - patient.truth) / patient.truth).tolist(),
-    }
-
-
-def _told(patient: _Patient, truth: Mapping[str, Mapping[str, Sample]]) -> dict[str, Any]:
-    filtered = patient.result.filtered
-    return {
-        "seed": patient.seed,
-        "truth": patient.truth.tolist(),
-        **_summary(patient),
-        "reason": patient.result.reason,
-        "correlation": None if filtered is None else _correlation(filtered.covariance),
-        "scenarios": {
-            name: {
-                "failure": found.at_estimate.reason,
-                "samples": len(found.samples),
-                "failures": list(found.failures),
-                "sampled": [s.measures for s in found.samples],
-                "truth_failure": truth[name]["own"].reason,
-                "finer_failure": "" if found.finer is None else found.finer.reason,
-                "measures": {
-                    measure: _row(found, truth[name], measure) for measure in _names(found)
+    estimated, filtered = result.estimate, result.filtered
+    error = None if estimated is None else (estimated - patient.truth) / patient.truth
+    return Patient(
+        seed=patient.seed,
+        truth=vector(patient.truth),
+        estimate=None if estimated is None else vector(estimated),
+        std=None if result.std is None else vector(result.std),
+        relative_error=None if error is None else vector(error),
+        reason=result.reason,
+        correlation=None if filtered is None else _correlation(filtered.covariance),
+        scenarios={
+            name: Scenario(
+                failure=predicted.at_estimate.reason,
+                samples=len(predicted.samples),
+                failures=tuple(predicted.failures),
+                sampled=tuple(s.measures for s in predicted.samples),
+                truth_failure=truths[name][0].reason,
+                finer_failure="" if predicted.finer is None else predicted.finer.reason,
+                measures={
+                    measure: Predicted.of(predicted, *truths[name], measure)
+                    for measure in predicted.at_estimate.measures
                 },
-            }
-            for name, found in patient.scenarios.items()
+            )
+            for name, predicted in patient.scenarios.items()
         },
-    }
+    )
 
 
-def _correlation(covariance: FloatArray) -> list[list[float]]:
+def _correlation(covariance: FloatArray) -> Rows:
     std = np.sqrt(np.diag(covariance))
-    return [[float(v) for v in row] for row in covariance / np.outer(std, std)]
+    return rows(covariance / np.outer(std, std))
 
 
-def _names(found: PredictedScenario) -> list[str]:
-    return list(found.at_estimate.measures)
-
-
-def _row(
-    found: PredictedScenario, truth: Mapping[str, Sample], measure: str
-) -> dict[str, float | bool | None]:
-    spread = found.spread(measure)
-    low, high = found.interval(measure)
-    row: dict[str, float | bool | None] = {
-        "estimate": found.at_estimate.measures[measure],
-        "first_order_std": found.first_order.get(measure),
-        "mean": _known(spread.mean),
-        "std": _known(spread.std),
-        "low": _known(spread.low),
-        "high": _known(spread.high),
-        "samples": spread.count,
-        "mesh_error": _known(found.mesh_error(measure)),
-        "wide_low": _known(low),
-        "wide_high": _known(high),
-    }
-    for key, sample in truth.items():
-        true = sample.measures.get(measure)
-        row[f"truth_{key}_mesh"] = true
-        row[f"inside_{key}_mesh"] = _inside(spread.low, true, spread.high)
-    row["inside_wide"] = _inside(low, row["truth_own_mesh"], high)
-    return row
-
-
-def _inside(low: float, true: float | None, high: float) -> bool | None:
-    """Whether an interval holds the truth; None where one of them is not known."""
-    if true is None or not np.isfinite(high - low):
-        return None
-    return bool(low <= true <= high)
-
-
-def _known(value: float) -> float | None:
-    """NaN, which JSON lacks, as None."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _write_fields(
-    path: Path, valve: Valve, patient: _Patient, scenarios: Mapping[str, Scenario]
-) -> None:
+def _write_fields(path: Path, valve: Valve, patient: _Patient, scenarios: Asked) -> None:
     """Closed shapes of the first patient at the estimate, NaN where there is none."""
     surface = valve.surface
     blank = np.full(surface.vertices.shape, np.nan)
@@ -339,10 +298,11 @@ def _write_fields(
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_prediction),
-    words=lambda record: prediction_text(flat(record)),
+    findings=Findings,
+    run=run_prediction,
+    words=prediction_words,
     write=write_prediction,
+    keep_arrays=lambda record, path: dict(np.load(path)),
     sections=(
         Section(
             "prediction",

@@ -4,23 +4,23 @@ In place of the mechanics there is a stretch that is known in closed form; that 
 scenarios is checked in tests/prediction.
 """
 
-import copy
-import json
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
 from experiments.studies.prediction import study as prediction
 from experiments.studies.prediction.figure import PANELS, prediction_figure
+from experiments.studies.prediction.findings import Findings
 from experiments.studies.prediction.report import (
     SHOWN,
     coverage,
-    prediction_text,
-    write_prediction_tables,
+    prediction_words,
+    write_prediction,
 )
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.mechanics.steps import StepReason
@@ -87,7 +87,7 @@ def run(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", command)
         status = main()
         path = tmp_path / "here" / "result.json"
-        record = flat(json.loads(path.read_text())) if path.is_file() else None
+        record = read_record(path, Findings) if path.is_file() else None
         return status, record, tmp_path / "here", capsys.readouterr()
 
     return call
@@ -96,62 +96,74 @@ def run(tmp_path, monkeypatch, capsys):
 def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):
     status, record, folder, said = run()
     assert status == 0, said.err
-    assert [len(p["scenarios"]) for p in record["patients"]] == [5, 5]
-    patient = record["patients"][0]
-    assert list(patient["scenarios"]) == ["observed", "pressure", "ring", "clip", "both"]
-    for found in patient["scenarios"].values():
-        assert found["failure"] == found["truth_failure"] == ""
-        assert len(found["sampled"]) == found["samples"] == 4
-        for row in found["measures"].values():
-            assert row["low"] <= row["mean"] <= row["high"]
-            inside = row["low"] <= row["truth_own_mesh"] <= row["high"]
-            assert row["inside_own_mesh"] == inside
+    findings = record.findings
+    assert [len(p.scenarios) for p in findings.patients] == [5, 5]
+    patient = findings.patients[0]
+    assert list(patient.scenarios) == ["observed", "pressure", "ring", "clip", "both"]
+    for found in patient.scenarios.values():
+        assert found.failure == found.truth_failure == ""
+        assert len(found.sampled) == found.samples == 4
+        for row in found.measures.values():
+            assert row.low <= row.mean <= row.high
+            inside = row.low <= row.truth_own_mesh <= row.high
+            assert row.inside_own_mesh == inside
             # Nothing is narrower for knowing of the mesh.
-            assert row["wide_low"] <= row["low"] <= row["high"] <= row["wide_high"]
-            if row["mesh_error"] > 1e-3 * abs(row["estimate"]):
-                assert row["wide_high"] > row["high"]
+            assert row.wide_low <= row.low <= row.high <= row.wide_high
+            if row.mesh_error > 1e-3 * abs(row.estimate):
+                assert row.wide_high > row.high
     # The same stretch on either mesh: the truth is one, but its stress has other sample points.
-    row = patient["scenarios"]["observed"]["measures"]["ap_diameter_mm"]
-    assert row["truth_own_mesh"] == pytest.approx(row["truth_same_mesh"], rel=1e-3)
+    row = patient.scenarios["observed"].measures["ap_diameter_mm"]
+    assert row.truth_own_mesh == pytest.approx(row.truth_same_mesh, rel=1e-3)
     # 160 in place of 120 mmHg: a third more stretch of y and as much of its logarithm's spread.
-    more = patient["scenarios"]["pressure"]["measures"]["ap_diameter_mm"]
-    assert more["first_order_std"] == pytest.approx(4 / 3 * row["first_order_std"], rel=1e-3)
-    assert more["estimate"] > row["estimate"]
+    more = patient.scenarios["pressure"].measures["ap_diameter_mm"]
+    assert more.first_order_std == pytest.approx(4 / 3 * row.first_order_std, rel=1e-3)
+    assert more.estimate > row.estimate
     # The truth was drawn about the configured values, and is another for each patient.
-    truths = np.array([p["truth"] for p in record["patients"]])
+    truths = np.array([p.truth for p in findings.patients])
     assert np.all(np.abs(np.log(truths / [6.23, 2.09, 1.0])) < [0.8, 0.8, 0.04])
     assert not np.any(truths[0] == truths[1])
-    for one in record["patients"]:
-        off = np.abs(np.subtract(one["estimate"], one["truth"]))
-        assert np.all(off < 4 * np.array(one["std"]))
+    for one in findings.patients:
+        off = np.abs(np.subtract(one.estimate, one.truth))
+        assert np.all(off < 4 * np.array(one.std))
         assert np.all(off > 0)
-    assert set(SHOWN) <= set(record["measures"])
-    assert coverage(record, "tenting_height_mm", "own")[1] == 10
-    assert coverage(record, "tenting_height_mm", "wide")[1] == 10
+    assert set(SHOWN) <= set(findings.measures)
+    assert coverage(findings, "tenting_height_mm", "own")[1] == 10
+    assert coverage(findings, "tenting_height_mm", "wide")[1] == 10
 
-    assert logged(folder)["forward_solves"] == record["forward_solves"]
-    write_prediction_tables(folder, record)
+    assert logged(folder)["forward_solves"] == record.forward_solves
+    assert not (folder / "prediction.png").exists()
+    write_prediction(folder, {"prediction": record}, {})
     text = (folder / "prediction.md").read_text()
     assert "All 30 samples gave a closed valve." in text
     table = (folder / "prediction.csv").read_text().splitlines()
-    assert len(table) == 1 + 10 * len(record["measures"])
+    assert len(table) == 1 + 10 * len(findings.measures)
     # Without a check nothing is said of the mesh's error, and with a failed one that it is missing.
-    narrow = copy.deepcopy(record) | {"check_mesh": []}
-    for one in narrow["patients"]:
-        for found in one["scenarios"].values():
-            for row in found["measures"].values():
-                row |= {"wide_low": None, "wide_high": None, "inside_wide": None}
-    said = prediction_text(narrow)
+    said = prediction_words(replace(record, findings=without_mesh_error(findings)))
     assert "not the error of the mesh" in said
     assert "truth inside |" not in said
     assert "]°, true" in said
     assert "]°" not in text
-    figure = prediction_figure(record, folder / "fields.npz")
+    figure = prediction_figure(findings, folder / "fields.npz")
     valves, dots = figure.subfigs
     assert [axes.get_title().split("\n")[0] for axes in valves.axes] == list(
-        record["scenarios"].values()
+        findings.scenarios.values()
     )
     assert [axes.get_ylabel() for axes in dots.axes] == [label for _, label in PANELS]
+
+
+def without_mesh_error(findings):
+    """The same of a run that asked for none."""
+    unknown = {"wide_low": None, "wide_high": None, "inside_wide": None}
+
+    def narrower(scenario):
+        rows = {name: replace(row, **unknown) for name, row in scenario.measures.items()}
+        return replace(scenario, measures=rows)
+
+    patients = tuple(
+        replace(one, scenarios={name: narrower(s) for name, s in one.scenarios.items()})
+        for one in findings.patients
+    )
+    return replace(findings, check_mesh=(), patients=patients)
 
 
 def test_samples_that_fail_are_told(run, monkeypatch):
@@ -162,22 +174,22 @@ def test_samples_that_fail_are_told(run, monkeypatch):
     monkeypatch.setattr(ClosureModel, "close", sometimes)
     status, record, folder, _ = run("prediction.patients=1")
     assert status == 0
-    clip = record["patients"][0]["scenarios"]["clip"]
-    assert clip["failure"] == StepReason.SINGULAR.value
-    assert clip["failures"] == [StepReason.SINGULAR.value] * 4
-    assert clip["measures"] == {}
-    text = prediction_text(record)
+    clip = record.findings.patients[0].scenarios["clip"]
+    assert clip.failure == StepReason.SINGULAR.value
+    assert clip.failures == (StepReason.SINGULAR.value,) * 4
+    assert clip.measures == {}
+    text = prediction_words(record)
     assert f"clip at A2–P2: 4 of 4 samples ({StepReason.SINGULAR.value})" in text
-    prediction_figure(record, folder / "fields.npz")
+    prediction_figure(record.findings, folder / "fields.npz")
 
 
 def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypatch):
     monkeypatch.setattr(ClosureModel, "close", buckled)
     status, record, _, _ = run()
     assert status == 1
-    assert record["status"] == "failed"
-    assert StepReason.SINGULAR.value in record["reason"]
-    assert "no prediction: " in prediction_text(record)
+    assert record.status == "failed"
+    assert StepReason.SINGULAR.value in record.reason
+    assert "no prediction: " in prediction_words(record)
 
 
 @pytest.mark.parametrize(
