@@ -17,6 +17,8 @@ import numpy as np
 import scipy
 
 from experiments.common.build import build_twin
+from experiments.common.record import Mesh
+from experiments.studies.filters.settings import FilterProblem, SurrogateDesign
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate
 from mvest.estimation.gaussian import Gaussian
@@ -55,7 +57,7 @@ class ComparedProblem:
         Standard deviation of each coordinate, mm.
     observations : int
         n.
-    mesh_hash : str
+    mesh : Mesh
     """
 
     name: str
@@ -65,7 +67,7 @@ class ComparedProblem:
     truth: FloatArray
     noise: float
     observations: int
-    mesh_hash: str
+    mesh: Mesh
 
     @cached_property
     def exact(self) -> FloatArray:
@@ -131,7 +133,7 @@ class SurrogateModel:
         return Prediction(self.surrogate(x[None])[0], jacobian)
 
 
-def build_problem(config: Values, name: str) -> ComparedProblem:
+def build_problem(config: Values, name: str, settings: FilterProblem) -> ComparedProblem:
     """One of the configured problems.
 
     Raises
@@ -139,10 +141,9 @@ def build_problem(config: Values, name: str) -> ComparedProblem:
     MvestError
         If a setting is inadmissible.
     """
-    settings = config["filters"]["problems"][name]
-    parameters = tuple(settings["parameters"])
-    mean = np.array(settings["initial"], dtype=float)
-    spread = np.array(settings["log_std"], dtype=float)
+    parameters = settings.parameters
+    mean = np.array(settings.initial, dtype=float)
+    spread = np.array(settings.log_std, dtype=float)
     if mean.shape != (len(parameters),) or spread.shape != mean.shape:
         raise ConfigurationError(
             f"filters.problems.{name}: expected one initial and one log_std for each of "
@@ -152,30 +153,30 @@ def build_problem(config: Values, name: str) -> ComparedProblem:
     values = {
         **config,
         "parameters": list(parameters),
-        "fixed": {**config["fixed"], **settings["fixed"]},
-        "truth": {**config["truth"], "values": settings["truth"]},
+        "fixed": {**config["fixed"], **settings.fixed},
+        "truth": {**config["truth"], "values": list(settings.truth)},
         "filter": {**config["filter"], "initial": mean.tolist(), "P0": np.diag(prior.covariance)},
         "observation": {
             **config["observation"],
             "frames": ["closed"],
-            "columns": settings["columns"],
-            "rows": settings["rows"],
+            "columns": settings.columns,
+            "rows": settings.rows,
         },
         "guided": False,
     }
     twin = build_twin(values)
     model = twin.model
     seen = np.zeros((1, len(twin.valve.surface.vertices)), dtype=np.bool_)
-    seen[:, :: settings["every"]] = True
+    seen[:, :: settings.every] = True
     return ComparedProblem(
         name,
         parameters,
         TimedModel(observed_frames(model, ("closed",), seen), lambda: model.restart(None)),
         prior,
         twin.truth_values,
-        float(settings["noise_mm"]),
+        float(settings.noise_mm),
         3 * int(seen.sum()),
-        model.mesh.sha256,
+        Mesh(model.mesh.sha256, len(model.mesh.nodes)),
     )
 
 
@@ -205,15 +206,17 @@ _Run = tuple[FloatArray, FloatArray]
 """Prediction and its derivatives by the logarithms' N(0, I); empty if it failed."""
 
 
-def fit_to_prior(problem: ComparedProblem, settings: Values, store: Path) -> FittedSurrogate:
+def fit_to_prior(
+    problem: ComparedProblem, settings: SurrogateDesign, store: Path
+) -> FittedSurrogate:
     """A polynomial over the prior out to ``reach`` standard deviations.
 
     Each run of the model is kept in the folder ``store`` and read from there if it is there.
     """
-    p, count = len(problem.parameters), settings["surrogate_runs"]
-    wanted = count + settings["held_out"]
-    region = Region(np.zeros(p), settings["reach"] * np.eye(p))
-    sobol = scipy.stats.qmc.Sobol(p, rng=np.random.default_rng(settings["surrogate_seed"]))
+    p, count = len(problem.parameters), settings.surrogate_runs
+    wanted = count + settings.held_out
+    region = Region(np.zeros(p), settings.reach * np.eye(p))
+    sobol = scipy.stats.qmc.Sobol(p, rng=np.random.default_rng(settings.surrogate_seed))
     # The first of Sobol's points are a design by themselves; the further ones lie between them.
     points = region.points(2.0 * sobol.random_base2((wanted - 1).bit_length())[:wanted] - 1.0)
     runs = enumerate(_run_all(problem, points, store))
@@ -225,7 +228,7 @@ def fit_to_prior(problem: ComparedProblem, settings: Values, store: Path) -> Fit
             f"{problem.name}: the model fails at too many of {wanted} points of the prior"
         )
     y, by_x = (np.array([kept[k][part] for k in number]) for part in (0, 1))
-    degree = affordable_degree(fitted * (1 + p), p, settings["degree"], SPARE)
+    degree = affordable_degree(fitted * (1 + p), p, settings.degree, SPARE)
     surrogate = fit_surrogate(at[:fitted], y[:fitted], by_x[:fitted], region, degree)
     error = surrogate(at[fitted:]) - y[fitted:]
     return FittedSurrogate(

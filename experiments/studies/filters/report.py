@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.report import axis_label
-from mvest.files import write_atomically
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line
+from experiments.common.findings import Vector
+from experiments.common.record import Model, Record
+from experiments.common.report import axis_label, write_each
+from experiments.studies.filters.findings import Estimated, Findings, Problem
 from mvest.reporting.style import BAD, GOOD, SMALL, headline, panels
 
 __all__ = [
     "REFERENCE",
     "filters_figure",
-    "filters_text",
-    "write_filter_study",
-    "write_filter_tables",
+    "filters_table",
+    "filters_words",
+    "write_filters",
 ]
-
-Record = Mapping[str, Any]
 
 REFERENCE = "monte_carlo"
 """The filter with which all others are compared."""
@@ -52,75 +48,74 @@ def _label(method: str) -> str:
     return LABELS.get(method, method)
 
 
-def _rows(record: Record) -> list[dict[str, Any]]:
+def filters_table(findings: Findings) -> pd.DataFrame:
     """One row for each problem, filter and parameter."""
     rows = []
-    for problem in record["problems"]:
-        reference = problem["filters"][REFERENCE]
-        ends = np.log([reference["low"], reference["high"]])
-        width = ends[1] - ends[0]
-        for method, found in problem["filters"].items():
-            repeats = problem["repeats"][method]
-            for k, parameter in enumerate(problem["parameters"]):
-                own = np.log([found["low"][k], found["high"][k]])
-                off = 100 * (own - ends[:, k]) / width[k]
+    for problem in findings.problems:
+        reference = problem.filters[REFERENCE]
+        assert reference.skewness is not None
+        for method, estimated in problem.filters.items():
+            repeats = problem.repeats[method]
+            for k, parameter in enumerate(problem.parameters):
+                ends, own = (np.log(one.interval(k)) for one in (reference, estimated))
+                width = ends[1] - ends[0]
+                off = 100 * (own - ends) / width
                 rows.append(
                     {
-                        "problem": problem["name"],
+                        "problem": problem.name,
                         "filter": method,
                         "parameter": parameter,
-                        "truth": problem["truth"][k],
-                        "estimate": found["estimate"][k],
-                        "low": found["low"][k],
-                        "high": found["high"][k],
-                        "error_percent": 100 * (found["estimate"][k] / problem["truth"][k] - 1),
-                        "width_ratio": (own[1] - own[0]) / width[k],
+                        "truth": problem.truth[k],
+                        "estimate": estimated.estimate[k],
+                        "low": estimated.low[k],
+                        "high": estimated.high[k],
+                        "error_percent": 100 * (estimated.estimate[k] / problem.truth[k] - 1),
+                        "width_ratio": (own[1] - own[0]) / width,
                         "lower_end_off_percent": off[0],
                         "upper_end_off_percent": off[1],
-                        "shift_in_std": (found["log_mean"][k] - reference["log_mean"][k])
-                        / reference["log_std"][k],
-                        "skewness": reference["skewness"][k],
-                        "repeats": repeats["runs"],
-                        "failed": repeats["failed"],
-                        "coverage": _of(repeats["coverage"], k),
-                        "rms_error_percent": 100 * _of(repeats["log_rms_error"], k),
-                        "repeats_width_ratio": _of(repeats["width_ratio"], k),
-                        "forward_solves": found["forward_solves"],
-                        "cpu_seconds": found["seconds"],
-                        "model_seconds": found["model_seconds"],
-                        "ended": found["reason"],
-                        "detail": found["detail"],
+                        "shift_in_std": (estimated.log_mean[k] - reference.log_mean[k])
+                        / reference.log_std[k],
+                        "skewness": reference.skewness[k],
+                        "repeats": repeats.runs,
+                        "failed": repeats.failed,
+                        "coverage": _of(repeats.coverage, k),
+                        "rms_error_percent": 100 * _of(repeats.log_rms_error, k),
+                        "repeats_width_ratio": _of(repeats.width_ratio, k),
+                        "forward_solves": estimated.forward_solves,
+                        "cpu_seconds": estimated.seconds,
+                        "model_seconds": estimated.model_seconds,
+                        "ended": estimated.reason,
+                        "detail": estimated.detail,
                     }
                 )
-    return rows
+    return pd.DataFrame(rows)
 
 
-def _of(values: list[float] | None, k: int) -> float:
+def _of(values: Vector | None, k: int) -> float:
     return float("nan") if values is None else values[k]
 
 
-def _readable(record: Record) -> str:
+def filters_words(record: Record[Findings]) -> str:
     """Markdown: one table for each problem, and the words around them."""
-    table = pd.DataFrame(_rows(record))
+    table = filters_table(record.findings)
     parts = []
-    for problem in record["problems"]:
-        parts += [_problem_text(problem, table[table["problem"] == problem["name"]]), ""]
-    return "\n".join([*parts, _conclusion(table), "", _notes(record)])
+    for problem in record.findings.problems:
+        parts += [_problem_text(problem, table[table["problem"] == problem.name]), ""]
+    return "\n".join([*parts, _conclusion(table), "", _notes(record.model)])
 
 
-def _problem_text(problem: Record, table: pd.DataFrame) -> str:
-    parameters = problem["parameters"]
-    surrogate = problem["surrogate"]
-    truth = ", ".join(f"{n} {v:g}" for n, v in zip(parameters, problem["truth"], strict=True))
+def _problem_text(problem: Problem, table: pd.DataFrame) -> str:
+    parameters, surrogate = problem.parameters, problem.surrogate
+    truth = ", ".join(f"{n} {v:g}" for n, v in zip(parameters, problem.truth, strict=True))
     prior = ", ".join(
         f"{n} {v:g} (± {100 * s:.0f} %)"
-        for n, v, s in zip(parameters, problem["initial"], problem["log_prior"]["std"], strict=True)
+        for n, v, s in zip(parameters, problem.initial, problem.log_std, strict=True)
     )
     lines = [
-        f"## {problem['title']}",
+        f"## {problem.title}",
         "",
-        f"Truth: {truth}. Prior: {prior}. {problem['observations']} coordinates of the closed "
-        f"valve with errors of {problem['noise_mm']:g} mm. {problem['about']}".strip(),
+        f"Truth: {truth}. Prior: {prior}. {problem.observations} coordinates of the closed "
+        f"valve with errors of {problem.noise_mm:g} mm. {problem.about}".strip(),
         "",
         "| filter | error (%) | width of the 95 % interval over that of Monte Carlo | its ends "
         "against those of Monte Carlo (% of the width) | "
@@ -145,10 +140,10 @@ def _problem_text(problem: Record, table: pd.DataFrame) -> str:
         "",
         f"Numbers of {', '.join(parameters)}, in this order. Skewness of the posterior: "
         f"{_list(reference['skewness'], '.2f')}. Monte Carlo: "
-        f"{reference['detail'].iloc[0]}. Surrogate of the repeats: degree {surrogate['degree']}, "
-        f"fitted to {surrogate['runs']} runs and their derivatives; error of a coordinate over "
-        f"{surrogate['held_out']} further runs {surrogate['rms_mm']:.2g} mm RMS, at most "
-        f"{surrogate['largest_mm']:.2g} mm.",
+        f"{reference['detail'].iloc[0]}. Surrogate of the repeats: degree {surrogate.degree}, "
+        f"fitted to {surrogate.runs} runs and their derivatives; error of a coordinate over "
+        f"{surrogate.held_out} further runs {surrogate.rms_mm:.2g} mm RMS, at most "
+        f"{surrogate.largest_mm:.2g} mm.",
     ]
     return "\n".join(lines)
 
@@ -190,11 +185,12 @@ def _within(ratios: pd.Series) -> str:
     return f"{int((off <= TARGET).sum())} of {len(ratios)} | {100 * off.max():.0f} %"
 
 
-def _notes(record: Record) -> str:
+def _notes(model: Model | None) -> str:
+    assert model is not None
     return (
         "Simulated. Unknowns are estimated by their logarithms. Errors, widths, runs and CPU time "
         "are of one observation that all filters were given, with the finite-element model itself "
-        f"({record['model']['element']}, {' x '.join(map(str, record['model']['cells']))} cells), "
+        f"({model.element}, {' x '.join(map(str, model.cells))} cells), "
         "each filter starting from the open valve; every run of the model computes its "
         "derivatives, also for filters that do not read them. Coverage and RMS errors are of "
         "repeats in each of which the truth is drawn from the prior, with a surrogate in the place "
@@ -204,24 +200,23 @@ def _notes(record: Record) -> str:
     )
 
 
-def filters_figure(record: Record) -> Figure:
+def filters_figure(findings: Findings) -> Figure:
     """95 % interval that each filter gives each unknown, on that of Monte Carlo."""
-    unknowns = [(p, k) for p in record["problems"] for k in range(len(p["parameters"]))]
-    methods = list(
-        dict.fromkeys(m for p in record["problems"] for m in p["filters"] if m != REFERENCE)
-    )
+    unknowns = [(p, k) for p in findings.problems for k in range(len(p.parameters))]
+    methods = list(dict.fromkeys(m for p in findings.problems for m in p.filters))
+    methods.remove(REFERENCE)
     figure, grid = panels(1, len(unknowns), 0.32 * len(methods) + 2.7, sharey=True)
     right = dict.fromkeys(methods, 0)
     for axes, (problem, k) in zip(grid[0], unknowns, strict=True):
-        reference = _in_std(problem, REFERENCE, k)
+        by = problem.filters[REFERENCE]
+        reference = _in_std(by, by.interval(k), k)
         axes.axvspan(*reference, color="0.88")
-        truth = np.log(problem["truth"][k]) - problem["filters"][REFERENCE]["log_mean"][k]
-        truth /= problem["filters"][REFERENCE]["log_std"][k]
+        (truth,) = _in_std(by, (problem.truth[k],), k)
         axes.axvline(truth, color="black", linewidth=1.0)
         for row, method in enumerate(methods):
-            if method not in problem["filters"]:
+            if method not in problem.filters:
                 continue
-            low, high = _in_std(problem, method, k)
+            low, high = _in_std(by, problem.filters[method].interval(k), k)
             off = (high - low) / (reference[1] - reference[0]) - 1
             is_right = abs(off) <= TARGET
             right[method] += is_right
@@ -236,10 +231,10 @@ def filters_figure(record: Record) -> Figure:
         axes.set_xlim(min(-4.2, truth - 0.5), max(4.2, truth + 0.5))
         axes.set_xticks([-2, 0, 2])
         axes.grid(visible=False, axis="y")
-        name = problem["parameters"][k]
+        name = problem.parameters[k]
         axes.set_title(textwrap.fill(axis_label(name), 14), fontsize=SMALL)
-        axes.set_xlabel(textwrap.fill(problem["title"], 14), fontsize=SMALL - 0.5)
-    counted = [sum(m in p["filters"] for p, _ in unknowns) for m in methods]
+        axes.set_xlabel(textwrap.fill(problem.title, 14), fontsize=SMALL - 0.5)
+    counted = [sum(m in p.filters for p, _ in unknowns) for m in methods]
     labels = [f"{_label(m)}, {right[m]} of {n}" for m, n in zip(methods, counted, strict=True)]
     grid[0, 0].set_yticks(range(len(methods)), labels)
     grid[0, 0].set_ylim(len(methods) - 0.4, -0.7)
@@ -254,32 +249,15 @@ def filters_figure(record: Record) -> Figure:
     return figure
 
 
-def _in_std(problem: Record, method: str, k: int) -> tuple[float, float]:
-    """Ends of an interval of the logarithm, in deviations of Monte Carlo from its mean."""
-    reference, own = problem["filters"][REFERENCE], problem["filters"][method]
-    low, high = (
-        (np.log(own[end][k]) - reference["log_mean"][k]) / reference["log_std"][k]
-        for end in ("low", "high")
-    )
-    return float(low), float(high)
+def _in_std(reference: Estimated, values: Sequence[float], k: int) -> list[float]:
+    """Logarithms of values of one unknown, in deviations of Monte Carlo from its mean."""
+    z = (np.log(values) - reference.log_mean[k]) / reference.log_std[k]
+    return [float(value) for value in z]
 
 
-def filters_text(record: Record) -> str:
-    """The tables for the terminal."""
-    return _readable(record)
-
-
-def write_filter_tables(folder: Path, record: Record) -> list[Path]:
-    """``filters.csv`` and ``filters.md`` in ``folder``."""
-    table = pd.DataFrame(_rows(record))
-    text = f"# {record['title']}\n\n{_readable(record)}\n\n{provenance_line(record)}\n"
-    return [
-        write_atomically(folder / "filters.csv", lambda path: table.to_csv(path, index=False)),
-        write_atomically(folder / "filters.md", text),
-    ]
-
-
-def write_filter_study(folder: Path, record: Record) -> list[Path]:
-    """The tables and the figure."""
-    figure = save_figure(folder / "filters", filters_figure(record), record)
-    return write_filter_tables(folder, record) + figure
+write_filters = write_each(
+    lambda record: filters_table(record.findings),
+    filters_words,
+    lambda record: filters_figure(record.findings),
+)
+"""``filters.csv``, ``filters.md`` and the figure."""

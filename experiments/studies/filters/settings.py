@@ -30,7 +30,7 @@ class FilterProblem:
 
 @dataclass
 class FilterMethod(FilterConfig):
-    """A filter that is told its prior by each problem."""
+    """A filter whose prior is that of each problem."""
 
     initial: list[float] = field(default_factory=list)
     P0: Any = None

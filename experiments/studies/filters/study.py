@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
+from pydantic import TypeAdapter
+from pydantic_core import to_jsonable_python
 
 from experiments.common.build import MADE_BY, filter_of
-from experiments.common.plain import Plain, each, flat, plain_run
-from experiments.common.progress import SolveBar
-from experiments.common.schema import build
+from experiments.common.findings import vector
+from experiments.common.progress import SolveBar, say
+from experiments.common.record import Mesh, Outcome
 from experiments.common.store import Store
-from experiments.common.study import Section, Study
+from experiments.common.study import Job, Section, Study
+from experiments.studies.filters.findings import (
+    Estimated,
+    Findings,
+    Problem,
+    Repeats,
+    SurrogateFit,
+)
 from experiments.studies.filters.problem import (
     TRANSFORM,
     ComparedProblem,
@@ -27,12 +34,8 @@ from experiments.studies.filters.problem import (
     build_problem,
     fit_to_prior,
 )
-from experiments.studies.filters.report import (
-    REFERENCE,
-    filters_text,
-    write_filter_study,
-)
-from experiments.studies.filters.settings import Settings
+from experiments.studies.filters.report import REFERENCE, filters_words, write_filters
+from experiments.studies.filters.settings import FilterStudySettings, Settings
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate, Filter
 from mvest.estimation.filters.ensemble import EnsembleFilter
@@ -40,34 +43,46 @@ from mvest.estimation.filters.monte_carlo import log_posterior
 from mvest.estimation.filters.sampler import SamplerSettings, draw
 from mvest.estimation.noise import observation_noise
 from mvest.kept import Entry
-from mvest.provenance import provenance, write_json
+from mvest.provenance import write_json
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_filter_study"]
 
 Values = Mapping[str, Any]
 
-BINS = 40
-"""Of the histograms of the Monte Carlo posterior."""
-
 INSIDE = 0.9
 """Part of the surrogate's region from which the truths of repeats are drawn, so that their
 posteriors lie within it."""
 
 
-def run_filter_study(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Every filter on every problem; a problem that was computed before is read from its store."""
-    settings = config["filters"]
-    if settings is None or REFERENCE not in settings["methods"]:
+def run_filter_study(job: Job[Settings]) -> Outcome[Findings]:
+    """Every filter on every problem; a problem that was computed before is read from its store.
+
+    Raises
+    ------
+    ConfigurationError
+        If the reference is not among the filters.
+    """
+    settings = job.settings.filters
+    if REFERENCE not in settings.methods:
         raise ConfigurationError(f"filters.methods needs {REFERENCE}, to compare the others with")
-    problems = [_solve(config, name) for name in settings["problems"]]
-    record = _record(config, config_hash, problems, started)
-    return record, []
+    problems, meshes = zip(
+        *(_solve(job.values, settings, name) for name in settings.problems), strict=True
+    )
+    estimates = [one for problem in problems for one in problem.filters.values()]
+    return Outcome(
+        findings=Findings(problems, sum(one.seconds for one in estimates)),
+        mesh=meshes[0],
+        forward_solves=sum(one.forward_solves for one in estimates),
+    )
 
 
-def _entry(config: Values, name: str, part: str, decisive: Any, made_by: tuple[Any, ...]) -> _Kept:
+T = TypeVar("T")
+
+
+def _entry(
+    config: Values, name: str, part: str, decisive: Any, made_by: tuple[Any, ...], kind: type[T]
+) -> Entry[T]:
     """Where a part of what is computed of a problem is kept: under a key of all that decides it."""
     described = {k: config[k] for k in ("valve", "mesh", "mechanics", "fixed", "seed")}
     problem = config["filters"]["problems"][name]
@@ -76,69 +91,70 @@ def _entry(config: Values, name: str, part: str, decisive: Any, made_by: tuple[A
     described["problem"] = {k: v for k, v in problem.items() if k not in without}
     described["decisive"] = decisive
     store = Store(config["paths"]["outputs"])
-    return store.entry("filter_store", described, made_by, _read, f"{name}_{part}_{{key}}.json")
+    adapter = TypeAdapter(kind)
+
+    def read(path: Path) -> T:
+        return adapter.validate_json(path.read_bytes())
+
+    return store.entry("filter_store", described, made_by, read, f"{name}_{part}_{{key}}.json")
 
 
-_Kept = Entry[dict[str, Any]]
+def _write(path: Path, made: Any) -> None:
+    write_json(path, to_jsonable_python(made))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text(encoding="utf-8")))
-
-
-def _solve(config: Values, name: str) -> dict[str, Any]:
-    """All that the study tells of one problem; what was computed before is read."""
-    settings = config["filters"]
-    problem = build_problem(config, name)
-    methods = settings["methods"]
+def _solve(config: Values, settings: FilterStudySettings, name: str) -> tuple[Problem, Mesh]:
+    """All that the study says of one problem, and its mesh; what was computed before is read."""
+    described = settings.problems[name]
+    problem = build_problem(config, name, described)
+    raw = config["filters"]
     filters = {
-        method: filter_of(_told(values, problem), problem.prior.mean)
-        for method, values in methods.items()
+        method: filter_of(_with_noise(values, problem), problem.prior.mean)
+        for method, values in raw["methods"].items()
     }
-    found = {}
+    estimates = {}
+    made_by: tuple[Any, ...] = (_estimate, build_problem, filter_of)
     for method, filter_ in filters.items():
-        entry = _entry(config, name, method, methods[method], (_estimate, build_problem, filter_of))
+        entry = _entry(config, name, method, raw["methods"][method], made_by, Estimated)
         make = partial(_estimate, problem, filter_, config["seed"])
-        found[method] = entry.get_or_make(make, write_json)
-        row = found[method]
-        _say(f"{name}, {method}: {row['forward_solves']} runs, {row['seconds']:.0f} s")
-    design = {k: v for k, v in settings["design"].items() if k != "degree"}
-    runs = _entry(config, name, "runs", design, (fit_to_prior, *MADE_BY)).path.with_suffix("")
-    fitted = fit_to_prior(problem, settings["design"], runs)
-    decisive = {k: settings[k] for k in ("methods", "design", "repeats", "sampler")}
-    entry = _entry(config, name, "repeats", decisive, (_repeats, build_problem, fit_to_prior))
-    repeats = entry.get_or_make(
-        lambda: _repeats(problem, fitted, filters, settings, config["seed"]), write_json
-    )
-    described = settings["problems"][name]
-    log_prior = problem.log_prior
-    return {
-        "name": name,
-        **{
-            k: described[k]
-            for k in ("title", "about", "parameters", "truth", "initial", "noise_mm")
-        },
-        "log_prior": {"mean": log_prior.mean.tolist(), "std": log_prior.std.tolist()},
-        "observations": problem.observations,
-        "mesh_hash": problem.mesh_hash,
-        "surrogate": {
-            "runs": fitted.runs,
-            "held_out": fitted.held_out,
-            "degree": int(fitted.model.surrogate.powers.sum(axis=1).max()),
-            "rms_mm": fitted.rms_mm,
-            "largest_mm": fitted.largest_mm,
-        },
-        "filters": found,
-        "repeats": repeats,
-    }
+        done = estimates[method] = entry.get_or_make(make, _write)
+        say(f"{name}, {method}: {done.forward_solves} runs, {done.seconds:.0f} s")
+    design = {k: v for k, v in raw["design"].items() if k != "degree"}
+    runs = _entry(config, name, "runs", design, (fit_to_prior, *MADE_BY), object)
+    fitted = fit_to_prior(problem, settings.design, runs.path.with_suffix(""))
+    decisive = {k: raw[k] for k in ("methods", "design", "repeats", "sampler")}
+    made_by = (_repeats, build_problem, fit_to_prior)
+    repeats = _entry(config, name, "repeats", decisive, made_by, dict[str, Repeats])
+    return Problem(
+        name=name,
+        title=described.title,
+        about=described.about,
+        parameters=described.parameters,
+        truth=described.truth,
+        initial=described.initial,
+        log_std=vector(problem.log_prior.std),
+        noise_mm=described.noise_mm,
+        observations=problem.observations,
+        surrogate=SurrogateFit(
+            fitted.runs,
+            fitted.held_out,
+            int(fitted.model.surrogate.powers.sum(axis=1).max()),
+            fitted.rms_mm,
+            fitted.largest_mm,
+        ),
+        filters=estimates,
+        repeats=repeats.get_or_make(
+            lambda: _repeats(problem, fitted, filters, settings, config["seed"]), _write
+        ),
+    ), problem.mesh
 
 
-def _told(values: Values, problem: ComparedProblem) -> dict[str, Any]:
+def _with_noise(values: Values, problem: ComparedProblem) -> dict[str, Any]:
     """Settings of a filter, with the process noise of the paper: as large as the prior."""
     return {**values, "Q": np.diag(problem.prior.covariance)}
 
 
-def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> dict[str, Any]:
+def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated:
     """One estimate with the model itself, from the open valve on."""
     problem.model.restart()
     y = problem.exact
@@ -156,45 +172,37 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> dict[str,
     )
     seconds = time.process_time() - began
     low, high = found.interval()
-    row = {
-        "converged": found.converged,
-        "reason": found.reason.value,
-        "detail": found.detail,
-        "forward_solves": found.forward_solves,
-        "iterations": found.iterations,
-        "seconds": seconds,
-        "model_seconds": problem.model.seconds - before,
-        "estimate": found.mean.tolist(),
-        "log_mean": found.transformed.mean.tolist(),
-        "log_std": found.transformed.std.tolist(),
-        "low": low.tolist(),
-        "high": high.tolist(),
-    }
-    if found.transformed_samples is not None:
-        row["histogram"] = [_histogram(draws) for draws in found.transformed_samples.T]
-        row["skewness"] = scipy.stats.skew(found.transformed_samples, axis=0).tolist()
-    return row
-
-
-def _histogram(draws: FloatArray) -> dict[str, Any]:
-    density, edges = np.histogram(draws, bins=BINS, density=True)
-    return {"edges": edges.tolist(), "density": density.tolist()}
+    draws = found.transformed_samples
+    return Estimated(
+        converged=found.converged,
+        reason=found.reason.value,
+        detail=found.detail,
+        forward_solves=found.forward_solves,
+        iterations=found.iterations,
+        seconds=seconds,
+        model_seconds=problem.model.seconds - before,
+        estimate=vector(found.mean),
+        log_mean=vector(found.transformed.mean),
+        log_std=vector(found.transformed.std),
+        low=vector(low),
+        high=vector(high),
+        skewness=None if draws is None else vector(scipy.stats.skew(draws, axis=0)),
+    )
 
 
 def _repeats(
     problem: ComparedProblem,
     fitted: FittedSurrogate,
     filters: Mapping[str, Filter],
-    settings: Values,
+    settings: FilterStudySettings,
     seed: int,
-) -> dict[str, Any]:
+) -> dict[str, Repeats]:
     """Estimates from many observations, each of a truth of its own, with the surrogate."""
-    p, count = len(problem.parameters), settings["repeats"]
-    sampler = build(SamplerSettings, settings["sampler"])
+    p = len(problem.parameters)
     every: dict[str, list[_Interval | None]] = {method: [] for method in filters}
-    truths = _truths(p, INSIDE * settings["design"]["reach"], np.random.default_rng([seed, 1]))
+    truths = _truths(p, INSIDE * settings.design.reach, np.random.default_rng([seed, 1]))
     log_prior = problem.log_prior
-    for k in range(count):
+    for k in range(settings.repeats):
         rng = np.random.default_rng([seed, 2, k])
         truth = next(truths)
         y = fitted.model.surrogate(truth[None])[0]
@@ -202,7 +210,7 @@ def _repeats(
         for method, filter_ in filters.items():
             interval: tuple[FloatArray, FloatArray, FloatArray] | None
             if method == REFERENCE:
-                interval = _drawn(problem, fitted, y, sampler, rng)
+                interval = _drawn(problem, fitted, y, settings.sampler, rng)
             else:
                 if isinstance(filter_, EnsembleFilter):
                     filter_ = replace(filter_, seed=k)
@@ -211,9 +219,7 @@ def _repeats(
                 )
                 interval = _interval(found, log_prior.mean, log_prior.std)
             every[method].append(None if interval is None else (*interval, truth))
-    return {
-        method: _summary(found, every[REFERENCE], log_prior.std) for method, found in every.items()
-    }
+    return {method: _summary(own, every[REFERENCE], log_prior.std) for method, own in every.items()}
 
 
 _Interval = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -257,74 +263,28 @@ def _drawn(
 
 
 def _summary(
-    found: list[_Interval | None], reference: list[_Interval | None], std: FloatArray
-) -> dict[str, Any]:
+    intervals: list[_Interval | None], reference: list[_Interval | None], std: FloatArray
+) -> Repeats:
     """Coverage, error and width over the repeats; one that failed covers nothing."""
-    kept = [(f, r) for f, r in zip(found, reference, strict=True) if f is not None]
+    kept = [(f, r) for f, r in zip(intervals, reference, strict=True) if f is not None]
     held = np.array([(f[1] <= f[3]) & (f[3] <= f[2]) for f, _ in kept])
     error = np.array([f[0] - f[3] for f, _ in kept]) * std
     width = np.array([(f[2] - f[1]) / (r[2] - r[1]) for f, r in kept if r is not None])
-    return {
-        "runs": len(found),
-        "failed": len(found) - len(kept),
-        "coverage": (held.sum(axis=0) / len(found)).tolist() if kept else None,
-        "log_rms_error": np.sqrt((error**2).mean(axis=0)).tolist() if kept else None,
-        "width_ratio": np.median(width, axis=0).tolist() if kept else None,
-    }
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def _record(
-    config: Values, config_hash: str, problems: list[dict[str, Any]], started: float
-) -> dict[str, Any]:
-    seconds = sum(row["seconds"] for p in problems for row in p["filters"].values())
-    return {
-        **{key: config[key] for key in ("title", "row", "table", "parameters")},
-        "schema": 1,
-        "experiment": config["name"],
-        "status": "converged",
-        "reason": "completed",
-        "detail": "",
-        "truth": None,
-        "estimate": None,
-        "std": None,
-        "relative_error": None,
-        "iterates": None,
-        "iterate_std": None,
-        "distance_mm": None,
-        "distance_to_truth_mm": None,
-        "moduli_error_percent": None,
-        "iterations": 0,
-        "forward_solves": sum(
-            row["forward_solves"] for p in problems for row in p["filters"].values()
-        ),
-        "seconds": seconds,
-        "seconds_total": time.time() - started,
-        "mesh": {},
-        "model": {
-            "element": config["mechanics"]["element"],
-            "cells": [config["mesh"][key] for key in ("columns", "rows", "layers")],
-        },
-        "problems": problems,
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": problems[0]["mesh_hash"],
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
+    return Repeats(
+        runs=len(intervals),
+        failed=len(intervals) - len(kept),
+        coverage=vector(held.sum(axis=0) / len(intervals)) if kept else None,
+        log_rms_error=vector(np.sqrt((error**2).mean(axis=0))) if kept else None,
+        width_ratio=vector(np.median(width, axis=0)) if kept else None,
+    )
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_filter_study),
-    words=lambda record: filters_text(flat(record)),
-    write=each(write_filter_study),
+    findings=Findings,
+    run=run_filter_study,
+    words=filters_words,
+    write=write_filters,
     sections=(
         Section(
             "filters",

@@ -10,14 +10,16 @@ from hydra import compose, initialize_config_dir
 
 from experiments.common.build import build_filter
 from experiments.common.config import plain, register
-from experiments.common.plain import flat
+from experiments.common.record import read_record
 from experiments.run import main
+from experiments.studies.filters.findings import Findings
 from experiments.studies.filters.problem import (
     ComparedProblem,
     SurrogateModel,
     TimedModel,
     fit_to_prior,
 )
+from experiments.studies.filters.settings import SurrogateDesign
 from experiments.studies.filters.study import _summary
 from mvest.errors import ConfigurationError
 from mvest.estimation import (
@@ -83,7 +85,7 @@ def quadratic(m):
     return Prediction(np.array([a * b, a**2, b]), jacobian)
 
 
-DESIGN = {"surrogate_runs": 8, "held_out": 3, "reach": 3.0, "degree": 3, "surrogate_seed": 1}
+DESIGN = SurrogateDesign(surrogate_runs=8, held_out=3, reach=3.0, degree=3, surrogate_seed=1)
 
 
 def test_a_surrogate_over_the_prior_is_a_model_of_the_parameters(tmp_path: Path) -> None:
@@ -128,12 +130,12 @@ def test_coverage_counts_failures_as_misses() -> None:
     held = (0.5 * one, 0 * one, one, 0.7 * one)
     missed = (0.5 * one, 0 * one, one, 1.5 * one)
     wide = (0.5 * one, -one, one, 0.7 * one)
-    told = _summary([held, missed, None, held], [wide] * 4, 2.0 * one)
+    repeats = _summary([held, missed, None, held], [wide] * 4, 2.0 * one)
     # Two of four hold; errors 0.2, 1, 0.2 times 2; half as wide as the reference.
-    assert told["coverage"] == [0.5]
-    assert told["failed"] == 1
-    assert told["log_rms_error"][0] == pytest.approx(2.0 * np.sqrt((0.04 + 1 + 0.04) / 3))
-    assert told["width_ratio"] == [0.5]
+    assert repeats.coverage == (0.5,)
+    assert repeats.failed == 1
+    assert repeats.log_rms_error[0] == pytest.approx(2.0 * np.sqrt((0.04 + 1 + 0.04) / 3))
+    assert repeats.width_ratio == (0.5,)
 
 
 def test_the_study_runs_and_its_tables_follow_from_the_record(
@@ -160,21 +162,21 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     ]
     monkeypatch.setattr(sys, "argv", arguments)
     assert main() == 0
-    record = flat(json.loads((tmp_path / "here" / "result.json").read_text()))
-    (problem,) = record["problems"]
-    found = problem["filters"]
+    record = read_record(tmp_path / "here" / "result.json", Findings)
+    (problem,) = record.findings.problems
+    found = problem.filters
+    assert record.mesh is not None
+    assert record.provenance.mesh_hash == record.mesh.sha256
     assert list(found) == ["extended", "iterated", "unscented", "ensemble", "monte_carlo"]
     # What each costs is what the model was run: 2; 6 members and the estimate.
-    assert found["extended"]["forward_solves"] == 2
-    assert found["ensemble"]["forward_solves"] == 7
-    assert all(0 < row["model_seconds"] <= row["seconds"] for row in found.values())
+    assert found["extended"].forward_solves == 2
+    assert found["ensemble"].forward_solves == 7
+    assert all(0 < row.model_seconds <= row.seconds for row in found.values())
     # Little is asked of so few draws: it is recorded that they are not enough.
-    assert not found["monte_carlo"]["converged"]
-    assert problem["repeats"]["iterated"]["runs"] == 3
+    assert not found["monte_carlo"].converged
+    assert problem.repeats["iterated"].runs == 3
     # The unscented and the extended filter agree where the data are strong.
-    np.testing.assert_allclose(
-        found["unscented"]["log_mean"], found["iterated"]["log_mean"], atol=0.01
-    )
+    np.testing.assert_allclose(found["unscented"].log_mean, found["iterated"].log_mean, atol=0.01)
     folder = tmp_path / "here"
     assert {"filters.csv", "filters.md", "filters.png", "filters.pdf"} <= {
         path.name for path in folder.iterdir()
@@ -188,5 +190,5 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     store.write_text(json.dumps(changed))
     monkeypatch.setattr(sys, "argv", [*arguments, "force=true"])
     assert main() == 0
-    again = flat(json.loads((folder / "result.json").read_text()))
-    assert again["problems"][0]["filters"]["iterated"]["detail"] == "from the store"
+    again = read_record(folder / "result.json", Findings).findings
+    assert again.problems[0].filters["iterated"].detail == "from the store"

@@ -1,58 +1,62 @@
 """Table and figure of the filters from a made-up record."""
 
 import math
+from dataclasses import replace
 
 import pandas as pd
 import pytest
 
-from experiments.studies.filters.report import filters_figure, filters_text, write_filter_study
+from experiments.common.record import Record
+from experiments.studies.filters.findings import (
+    Estimated,
+    Findings,
+    Problem,
+    Repeats,
+    SurrogateFit,
+)
+from experiments.studies.filters.report import filters_figure, filters_words, write_filters
 from mvest.reporting.style import BAD, GOOD
-from tests.reporting.records import record
+from tests.experiments.studies.made_up import made_up
 
 
-def told(width: float, **changes) -> dict:
-    """A filter's word of one modulus, 4 MPa ± half a ``width`` of the logarithm."""
-    return {
-        "converged": True,
-        "reason": "converged: as it should",
-        "detail": "",
-        "forward_solves": 7,
-        "seconds": 3.0,
-        "model_seconds": 2.9,
-        "estimate": [4.0],
-        "log_mean": [1.386],
-        "log_std": [width / 3.92],
-        "low": [4.0 * 2.718281828 ** (-width / 2)],
-        "high": [4.0 * 2.718281828 ** (width / 2)],
-        **changes,
-    }
+def estimated(width: float, skewness: float | None = None) -> Estimated:
+    """What a filter says of one modulus, 4 MPa ± half a ``width`` of the logarithm."""
+    return Estimated(
+        converged=True,
+        reason="converged: as it should",
+        detail="",
+        forward_solves=7,
+        iterations=1,
+        seconds=3.0,
+        model_seconds=2.9,
+        estimate=(4.0,),
+        log_mean=(1.386,),
+        log_std=(width / 3.92,),
+        low=(4.0 * 2.718281828 ** (-width / 2),),
+        high=(4.0 * 2.718281828 ** (width / 2),),
+        skewness=None if skewness is None else (skewness,),
+    )
 
 
-def study(skewness: float, width: float, **repeats) -> dict:
-    seen = {"runs": 50, "failed": 0, "coverage": [0.94], "log_rms_error": [0.1],
-            "width_ratio": [1.0], **repeats}  # fmt: skip
-    histogram = {"edges": [1.1, 1.3, 1.5, 1.7], "density": [1.0, 3.0, 1.0]}
-    reference = told(0.4, histogram=[histogram], skewness=[skewness])
-    problem = {
-        "name": "made_up",
-        "title": "One modulus",
-        "about": "",
-        "parameters": ["E_f.anterior"],
-        "truth": [5.0],
-        "initial": [4.5],
-        "noise_mm": 0.5,
-        "log_prior": {"mean": [1.5], "std": [0.3]},
-        "observations": 672,
-        "surrogate": {"runs": 9, "held_out": 2, "degree": 3, "rms_mm": 0.01, "largest_mm": 0.1},
-        "filters": {"iterated": told(width), "monte_carlo": reference},
-        "repeats": {"iterated": seen, "monte_carlo": seen},
-    }
-    return {
-        **record(),
-        "title": "Filters",
-        "problems": [problem],
-        "model": {"element": "hex18", "cells": [24, 3, 1]},
-    }
+SEEN = Repeats(runs=50, failed=0, coverage=(0.94,), log_rms_error=(0.1,), width_ratio=(1.0,))
+
+
+def study(skewness: float, width: float, seen: Repeats = SEEN) -> Record[Findings]:
+    problem = Problem(
+        name="made_up",
+        title="One modulus",
+        about="",
+        parameters=("E_f.anterior",),
+        truth=(5.0,),
+        initial=(4.5,),
+        log_std=(0.3,),
+        noise_mm=0.5,
+        observations=672,
+        surrogate=SurrogateFit(9, 2, 3, 0.01, 0.1),
+        filters={"iterated": estimated(width), "monte_carlo": estimated(0.4, skewness)},
+        repeats={"iterated": seen, "monte_carlo": seen},
+    )
+    return made_up(Findings((problem,), 6.0), title="Filters", experiment="filters")
 
 
 def row(text: str, start: str) -> str:
@@ -60,7 +64,7 @@ def row(text: str, start: str) -> str:
 
 
 def test_error_width_coverage_and_cost_of_a_filter() -> None:
-    text = filters_text(study(0.0, 0.44))
+    text = filters_words(study(0.0, 0.44))
     # 4 of 5 MPa: -20 %; 0.44/0.4 = 1.10; each end 0.02 farther out, 5 % of 0.4.
     expected = "| iterated extended | -20.0 | 1.10 | -5 / +5 | 94 % | 10.0 | 7 | 3 | converged |"
     assert row(text, "| iterated extended | -20") == expected
@@ -75,24 +79,23 @@ def test_error_width_coverage_and_cost_of_a_filter() -> None:
     ],
 )
 def test_the_target_holds_where_the_posterior_is_near_normal(skewness, width, expected) -> None:
-    text = filters_text(study(skewness, width)).partition("Gaussian intervals against")[2]
+    text = filters_words(study(skewness, width)).partition("Gaussian intervals against")[2]
     assert row(text, "| iterated extended") == expected
 
 
 def test_failed_repeats_are_told() -> None:
-    text = filters_text(study(0.0, 0.4, failed=3))
+    text = filters_words(study(0.0, 0.4, replace(SEEN, failed=3)))
     assert "3 of 50 repeats failed" in row(text, "| iterated extended")
 
 
 def test_a_filter_that_always_failed_has_dashes() -> None:
-    text = filters_text(
-        study(0.0, 0.4, failed=50, coverage=None, log_rms_error=None, width_ratio=None)
-    )
+    lost = Repeats(runs=50, failed=50, coverage=None, log_rms_error=None, width_ratio=None)
+    text = filters_words(study(0.0, 0.4, lost))
     assert "| – % | – |" in row(text, "| iterated extended")
 
 
 def test_files_are_written_and_hold_all_numbers(tmp_path) -> None:
-    written = write_filter_study(tmp_path, study(0.0, 0.4))
+    written = write_filters(tmp_path, {"filters": study(0.0, 0.4)}, {})
     assert {path.name for path in written} == {
         "filters.csv",
         "filters.md",
@@ -106,7 +109,7 @@ def test_files_are_written_and_hold_all_numbers(tmp_path) -> None:
 
 @pytest.mark.parametrize(("width", "colour", "words"), [(0.42, GOOD, []), (0.48, BAD, ["+20 %"])])
 def test_every_filter_has_an_interval_on_that_of_the_draws(width, colour, words) -> None:
-    figure = filters_figure(study(0.0, width))
+    figure = filters_figure(study(0.0, width).findings)
     (axes,) = figure.axes
     # The truth, and the filter's interval and mean.
     truth, interval, mean = axes.lines
