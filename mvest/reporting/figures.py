@@ -20,10 +20,22 @@ from mvest.files import write_atomically
 from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["iterates_figure", "save_figure", "save_figure_with", "valve_figure"]
+__all__ = [
+    "COLOURS",
+    "LEAFLET_COLOURS",
+    "MARKERS",
+    "iterates_figure",
+    "save_figure",
+    "save_figure_with",
+    "valve_figure",
+]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008)."""
+
+LEAFLET_COLOURS = np.array([[0.45, 0.70, 0.83], [0.91, 0.65, 0.45], [0.45, 0.79, 0.70]])
+"""Of leaflets in the order of their regions, ``(3, 3)``: tints of the first of `COLOURS`, in which
+curves show their moduli, light enough to be shaded."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
@@ -102,7 +114,7 @@ def valve_figure(fields: Path) -> Figure:
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{fields}: no fields of a valve ({error})") from error
     figure = Figure(figsize=(8.4, 6.4), layout="constrained")
-    tissue = np.array([_rgb(COLOURS[r % len(COLOURS)]) for r in region])
+    tissue = LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)]
     unit, factor = next(
         ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * np.nanmax(distance) >= 0.1),
         ("nm", 1e6),
@@ -187,7 +199,3 @@ def _draw(
     axes.set_box_aspect(tuple(high - low), zoom=1.2)
     axes.set_proj_type("ortho")
     axes.set_axis_off()
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    return tuple(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))  # type: ignore[return-value]

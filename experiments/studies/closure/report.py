@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from experiments.common.findings import stored_arrays
 from experiments.common.record import Record
 from experiments.common.report import write_report
 from mvest.closure.measures import StepMeasures
@@ -89,8 +90,7 @@ def closure_figure(record: Record[Findings], fields: Path) -> Figure:
         If the fields cannot be read.
     """
     try:
-        with np.load(fields, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = stored_arrays(fields)
         # The ends of the chordae are points of no triangle.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
         valve = _valve(arrays, shapes)

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy
 from pydantic import TypeAdapter
-from pydantic_core import to_jsonable_python
 
 from experiments.common.build import MADE_BY, filter_of
 from experiments.common.findings import vector
@@ -42,8 +41,8 @@ from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import log_posterior
 from mvest.estimation.filters.sampler import SamplerSettings, draw
 from mvest.estimation.noise import observation_noise
+from mvest.files import write_atomically
 from mvest.kept import Entry
-from mvest.provenance import write_json
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_filter_study"]
@@ -100,7 +99,7 @@ def _entry(
 
 
 def _write(path: Path, made: Any) -> None:
-    write_json(path, to_jsonable_python(made))
+    write_atomically(path, TypeAdapter(Any).dump_json(made))
 
 
 def _solve(config: Values, settings: FilterStudySettings, name: str) -> tuple[Problem, Mesh]:

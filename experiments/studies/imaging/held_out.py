@@ -1,4 +1,4 @@
-"""Detectors on volumes of held-out valves: which volumes, and what was found in them."""
+"""Detectors on volumes of held-out valves: which volumes, and what they saw in them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from experiments.common.progress import PartBar
-from experiments.common.schema import build
 from experiments.studies.imaging.parallel import in_processes
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.trials import (
@@ -30,12 +29,10 @@ from mvest.typing import FloatArray
 
 __all__ = ["HeldOut", "hold_out"]
 
-Values = Mapping[str, Any]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """What detectors found in volumes of valves that no training saw.
+    """What detectors saw in volumes of valves that no training saw.
 
     Attributes
     ----------
@@ -48,7 +45,7 @@ class HeldOut:
     volumes: dict[int, list[dict[str, Any]]]
     sequences: dict[str, list[tuple[dict[str, Any], dict[str, FloatArray]]]]
 
-    def found(self, kind: str, min_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
+    def detected(self, kind: str, min_confidence: float, wrong_mm: float = np.inf) -> HeldOut:
         """Only volumes over time of a kind whose valve is believed in, and is not a wrong one.
 
         Parameters
@@ -73,26 +70,22 @@ class HeldOut:
 
 
 def hold_out(
-    store: ImagingStore,
-    config: Values,
-    calibration: Sequence[MovingValve],
-    test: Sequence[MovingValve],
+    store: ImagingStore, calibration: Sequence[MovingValve], test: Sequence[MovingValve]
 ) -> HeldOut:
     """Simulate all held-out volumes and search them; what was done before is read."""
-    imaging = config["imaging"]
-    # The verdict changes nothing of what is found.
-    settings = replace(build(TrackingSettings, imaging["detection"]), min_confidence=0.0)
-    held_out = imaging["held_out"]
-    counts = dict(zip(VOLUMES, (held_out["volumes"], held_out["shifted"]), strict=True))
-    counts |= dict.fromkeys(WITHOUT_VALVE, held_out["without_valve"])
-    every = [store.training.volumes, *sorted(imaging["curve"], reverse=True)]
+    # The verdict changes nothing of what is seen.
+    settings = replace(store.settings.detection, min_confidence=0.0)
+    held_out = store.settings.held_out
+    counts = dict(zip(VOLUMES, (held_out.volumes, held_out.shifted), strict=True))
+    counts |= dict.fromkeys(WITHOUT_VALVE, held_out.without_valve)
+    every = [store.training.volumes, *sorted(store.settings.curve, reverse=True)]
     asked = []
     for kind, count in counts.items():
         for number in range(count):
-            also = kind in VOLUMES and number < held_out["curve_volumes"]
+            also = kind in VOLUMES and number < held_out.curve_volumes
             asked.append((_trial(store, kind, number), every if also else every[:1]))
     volumes = _volumes(store, asked, test, settings)
-    lengths = (len(calibration), held_out["sequences"], held_out["shifted_sequences"])
+    lengths = (len(calibration), held_out.sequences, held_out.shifted_sequences)
     sequences = {
         kind: _sequences(
             store,
@@ -160,7 +153,7 @@ def _sequences(
 ) -> list[tuple[dict[str, Any], dict[str, FloatArray]]]:
     """Rows and arrays of sequences."""
     population, size = store.population_key(which), store.training.volumes
-    closed = store.population_settings.motion.frames - 1
+    closed = store.settings.population.motion.frames - 1
     entries = [
         store.store.entry(
             "sequences",

@@ -1,8 +1,9 @@
-"""Everything that is told of a study of the image step: tables, figures, words."""
+"""The study of the image step in tables, figures and words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,12 +11,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from experiments.common.record import Record
 from experiments.common.tables import write_table
-from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_tables
+from experiments.studies.imaging.findings import Accuracy, Confidences, Evaluation, Findings
+from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_table
 from mvest.imaging.layout import ValveLayout
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import keep_record, provenance_line
-from mvest.reporting.images.figures import SETTINGS, std_figure
+from mvest.reporting.figures import save_figure_with
+from mvest.reporting.images.figures import SETTINGS, distance_figure, std_figure, training_figure
 from mvest.reporting.markup import MISSING, number
 from mvest.reporting.style import COLOURS, GREY, MARKERS, SMALL, headline, panels
 
@@ -23,15 +25,15 @@ __all__ = [
     "confidence_figure",
     "correlation_figure",
     "imaging_text",
-    "publish_imaging",
     "study_words",
-    "write_imaging_study",
+    "write_imaging",
 ]
 
-Record = Mapping[str, Any]
-
-NOT_KEPT: Final = ("volumes", "sequence_frames")
-"""Of a record, what no table needs."""
+CALLED: Final = {
+    "called_percent": "called a valve [%]",
+    "wrongly_percent": "wrongly called so [%]",
+}
+"""Columns of the table of confidences."""
 
 _PARTS: Final = {
     "valves": "for valves",
@@ -58,71 +60,73 @@ OVER_TIME: Final = (
 WITHOUT: Final = (
     "How sure the detectors are of a valve in simulated volumes, with and without one. Walls only: "
     "leaflets, annulus and chordae send no echo; no tissue: nothing does; a volume over time "
-    "counts with its best frame. Wrongly: there is none, or what was found is not it. Nothing here "
-    "was measured in patients."
+    "counts with its best frame. Wrongly: there is none, or what was detected is not it. Nothing "
+    "here was measured in patients."
 )
 
 
-def study_words(record: Record) -> list[str]:
-    """What the study's record says in numbers, sentence by sentence."""
-    spent, told = record["spent"], []
+def study_words(findings: Findings) -> list[str]:
+    """What the study says in numbers, sentence by sentence."""
+    spent, tested = findings.spent, findings.tested
     parts = [
-        f"{spent[part]['cpu_s']:.0f} s {words}"
+        f"{cpu_s:.0f} s {words}"
         for part, words in _PARTS.items()
-        if spent[part]["cpu_s"] is not None
+        if (cpu_s := spent[part].cpu_s) is not None
     ]
-    total = spent["training"]["cpu_s"]
-    told.append(
-        f"Trained on {record['training_volumes']} volumes of "
-        f"{record['valves']['train']['count']} simulated valves; CPU time "
+    total = spent["training"].cpu_s
+    said = [
+        f"Trained on {findings.training_volumes} volumes of "
+        f"{findings.valves['train'].count} simulated valves; CPU time "
         + ", ".join(parts)
         + (f"; {total / 60.0:.1f} minutes in all." if total is not None else ".")
-    )
-    if "accuracy" not in record:
-        return [*told, "Not tested."]
-    known = [row["state_right"] for row in record["rows"] if row["state_right"] is not None]
+    ]
+    if tested is None:
+        return [*said, "Not tested."]
+    known = [row.state_right for row in tested.rows if row.state_right is not None]
     if known:
-        told.append(
+        said.append(
             f"Whether the orifice is open is right in {sum(known)} of {len(known)} volumes."
         )
-    accuracy = record["accuracy"]
-    told.append(
-        f"Errors that the detectors tell, from {accuracy['sequences']} volumes over time of other "
-        f"valves: median standard deviation of a coordinate {accuracy['median_std_mm']:.2f} mm, "
-        f"alike over {accuracy['correlation_length_mm']:.1f} mm, mean error "
-        f"{accuracy['mean_error_mm']:.2f} mm. Left out, as the valve was not found or something "
-        f"else was taken for it: {accuracy['left_out']}."
+    accuracy, confidence = tested.accuracy, tested.confidence
+    said.append(
+        f"Errors that the detectors state, from {accuracy.sequences} volumes over time of other "
+        f"valves: median standard deviation of a coordinate {accuracy.median_std_mm:.2f} mm, "
+        f"alike over {accuracy.correlation_length_mm:.1f} mm, mean error "
+        f"{accuracy.mean_error_mm:.2f} mm. Left out, as the valve was not detected or something "
+        f"else was taken for it: {accuracy.left_out}."
     )
-    for row in accuracy["within_95"]:
-        told.append(
-            f"{row['setting'].capitalize()}, {row['frame']} frame: {100 * row['share']:.0f} % of "
-            f"coordinates lie within 1.96 of these standard deviations "
-            f"({100 * row['share_about_mean']:.0f} % with the mean error taken off), of "
-            f"{row['sequences']} volumes."
-        )
-    found = record["confidence"]
-    told.append(
-        f"Confidence without a valve: at most {found['highest_without_valve']:.2f}; a valve is "
-        f"called one from {found['least_confidence']:g} on."
+    said += [
+        f"{row.setting.capitalize()}, {row.frame} frame: {100 * row.share:.0f} % of "
+        f"coordinates lie within 1.96 of these standard deviations "
+        f"({100 * row.share_about_mean:.0f} % with the mean error taken off), of "
+        f"{row.sequences} volumes."
+        for row in accuracy.within_95
+    ]
+    said.append(
+        f"Confidence without a valve: at most {confidence.highest_without_valve:.2f}; a valve is "
+        f"called one from {confidence.min_confidence:g} on."
     )
-    if found["lowest_right"] is not None:
-        told.append(
-            f"Where the valve was found (points on average within {found['wrong_mm']:g} mm): at "
-            f"least {found['lowest_right']:.2f}; where it was not, or where there is none: at most "
-            f"{found['highest_wrong']:.2f}; {found['best_threshold']:.2f} would tell these apart "
-            "best."
+    if confidence.lowest_right is not None:
+        said.append(
+            f"Where the valve was detected (points on average within {confidence.wrong_mm:g} mm): "
+            f"at least {confidence.lowest_right:.2f}; where it was not, or where there is none: at "
+            f"most {confidence.highest_wrong:.2f}; {confidence.best_threshold:.2f} would part "
+            "these best."
         )
-    return told
+    return said
 
 
-def imaging_text(record: Record) -> str:
+def imaging_text(record: Record[Findings]) -> str:
     """What a finished study says on the terminal."""
-    lines = [f"{record['row']}: {record['reason']}"]
-    if record["rows"]:
-        table = imaging_table(record["rows"])
+    findings = record.findings
+    lines = [f"{record.row}: {record.reason}"]
+    if findings.tested is not None:
+        table = imaging_table(findings.tested.rows)
         for _, row in table.iterrows():
-            share = f"valve found in {row['valve found [%]']:.0f} % of {row['volumes']} volumes"
-            if not row["valve found [%]"] > 0:
+            share = (
+                f"valve detected in {row['valve detected [%]']:.0f} % of {row['volumes']} volumes"
+            )
+            if not row["valve detected [%]"] > 0:
                 lines.append(f"  {row['setting']}: {share}")
                 continue
             lines.append(
@@ -130,56 +134,53 @@ def imaging_text(record: Record) -> str:
                 f"{row['surface median [mm]']:.2f} median, {row['surface 90 % [mm]']:.2f} at 90 %; "
                 f"{share}; {row['time per volume [s]']:.1f} s each"
             )
-        lines += [f"  {line}" for line in imaging_words(table, record["targets"])]
-    return "\n".join([*lines, *(f"  {line}" for line in study_words(record))])
+        lines += [f"  {line}" for line in imaging_words(table, findings.targets)]
+    return "\n".join([*lines, *(f"  {line}" for line in study_words(findings))])
 
 
-def write_imaging_study(folder: Path, record: Record) -> list[Path]:
-    """All tables and figures of the study; nothing for one that only trained.
+def write_imaging(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """All tables and figures of each study; nothing for one that only trained.
 
     ``imaging.*``, ``imaging_sequences.*`` and ``imaging_confidence.*`` (tables as CSV, Markdown and
     LaTeX), and ``imaging_distance``, ``imaging_training``, ``imaging_confidence``, ``imaging_std``
     and ``imaging_correlation`` (figures).
 
-    Parameters
-    ----------
-    folder : Path
-    record : mapping
-        Of ``experiment=imaging``.
-
     Raises
     ------
     InputError
-        If the record is damaged or a file cannot be written.
+        If a file cannot be written.
     """
-    if "accuracy" not in record:
-        return []
-    written = write_imaging_tables(folder, {**record, "notes": study_words(record)})
-    line = provenance_line(record)
-    sequences = pd.DataFrame(record["sequences"])
-    written += write_table(
-        folder / "imaging_sequences", sequences, _over_time(sequences), line, [OVER_TIME]
-    )
-    confidence = record["confidence"]
-    table = pd.DataFrame(confidence["rows"])
-    written += write_table(
-        folder / "imaging_confidence", table, _rounded(confidence["rows"]), line, [WITHOUT]
-    )
-    accuracy, layout = record["accuracy"], ValveLayout(**record["layout"])
-    for name, figure in (
-        ("confidence", confidence_figure(confidence)),
-        ("std", std_figure(layout, np.array(accuracy["std_mm"]))),
-        ("correlation", correlation_figure(accuracy)),
-    ):
-        written += save_figure(folder / f"imaging_{name}", figure, record)
+    written = []
+    for record in records.values():
+        findings, tested, line = record.findings, record.findings.tested, record.line
+        if tested is None:
+            continue
+        words = study_words(findings)
+        written += write_imaging_table(folder / "imaging", tested, findings.targets, words, line)
+        sequences = pd.DataFrame(map(asdict, tested.sequences))
+        written += write_table(
+            folder / "imaging_sequences", sequences, _over_time(sequences), line, [OVER_TIME]
+        )
+        kinds = pd.DataFrame(map(asdict, tested.confidence.rows)).rename(columns=CALLED)
+        readable = [_rounded(row) for row in kinds.to_dict("records")]
+        written += write_table(folder / "imaging_confidence", kinds, readable, line, [WITHOUT])
+        for name, figure in _figures(findings.layout, tested).items():
+            written += save_figure_with(folder / f"imaging_{name}", figure, line)
     return written
 
 
-def publish_imaging(results: Path, record: Record) -> list[Path]:
-    """Keep the record, and write its tables and figures into the results."""
-    kept = {key: value for key, value in record.items() if key not in NOT_KEPT}
-    keep_record(results, kept)
-    return write_imaging_study(results, kept)
+def _figures(layout: ValveLayout, tested: Evaluation) -> dict[str, Figure]:
+    accuracy = tested.accuracy
+    figures = {"distance": distance_figure([asdict(row) for row in tested.rows])}
+    if tested.training:
+        figures["training"] = training_figure(pd.DataFrame(map(asdict, tested.training)))
+    return figures | {
+        "confidence": confidence_figure(tested.confidence),
+        "std": std_figure(layout, np.array(accuracy.std_mm)),
+        "correlation": correlation_figure(accuracy),
+    }
 
 
 def _over_time(table: pd.DataFrame) -> list[dict[str, str]]:
@@ -202,11 +203,11 @@ def _over_time(table: pd.DataFrame) -> list[dict[str, str]]:
         row = {
             "setting": setting,
             "volumes": str(len(own)),
-            "called a valve [%]": f"{100.0 * own['found'].mean():.0f}",
+            "called a valve [%]": f"{100.0 * own['detected'].mean():.0f}",
             "wrongly called so [%]": f"{100.0 * own['wrong'].mean():.0f}",
         }
         for name, words in columns.items():
-            values = own.loc[own["found"], name].dropna().astype(float)
+            values = own.loc[own["detected"], name].dropna().astype(float)
             row[words] = f"{values.mean():.2f}" if len(values) else MISSING
         frames = int(own["frames"].iloc[0])
         row["time [s]"] = f"{own['seconds'].median():.1f} ({frames} frames)"
@@ -218,26 +219,16 @@ def _called(kind: str) -> str:
     return f"no valve: {kind}" if kind in NO_VALVE else SEQUENCES.get(kind, kind)
 
 
-def _rounded(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    return [
-        {
-            key: _called(value) if isinstance(value, str) else number(value)
-            for key, value in row.items()
-        }
-        for row in rows
-    ]
+def _rounded(row: Mapping[Hashable, Any]) -> dict[str, str]:
+    return {
+        str(key): _called(value) if isinstance(value, str) else number(value)
+        for key, value in row.items()
+    }
 
 
-def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
-    """Confidence of every volume, by kind, with the threshold.
-
-    Parameters
-    ----------
-    confidence : mapping
-        ``values`` (kind -> confidences), ``off_mm`` (kind -> distances of points, None without a
-        valve), ``wrong_mm`` and ``least_confidence``.
-    """
-    values = {kind: own for kind, own in confidence["values"].items() if own}
+def confidence_figure(confidence: Confidences) -> Figure:
+    """Confidence of every volume, by kind, with the threshold."""
+    values = {kind: own for kind, own in confidence.values.items() if own}
     figure, grid = panels(1, 1, 0.42 * len(values) + 1.6)
     axes = grid[0, 0]
     random = np.random.default_rng(0)
@@ -245,17 +236,17 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     for k, (kind, own) in enumerate(values.items()):
         look = 1 if kind in NO_VALVE else 0
         places = k + random.uniform(-0.2, 0.2, len(own))
-        off = np.array([np.nan if v is None else v for v in confidence["off_mm"][kind]])
-        wrong = off >= confidence["wrong_mm"]
+        off = np.array([np.nan if v is None else v for v in confidence.off_mm[kind]])
+        wrong = off >= confidence.wrong_mm
         for which, face in ((~wrong, COLOURS[look]), (wrong, "white")):
             axes.plot(
                 np.array(own)[which], places[which], ls="none", marker=MARKERS[look], ms=4.2,
                 mec=COLOURS[look], mfc=face, alpha=0.8,
             )  # fmt: skip
         labels.append(f"{_called(kind)} ({len(own)})")
-    axes.axvline(confidence["least_confidence"], color="0.25", lw=1.0, ls="--", zorder=0)
+    axes.axvline(confidence.min_confidence, color="0.25", lw=1.0, ls="--", zorder=0)
     axes.annotate(
-        "called a valve from here", (confidence["least_confidence"], 1.0),
+        "called a valve from here", (confidence.min_confidence, 1.0),
         xycoords=("data", "axes fraction"), xytext=(3, 2), textcoords="offset points",
         fontsize=SMALL, color="0.25", va="bottom",
     )  # fmt: skip
@@ -266,26 +257,20 @@ def confidence_figure(confidence: Mapping[str, Any]) -> Figure:
     axes.grid(visible=False, axis="y")
     headline(
         figure, "How sure the detectors are that there is a valve",
-        "Simulated volumes. Hollow: what was found is not the valve, its points are on average "
-        f"{confidence['wrong_mm']:g} mm off or more.",
+        "Simulated volumes. Hollow: what was detected is not the valve, its points are on average "
+        f"{confidence.wrong_mm:g} mm off or more.",
     )  # fmt: skip
     return figure
 
 
-def correlation_figure(accuracy: Mapping[str, Any]) -> Figure:
-    """How alike errors are at two vertices, against their distance, and the fitted correlation.
-
-    Parameters
-    ----------
-    accuracy : mapping
-        ``correlogram`` (``distance``, ``correlation``) and ``correlation_length_mm``.
-    """
-    found, length = accuracy["correlogram"], accuracy["correlation_length_mm"]
+def correlation_figure(accuracy: Accuracy) -> Figure:
+    """How alike errors are at two vertices, against their distance, and the fitted correlation."""
+    measured, length = accuracy.correlogram, accuracy.correlation_length_mm
     figure, grid = panels(1, 1, 3.2)
     axes = grid[0, 0]
-    axes.plot(found["distance"], found["correlation"], ls="none", marker=MARKERS[0], ms=4,
-              color=COLOURS[0], label="errors found")  # fmt: skip
-    d = np.linspace(0.0, max(found["distance"]), 200)
+    axes.plot(measured.distance, measured.correlation, ls="none", marker=MARKERS[0], ms=4,
+              color=COLOURS[0], label="measured errors")  # fmt: skip
+    d = np.linspace(0.0, max(measured.distance), 200)
     scaled = np.sqrt(3.0) * d / length
     axes.plot(d, (1.0 + scaled) * np.exp(-scaled), color=COLOURS[1], lw=1.3,
               label=f"Matérn 3/2, {length:.1f} mm")  # fmt: skip
@@ -295,6 +280,6 @@ def correlation_figure(accuracy: Mapping[str, Any]) -> Figure:
     axes.legend(fontsize=SMALL, frameon=False)
     headline(
         figure, "How far errors of the image step are alike",
-        f"Of {accuracy['sequences']} simulated volumes over time, open and closed frame.",
+        f"Of {accuracy.sequences} simulated volumes over time, open and closed frame.",
     )  # fmt: skip
     return figure

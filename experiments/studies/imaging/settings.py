@@ -41,7 +41,7 @@ class ImagingSettings:
     bases: dict[str, TemplateParameters] = field(default_factory=dict)
     population: PopulationSettings = field(default_factory=PopulationSettings)
     train: DrawnValves
-    calibration: DrawnValves  # for the errors told
+    calibration: DrawnValves  # for the errors that detectors state
     test: DrawnValves
     training: TrainingSettings = field(default_factory=TrainingSettings)
     curve: tuple[int, ...] = ()  # volumes of further, smaller trainings

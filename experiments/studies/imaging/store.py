@@ -10,7 +10,7 @@ import json
 import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 
 from experiments.common.build import mechanics_of
 from experiments.common.progress import PartBar
-from experiments.common.schema import build
 from experiments.common.store import Store, key_of
+from experiments.studies.imaging.findings import Spent
 from experiments.studies.imaging.parallel import in_processes
+from experiments.studies.imaging.settings import ImagingSettings
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.learning.training import (
     Draft,
     Samples,
-    TrainingSettings,
     draft_of,
     train_stage,
     volume_samples,
@@ -39,10 +39,9 @@ from mvest.imaging.moving_valve import MovingValve
 from mvest.kept import Entry, get_or_make
 from mvest.provenance import write_json
 from mvest.simulation.motion.files import load_population, save_population
-from mvest.simulation.motion.population import Population, PopulationSettings, draw_population
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.simulation.motion.population import Population, draw_population
 
-__all__ = ["ImagingStore", "Spent"]
+__all__ = ["ImagingStore"]
 
 Values = Mapping[str, Any]
 T = TypeVar("T")
@@ -56,21 +55,6 @@ SPENT = "spent.json"
 VALVES, DETECTORS = "valves.npz", "detectors.npz"
 
 SAMPLED_BY = (volume_samples, draft_of, fit_shape_model)
-
-
-@dataclass(frozen=True, slots=True)
-class Spent:
-    """What one part of the study cost.
-
-    Attributes
-    ----------
-    cpu_s : float or None
-        Of all processes together; None where it was not measured.
-    wall_s : float or None
-    """
-
-    cpu_s: float | None
-    wall_s: float | None
 
 
 class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]):
@@ -109,28 +93,29 @@ class ImagingStore:
     ----------
     config : mapping
         The resolved configuration, checked.
+    settings : ImagingSettings
+        Of the study.
     """
 
-    def __init__(self, config: Values) -> None:
-        imaging = config["imaging"]
+    def __init__(self, config: Values, settings: ImagingSettings) -> None:
         self.store = Store(Path(config["paths"]["outputs"]) / "detectors")
-        self.processes = int(imaging["processes"])
+        self.settings = settings
+        self.processes, self.training = settings.processes, settings.training
         self.seed = int(config["seed"])
-        self.training = build(TrainingSettings, imaging["training"])
-        self.population_settings = build(PopulationSettings, imaging["population"])
         self.mechanics = mechanics_of(config)
-        self.bases = {
-            name: build(TemplateParameters, values) for name, values in imaging["bases"].items()
+        self._drawn = {
+            "train": settings.train,
+            "calibration": settings.calibration,
+            "test": settings.test,
         }
-        self._drawn = {which: dict(imaging[which]) for which in ("train", "calibration", "test")}
         self._shapes: ShapeModel | None = None
 
     # -- valves -----------------------------------------------------------------------------------
     def _valves(self, which: str) -> Entry[Population]:
         described = {
-            "drawn": self._drawn[which],
-            "bases": [[name, asdict(values)] for name, values in self.bases.items()],
-            "settings": asdict(self.population_settings),
+            "drawn": asdict(self._drawn[which]),
+            "bases": [[name, asdict(values)] for name, values in self.settings.bases.items()],
+            "settings": asdict(self.settings.population),
             "mechanics": asdict(self.mechanics),
         }
         made_by = (draw_population, save_population)
@@ -155,12 +140,12 @@ class ImagingStore:
         def draw() -> tuple[Population, Spent]:
             began = _cpu_s(), time.monotonic()
             title = f"valves to {'train on' if which == 'train' else which}"
-            with PartBar(title, about["count"], "valve") as bar:
+            with PartBar(title, about.count, "valve") as bar:
                 made = draw_population(
-                    about["count"],
-                    about["seed"],
-                    self.bases,
-                    self.population_settings,
+                    about.count,
+                    about.seed,
+                    self.settings.bases,
+                    self.settings.population,
                     self.mechanics,
                     processes=self.processes,
                     progress=lambda _number, _valve: bar.step(),

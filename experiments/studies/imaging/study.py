@@ -7,24 +7,23 @@ import json
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.plain import Plain, each, flat, plain_run
+from experiments.common.record import Outcome, Record
 from experiments.common.schema import build
-from experiments.common.study import Section, Study
+from experiments.common.study import Job, Section, Study
+from experiments.studies.imaging.evaluation import findings_of, tested_of
+from experiments.studies.imaging.findings import DetectedVolume, Evaluation, Findings
 from experiments.studies.imaging.held_out import HeldOut, hold_out
-from experiments.studies.imaging.record import imaging_record
-from experiments.studies.imaging.report import NOT_KEPT, imaging_text, write_imaging_study
-from experiments.studies.imaging.settings import Settings
+from experiments.studies.imaging.report import imaging_text, write_imaging
+from experiments.studies.imaging.settings import ImagingSettings, Settings
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.tables import imaging_table, imaging_words
 from mvest.errors import ConfigurationError, InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.imaging.detection.shape_start import MODES
-from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.detection.trained_model import (
     DetectionAccuracy,
     DetectionModel,
@@ -49,12 +48,17 @@ MODEL = "tee.npz"
 POPULATIONS = ("train", "calibration", "test")
 
 
-def run_imaging(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Train detectors, and test them on valves that no training saw: the record, and the model."""
-    require_imaging(config)
-    store, imaging = ImagingStore(config), config["imaging"]
+def run_imaging(job: Job[Settings]) -> Outcome[Findings]:
+    """Train detectors, and test them on valves that no training saw; the model is left beside.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible; the message names it.
+    """
+    require_imaging(job.values)
+    settings = job.settings.imaging
+    store = ImagingStore(job.values, settings)
     valves = store.population("train").valves
     trained_on = {
         "valves": [valve.name for valve in valves],
@@ -67,53 +71,53 @@ def run_imaging(
         return store.model(valves, volumes, {**trained_on, "volumes": volumes})[0]
 
     model = train(store.training.volumes)
-    held_out: HeldOut | None = None
-    accuracy: tuple[DetectionAccuracy, Correlogram] | None = None
-    if imaging["evaluate"]:
+    tested: Evaluation | None = None
+    accuracy: DetectionAccuracy | None = None
+    if settings.evaluate:
         apart = [store.population(which).valves for which in POPULATIONS[1:]]
         require_apart(valves, *apart)
-        for volumes in imaging["curve"]:
+        for volumes in settings.curve:
             train(volumes)
-        held_out = hold_out(store, config, *apart)
-        accuracy, trained_on["calibrated_on"] = _calibrated(config, held_out)
+        held_out = hold_out(store, *apart)
+        (accuracy, correlogram), trained_on["calibrated_on"] = _calibrated(settings, held_out)
+        tested = tested_of(store, held_out, accuracy, correlogram)
     final = DetectionModel(
         model.shape,
         model.boosters,
-        {**trained_on, "volumes": store.training.volumes, "config_hash": config_hash},
-        None if accuracy is None else accuracy[0],
+        {**trained_on, "volumes": store.training.volumes, "config_hash": job.config_hash},
+        accuracy,
     )
-    save_model(folder / MODEL, final)
-    record = imaging_record(config, config_hash, store, held_out, accuracy, started)
-    raw = (folder / MODEL).read_bytes()
-    record["model_file"] = {"sha256": hashlib.sha256(raw).hexdigest(), "bytes": len(raw)}
-    return record, [folder / MODEL]
+    save_model(job.folder / MODEL, final)
+    return Outcome(
+        findings=findings_of(store, tested, job.folder / MODEL),
+        reason="trained" if tested is None else "trained and tested",
+    )
 
 
 def _calibrated(
-    config: Values, held_out: HeldOut
+    settings: ImagingSettings, held_out: HeldOut
 ) -> tuple[tuple[DetectionAccuracy, Correlogram], list[str]]:
-    """Errors in the volumes in which the valve was found, and the names of these valves.
+    """Errors in the volumes in which the valve was detected, and the names of these valves.
 
-    Where it was not, or where something else was taken for it, no standard deviation tells how far.
+    Where it was not, or where something else was taken for it, no standard deviation says how far.
     """
     kind = "calibration"
-    least, wrong = (
-        config["imaging"]["detection"]["min_confidence"],
-        config["imaging"]["held_out"]["wrong_mm"],
-    )
-    found = held_out.found(kind, least, wrong)
-    rows = found.sequences[kind]
+    threshold, wrong = settings.detection.min_confidence, settings.held_out.wrong_mm
+    detected = held_out.detected(kind, threshold, wrong)
+    rows = detected.sequences[kind]
     if len(rows) < 2:
         raise InputError(
             f"imaging.calibration: in {len(rows)} of {len(held_out.sequences[kind])} volumes the "
-            f"valve was found (confidence at least {least:g}, points nearer than {wrong:g} mm), "
-            "expected two or more: more volumes to train on"
+            f"valve was detected (confidence at least {threshold:g}, points nearer than "
+            f"{wrong:g} mm), expected two or more: more volumes to train on"
         )
-    samples, tips, rest = (found.stacked(kind, name) for name in ("errors", "tip_errors", "rest"))
+    samples, tips, rest = (
+        detected.stacked(kind, name) for name in ("errors", "tip_errors", "rest")
+    )
     return measure_accuracy(samples, tips, rest.mean(axis=0)), [row["valve"] for row, _ in rows]
 
 
-def publish_model(config: Values, record: Values, folder: Path) -> None:
+def publish_model(job: Job[Settings], _record: Record[Findings]) -> None:
     """Make a finished run's detectors those that come with the package, if that is asked for.
 
     Raises
@@ -121,9 +125,9 @@ def publish_model(config: Values, record: Values, folder: Path) -> None:
     InputError
         If they are not there any more, or cannot be written.
     """
-    if not config["imaging"]["publish_model"]:
+    if not job.settings.imaging.publish_model:
         return
-    source = folder / MODEL
+    source = job.folder / MODEL
     if not source.is_file():
         raise InputError(f"{source}: no such file; force=true trains again")
     # What cannot be read is not handed on.
@@ -170,94 +174,101 @@ def require_imaging(config: Values) -> None:
     MvestError
         The message names the setting.
     """
-    imaging = config["imaging"]
-    if imaging is None:
-        raise ConfigurationError("imaging is not given; expected one of conf/imaging")
-    store = ImagingStore(config)
-    _require_populations(imaging)
-    volumes, held_out = store.training.volumes, imaging["held_out"]
-    _at_least(1, "training.volumes", volumes)
-    _at_least(1, "processes", imaging["processes"])
-    for size in imaging["curve"]:
-        if not 1 <= size < volumes:
+    settings = build(Settings, config).imaging
+    training, held_out = settings.training, settings.held_out
+    _require_populations(settings)
+    _require_min(1, "training.volumes", training.volumes)
+    _require_min(1, "processes", settings.processes)
+    for size in settings.curve:
+        if not 1 <= size < training.volumes:
             raise ConfigurationError(
-                f"imaging.curve has {size} volumes, expected 1 to {volumes - 1}: fewer than "
-                "imaging.training.volumes"
+                f"imaging.curve has {size} volumes, expected 1 to {training.volumes - 1}: fewer "
+                "than imaging.training.volumes"
             )
-    if len(set(imaging["curve"])) < len(imaging["curve"]):
-        raise ConfigurationError(f"imaging.curve = {imaging['curve']}, expected other numbers")
-    curve = 1 if imaging["curve"] else 0
-    for name, least in {
+    if len(set(settings.curve)) < len(settings.curve):
+        raise ConfigurationError(f"imaging.curve = {list(settings.curve)}, expected other numbers")
+    for name, minimum in {
         "volumes": 1, "shifted": 1, "sequences": 1, "shifted_sequences": 0, "without_valve": 1,
-        "curve_volumes": curve,
+        "curve_volumes": 1 if settings.curve else 0,
     }.items():  # fmt: skip
-        _at_least(least, f"held_out.{name}", held_out[name])
-    most = min(held_out["volumes"], held_out["shifted"])
-    if held_out["curve_volumes"] > most:
+        _require_min(minimum, f"held_out.{name}", getattr(held_out, name))
+    maximum = min(held_out.volumes, held_out.shifted)
+    if held_out.curve_volumes > maximum:
         raise ConfigurationError(
-            f"imaging.held_out.curve_volumes = {held_out['curve_volumes']}, expected at most "
-            f"{most}: all held-out volumes"
+            f"imaging.held_out.curve_volumes = {held_out.curve_volumes}, expected at most "
+            f"{maximum}: all held-out volumes"
         )
-    if not held_out["wrong_mm"] > 0:
+    if not held_out.wrong_mm > 0:
         raise ConfigurationError(
-            f"imaging.held_out.wrong_mm = {held_out['wrong_mm']}, expected a distance > 0"
+            f"imaging.held_out.wrong_mm = {held_out.wrong_mm}, expected a distance > 0"
         )
-    settings = build(TrackingSettings, imaging["detection"])
-    modes = max(MODES, *settings.fit.modes)
-    if store.training.modes < modes:
+    modes = max(MODES, *settings.detection.fit.modes)
+    if training.modes < modes:
         raise ConfigurationError(
-            f"imaging.training.modes = {store.training.modes}, expected at least {modes}: as many "
+            f"imaging.training.modes = {training.modes}, expected at least {modes}: as many "
             "as are read off and as imaging.detection.fit.modes has"
         )
-    motion = store.population_settings.motion
+    motion = settings.population.motion
     landmark_vertices(ValveLayout(motion.columns, motion.rows))
-    _require_targets(imaging["targets"])
+    _require_targets(settings.targets)
 
 
-def _require_populations(imaging: Values) -> None:
-    for which, least in zip(POPULATIONS, (1, 2, 1), strict=True):
-        _at_least(least, f"{which}.count", imaging[which]["count"])
-        _at_least(0, f"{which}.seed", imaging[which]["seed"])
-    seeds = [imaging[which]["seed"] for which in POPULATIONS]
+def _require_populations(settings: ImagingSettings) -> None:
+    drawn = {which: getattr(settings, which) for which in POPULATIONS}
+    for (which, population), minimum in zip(drawn.items(), (1, 2, 1), strict=True):
+        _require_min(minimum, f"{which}.count", population.count)
+        _require_min(0, f"{which}.seed", population.seed)
+    seeds = [population.seed for population in drawn.values()]
     if len(set(seeds)) < len(seeds):
-        told = ", ".join(f"imaging.{which}.seed" for which in POPULATIONS)
+        names = ", ".join(f"imaging.{which}.seed" for which in drawn)
         raise ConfigurationError(
-            f"{told} = {', '.join(map(str, seeds))}, expected different seeds: a valve that was "
+            f"{names} = {', '.join(map(str, seeds))}, expected different seeds: a valve that was "
             "trained on tests nothing"
         )
 
 
-def _at_least(least: int, name: str, value: Any) -> None:
-    if not isinstance(value, int) or value < least:
-        raise ConfigurationError(f"imaging.{name} = {value}, expected a number >= {least}")
+def _require_min(minimum: int, name: str, value: int) -> None:
+    if value < minimum:
+        raise ConfigurationError(f"imaging.{name} = {value}, expected a number >= {minimum}")
 
 
-def _require_targets(targets: Values) -> None:
+def _require_targets(targets: Mapping[str, Any]) -> None:
     """Targets that no table has would only be noticed at the end."""
-    names = ("surface_mm", "point_mm", "tips_mm", "annulus_area_error_percent", "ap_error_mm")
-    blank = [{"setting": s, "seconds": 1.0, **dict.fromkeys(names, 1.0)} for s in SETTINGS]
+    blank = [
+        DetectedVolume(
+            setting=setting, valve="", frame=0, confidence=1.0, surface_mm=1.0, point_mm=1.0,
+            tips_mm=1.0, annulus_area_error_percent=1.0, ap_error_mm=1.0, state_right=True,
+            seconds=1.0,
+        )
+        for setting in SETTINGS
+    ]  # fmt: skip
     try:
         imaging_words(imaging_table(blank), targets)
     except (InputError, AttributeError, TypeError, ValueError) as error:
         raise ConfigurationError(f"imaging.targets: {error}") from error
 
 
+def _without_volumes(record: Record[Findings]) -> Record[Findings]:
+    """The record without what no table needs."""
+    if record.findings.tested is None:
+        return record
+    tested = replace(record.findings.tested, volumes={}, sequence_frames={})
+    return replace(record, findings=replace(record.findings, tested=tested))
+
+
 def _versions() -> dict[str, Any]:
-    found = provenance()["versions"]
-    return {name: found[name] for name in ("mvest", "numpy", "lightgbm")}
+    versions = provenance()["versions"]
+    return {name: versions[name] for name in ("mvest", "numpy", "lightgbm")}
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_imaging),
-    words=lambda record: imaging_text(flat(record)),
-    write=each(write_imaging_study),
-    keep=lambda record: replace(
-        record,
-        findings={key: value for key, value in record.findings.items() if key not in NOT_KEPT},
-    ),
-    finish=lambda job, record: publish_model(job.values, flat(record), job.folder),
+    findings=Findings,
+    run=run_imaging,
+    words=imaging_text,
+    write=write_imaging,
+    keep=_without_volumes,
+    finish=publish_model,
     require=require_imaging,
     sections=(
         Section(

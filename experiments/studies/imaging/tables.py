@@ -3,32 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
-from experiments.common.tables import checked_rows, write_table
+from experiments.common.tables import write_table
+from experiments.studies.imaging.findings import DetectedVolume, Evaluation
 from mvest.errors import InputError
-from mvest.reporting.figures import save_figure
-from mvest.reporting.files import provenance_line
-from mvest.reporting.images.figures import (
-    LIMITS_MM,
-    SETTINGS,
-    distance_figure,
-    training_figure,
-)
+from mvest.reporting.images.figures import LIMITS_MM, SETTINGS
 from mvest.reporting.markup import MISSING, number
 
 __all__ = [
     "imaging_table",
     "imaging_words",
-    "write_imaging_tables",
+    "write_imaging_table",
 ]
 
-Record = Mapping[str, Any]
-Row = Mapping[str, Any]
+Targets = Mapping[str, Mapping[str, float]]
+
+SIZES: Final = (
+    "surface_mm",
+    "point_mm",
+    "tips_mm",
+    "annulus_area_error_percent",
+    "ap_error_mm",
+    "seconds",
+)
+"""Of a volume, which the table summarises."""
 
 TRUTH_OF_VALVES: Final = (
     "Simulated transoesophageal echo (TEE) volumes of simulated valves that no training saw. The "
@@ -38,58 +42,47 @@ TRUTH_OF_VALVES: Final = (
     "measured in patients."
 )
 SHARE: Final = f"surface below {LIMITS_MM[-1]:g} mm [%]"
-AT_LEAST: Final = (SHARE, "valve found [%]")
+AT_LEAST: Final = (SHARE, "valve detected [%]")
 """Columns in which more is better."""
 
 
-def imaging_table(rows: Sequence[Row]) -> pd.DataFrame:
+def imaging_table(rows: Sequence[DetectedVolume]) -> pd.DataFrame:
     """One row for each setting that summarises its volumes.
 
     Parameters
     ----------
-    rows : sequence of mapping
-        For each volume: ``setting`` (see `SETTINGS`), ``surface_mm`` (mean surface distance),
-        ``point_mm`` (mean distance of the same points of tissue), ``tips_mm`` (mean error of the
-        papillary tips), ``annulus_area_error_percent`` and ``ap_error_mm`` (with sign), and
-        ``seconds``. All but the setting and the seconds are None where no valve was found.
+    rows : sequence of DetectedVolume
 
     Returns
     -------
     DataFrame
-        Sizes of errors are means over the volumes with a valve found; the shares are of all.
+        Sizes of errors are means over the volumes with a valve detected; the shares are of all.
 
     Raises
     ------
     InputError
-        No rows, an entry that is missing, or another setting.
+        No rows, or another setting.
     """
-    wanted = (
-        "setting",
-        "surface_mm",
-        "point_mm",
-        "tips_mm",
-        "annulus_area_error_percent",
-        "ap_error_mm",
-        "seconds",
-    )
-    table = checked_rows(rows, wanted, "volumes of the image step")
+    if not rows:
+        raise InputError("volumes of the image step: no rows, expected at least one")
+    table = pd.DataFrame(map(asdict, rows))
     wrong = sorted(set(map(str, table["setting"])) - set(SETTINGS))
     if wrong:
         raise InputError(
             f"volumes of the image step: setting {wrong[0]}, expected {' or '.join(SETTINGS)}"
         )
-    found = []
+    summaries = []
     for setting in SETTINGS:
         own = table[table["setting"] == setting]
         if own.empty:
             continue
-        values = {name: own[name].astype(float) for name in wanted[1:]}
+        values = own[list(SIZES)].astype(float)
         surface = values["surface_mm"]
-        found.append(
+        summaries.append(
             {
                 "setting": setting,
                 "volumes": len(own),
-                "valve found [%]": 100.0 * surface.notna().mean(),
+                "valve detected [%]": 100.0 * surface.notna().mean(),
                 "surface mean [mm]": surface.mean(),
                 "surface median [mm]": surface.median(),
                 "surface 90 % [mm]": surface.quantile(0.9),
@@ -103,12 +96,10 @@ def imaging_table(rows: Sequence[Row]) -> pd.DataFrame:
                 "time per volume [s]": values["seconds"].median(),
             }
         )
-    return pd.DataFrame(found)
+    return pd.DataFrame(summaries)
 
 
-def imaging_words(
-    table: pd.DataFrame, targets: Mapping[str, Mapping[str, float]] | None = None
-) -> list[str]:
+def imaging_words(table: pd.DataFrame, targets: Targets | None = None) -> list[str]:
     """What a table of `imaging_table` says beside its targets.
 
     Parameters
@@ -143,24 +134,29 @@ def imaging_words(
     return out
 
 
-def write_imaging_tables(results: Path, record: Record) -> list[Path]:
-    """``imaging.*`` (table), ``imaging_distance.*`` and, if there are, ``imaging_training.*``.
+def write_imaging_table(
+    base: Path, tested: Evaluation, targets: Targets, notes: Sequence[str], line: str
+) -> list[Path]:
+    """Write the table, and below each of its rows the targets, if there are any.
 
     Parameters
     ----------
-    results : Path
-    record : mapping
-        ``rows`` as for `imaging_table`, ``targets`` as for `imaging_words` (may be missing),
-        ``training`` rows as for `training_figure` (may be missing), ``notes`` (sentences, may be
-        missing), ``experiment`` and ``provenance``.
+    base : Path
+        Without suffix.
+    tested : Evaluation
+    targets : mapping
+        As for `imaging_words`.
+    notes : sequence of str
+        Sentences.
+    line : str
+        Provenance.
 
     Raises
     ------
     InputError
         As `imaging_table` and `imaging_words`, or a file that cannot be written.
     """
-    table = imaging_table(record["rows"])
-    targets = record.get("targets") or {}
+    table = imaging_table(tested.rows)
     readable = []
     for _, row in table.iterrows():
         own = targets.get(row["setting"], {})
@@ -170,15 +166,8 @@ def write_imaging_tables(results: Path, record: Record) -> list[Path]:
             for name, limit in own.items():
                 goal[name] = f"{'≥' if name in AT_LEAST else '≤'} {number(limit)}"
             readable.append(goal)
-    notes = [TRUTH_OF_VALVES, *imaging_words(table, targets), *record.get("notes", ())]
-    line = provenance_line(record)
-    written = write_table(results / "imaging", table, readable, line, notes)
-    figure = distance_figure(record["rows"])
-    written += save_figure(results / "imaging_distance", figure, record)
-    if record.get("training"):
-        figure = training_figure(pd.DataFrame(list(record["training"])))
-        written += save_figure(results / "imaging_training", figure, record)
-    return written
+    said = [TRUTH_OF_VALVES, *imaging_words(table, targets), *notes]
+    return write_table(base, table, readable, line, said)
 
 
 def _cell(name: str, value: Any) -> str:

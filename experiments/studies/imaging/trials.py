@@ -53,7 +53,7 @@ VOLUMES = ("in distribution", "shifted")
 """Kinds of volumes of one frame with a valve, as tables call them."""
 
 SEQUENCES = ("calibration", "sequence", "shifted sequence")
-"""Kinds of volumes of all frames of a valve; the first ones tell how far detectors are off."""
+"""Kinds of volumes of all frames of a valve; the first ones say how far detectors are off."""
 
 KINDS = (*VOLUMES, *WITHOUT_VALVE, *SEQUENCES)
 
@@ -113,7 +113,7 @@ def try_volume(
     dict
         Name -> plain values: of every volume its kind, valve, frame, ``confidence`` and ``cpu_s``
         of one thread (what simulation takes is no part of it); where there is a valve, also errors
-        in mm and degrees, measures, found and true, and the distances after each stage.
+        in mm and degrees, measures, estimated and true, and the distances after each stage.
     """
     choose, render = asked.random.spawn(2)
     frame = int(np.random.default_rng(choose).integers(len(valve.times)))
@@ -146,7 +146,7 @@ def try_volume(
             row |= {
                 "errors": asdict(frame_errors(fitted, fitted.vertices, fitted.tips, true, layout)),
                 "true": measures(seen.vertices, seen.tips, layout),
-                "found": measures(fitted.vertices, fitted.tips, layout),
+                "estimated": measures(fitted.vertices, fitted.tips, layout),
             }
         found[name] = row
     return found
@@ -179,7 +179,7 @@ def try_sequence(
     Returns
     -------
     dict
-        ``row`` (plain values, JSON text), and in mm, found minus true in the valve's own axes,
+        ``row`` (plain values, JSON text), and in mm, estimated minus true in the valve's own axes,
         ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open and the closed frame, and
         ``rest`` (n, 3), where the true open valve's vertices are.
     """
@@ -204,7 +204,7 @@ def try_sequence(
                 "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
                 "confidence": float(found.frame_confidence[k]),
                 "true": measures(right, true.tips[k], layout),
-                "found": measures(x, tips, layout),
+                "estimated": measures(x, tips, layout),
             }
         )
     row = {

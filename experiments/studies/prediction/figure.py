@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from experiments.common.findings import stored_arrays
 from experiments.studies.prediction.findings import Findings, Patient
 from mvest.errors import InputError
 from mvest.reporting.case.drawing import (
@@ -61,8 +62,7 @@ def prediction_figure(findings: Findings, fields: Path) -> Figure:
         If the fields cannot be read.
     """
     try:
-        with np.load(fields, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = stored_arrays(fields)
         valve = _valve(arrays)
         shapes = arrays["shapes"].astype(float)
     except (OSError, KeyError, ValueError) as error:

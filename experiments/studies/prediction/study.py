@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
-from experiments.common.findings import Rows, rows, vector
+from experiments.common.findings import Rows, rows, stored_arrays, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.record import Outcome
@@ -302,7 +302,7 @@ STUDY = Study(
     run=run_prediction,
     words=prediction_words,
     write=write_prediction,
-    keep_arrays=lambda record, path: dict(np.load(path)),
+    keep_arrays=lambda record, path: stored_arrays(path),
     sections=(
         Section(
             "prediction",

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 
 from mvest.reporting.case.fields import CaseFields
+from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.gap import Gap
@@ -21,7 +22,6 @@ from mvest.valve.measure.gap import Gap
 __all__ = [
     "ATRIUM",
     "BLOOD",
-    "LEAFLET_COLOURS",
     "LINE_PIECES",
     "SIDE",
     "TISSUE",
@@ -36,8 +36,6 @@ __all__ = [
     "same_scale",
 ]
 
-LEAFLET_COLOURS = np.array([[0.87, 0.57, 0.49], [0.50, 0.66, 0.86], [0.58, 0.77, 0.57]])
-"""Of the leaflets in the order of their regions, light enough to be shaded."""
 BLOOD = (0.70, 0.05, 0.10)
 """Of a gap."""
 TISSUE = (0.80, 0.76, 0.72)

@@ -12,9 +12,9 @@ import plotly.graph_objects as go
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from mvest.reporting.case.drawing import LEAFLET_COLOURS
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.case.figures import distance_top
+from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["CaseView", "case_view", "small"]

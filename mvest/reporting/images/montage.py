@@ -15,6 +15,7 @@ from matplotlib.patheffects import withStroke
 from mvest.errors import InputError
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
+from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.images.planes import (
     COLUMNS,
     STEP_MM,
@@ -29,8 +30,8 @@ from mvest.typing import FloatArray
 
 __all__ = ["LEAFLETS", "LOW_CONFIDENCE", "chosen_frames", "montage_figure"]
 
-LEAFLETS = ("#E69F00", "#56B4E9")
-"""Of the anterior and the posterior leaflet: Okabe and Ito's orange and sky blue."""
+LEAFLETS = LEAFLET_COLOURS[:2]
+"""Of the anterior and the posterior leaflet."""
 TIP, ANNULUS = "#F0E442", "white"
 LOW_CONFIDENCE = 0.5
 """Below this a frame is marked."""

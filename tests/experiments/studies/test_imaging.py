@@ -4,6 +4,7 @@ import copy
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,20 @@ from omegaconf import OmegaConf
 
 from experiments import tables
 from experiments.common.config import register
-from experiments.common.plain import flat
-from experiments.common.record import read_record
+from experiments.common.record import Record, read_record
+from experiments.common.schema import build
 from experiments.results.keep import publish
 from experiments.run import main
 from experiments.studies.imaging import study as imaging
+from experiments.studies.imaging.evaluation import (
+    _threshold,
+    confidences,
+    detected_volume,
+    learning_rows,
+)
+from experiments.studies.imaging.findings import Findings
 from experiments.studies.imaging.held_out import HeldOut
-from experiments.studies.imaging.record import _confidences, _threshold, learning_rows, table_row
+from experiments.studies.imaging.settings import ImagingSettings, Settings
 from experiments.studies.imaging.store import ImagingStore, StoredSamples
 from experiments.studies.imaging.trials import KINDS, Trial
 from mvest.errors import ConfigurationError, InputError
@@ -74,8 +82,16 @@ def done(tmp_path_factory) -> Path:
     return place
 
 
-def record_of(place: Path, run: str = "run") -> dict:
-    return flat(json.loads((place / run / "result.json").read_text(encoding="utf-8")))
+def settings_of(*overrides: str) -> ImagingSettings:
+    return build(Settings, composed(*overrides)).imaging
+
+
+def store_of(*overrides: str) -> ImagingStore:
+    return ImagingStore(composed(*overrides), settings_of(*overrides))
+
+
+def record_of(place: Path, run: str = "run") -> Record[Findings]:
+    return read_record(place / run / "result.json", Findings)
 
 
 def changed(place: Path) -> dict[str, int]:
@@ -86,38 +102,41 @@ def changed(place: Path) -> dict[str, int]:
 
 def test_the_study_tells_how_far_detectors_are_off(done: Path):
     record = record_of(done)
-    assert (record["status"], record["reason"]) == ("converged", "trained and tested")
-    assert [row["setting"] for row in record["rows"]] == ["in distribution"] * 2 + ["shifted"] * 2
-    assert all(row["seconds"] > 0 for row in record["rows"])
+    assert (record.status, record.reason) == ("converged", "trained and tested")
+    findings, tested = record.findings, record.findings.tested
+    assert tested is not None
+    assert [row.setting for row in tested.rows] == ["in distribution"] * 2 + ["shifted"] * 2
+    assert all(row.seconds > 0 for row in tested.rows)
     # The curve has both trainings, on the same volumes.
-    found = {(row["stage"], row["training_volumes"], row["setting"]) for row in record["training"]}
+    found = {(row.stage, row.training_volumes, row.setting) for row in tested.training}
     stages = ("position", "pose", "landmarks", "hinge", "surface")
     settings = ("in distribution", "shifted")
     assert found == {(stage, n, s) for stage in stages for n in (3, 6) for s in settings}
-    assert {row["volumes"] for row in record["training"]} == {1}
-    units = {row["stage"]: row["unit"] for row in record["training"]}
+    assert {row.volumes for row in tested.training} == {1}
+    units = {row.stage: row.unit for row in tested.training}
     assert units["pose"] == "degrees"
     # Confidences with a valve and without one.
-    assert set(record["confidence"]["values"]) == set(KINDS)
-    accuracy = record["accuracy"]
-    assert len(accuracy["std_mm"]) == 16 * 5
-    assert {(row["setting"], row["frame"]) for row in accuracy["within_95"]} == {
+    assert set(tested.confidence.values) == set(KINDS)
+    accuracy = tested.accuracy
+    assert len(accuracy.std_mm) == 16 * 5
+    assert {(row.setting, row.frame) for row in accuracy.within_95} == {
         (s, f) for s in settings for f in ("open", "closed")
     }
-    assert all(0 <= row["share"] <= 1 for row in accuracy["within_95"])
+    assert all(0 <= row.share <= 1 for row in accuracy.within_95)
     parts = ("valves", "volumes", "draft", "trees")
     for part in (*parts, "training"):
-        assert record["spent"][part]["cpu_s"] > 0
-    total = sum(record["spent"][part]["cpu_s"] for part in parts)
-    assert record["spent"]["training"]["cpu_s"] == pytest.approx(total)
-    assert record["measures"]["training_cpu_s"] == pytest.approx(total)
+        assert findings.spent[part].cpu_s > 0
+    total = sum(findings.spent[part].cpu_s for part in parts)
+    assert findings.spent["training"].cpu_s == pytest.approx(total)
+    assert findings.measures["training_cpu_s"] == pytest.approx(total)
 
 
 def test_what_is_tested_on_was_not_trained_on(done: Path):
     record, trained = record_of(done), load_model(done / "run" / "tee.npz").trained_on
-    tested = {row["valve"] for rows in record["volumes"].values() for row in rows}
-    tested |= {row["valve"] for row in record["sequences"]}
-    calibrated = {row["valve"] for row in record["sequence_frames"]["calibration"]}
+    of = record.findings.tested
+    tested = {row["valve"] for rows in of.volumes.values() for row in rows}
+    tested |= {row.valve for row in of.sequences}
+    calibrated = {row["valve"] for row in of.sequence_frames["calibration"]}
     assert len(trained["valves"]) == 4
     assert set(trained["calibrated_on"]) == calibrated
     assert len(calibrated) == len(tested) == 2
@@ -136,10 +155,10 @@ def test_the_model_tells_its_errors(done: Path):
     about = model.accuracy.samples - model.accuracy.samples.mean(axis=0)
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / 6)
     assert model.accuracy.std_mm == pytest.approx(std, rel=1e-5)
-    length = record["accuracy"]["correlation_length_mm"]
+    length = record.findings.tested.accuracy.correlation_length_mm
     assert model.accuracy.correlation_length_mm == pytest.approx(length)
-    assert model.sha256 == record["model_file"]["sha256"]
-    assert model.trained_on["config_hash"] == record["provenance"]["config_hash"]
+    assert model.sha256 == record.findings.model_file.sha256
+    assert model.trained_on["config_hash"] == record.provenance.config_hash
 
 
 def test_tables_and_figures_are_made_and_made_again(
@@ -160,8 +179,9 @@ def test_tables_and_figures_are_made_and_made_again(
     publish(imaging.STUDY, results, "imaging", record, done / "run")
     assert (results / "imaging.md").read_text(encoding="utf-8") == text
     kept = json.loads((results / "records" / "imaging" / "imaging.json").read_text("utf-8"))
-    assert "volumes" in record.findings
-    assert "volumes" not in kept["findings"]
+    assert record.findings.tested.volumes
+    assert not kept["findings"]["tested"]["volumes"]
+    assert not kept["findings"]["tested"]["sequence_frames"]
     for path in results.glob("imaging*.md"):
         path.unlink()
     assert tables.main([str(results)]) == 0
@@ -182,9 +202,9 @@ def test_an_interrupted_study_goes_on_where_it_was(done: Path):
     assert set(now) == set(store)
     assert {name for name in now if now[name] != store[name]} <= set(lost)
     after = record_of(done, "again")
-    assert after["accuracy"] == before["accuracy"]
+    assert after.findings.tested.accuracy == before.findings.tested.accuracy
     without_time = [
-        [{k: v for k, v in row.items() if k != "seconds"} for row in record["rows"]]
+        [replace(row, seconds=0.0) for row in record.findings.tested.rows]
         for record in (before, after)
     ]
     assert without_time[0] == without_time[1]
@@ -196,7 +216,7 @@ def test_the_seed_decides_and_not_the_processes(done: Path, tmp_path: Path):
     first = load_model(done / "run" / "tee.npz")
     assert call(tmp_path, "imaging.evaluate=false", "imaging.processes=2", "hydra.run.dir=two") == 0
     record = record_of(tmp_path, "two")
-    assert (record["reason"], record["rows"]) == ("trained", [])
+    assert (record.reason, record.findings.tested) == ("trained", None)
     second = load_model(tmp_path / "two" / "tee.npz")
     assert second.accuracy is None
     for name in STAGES:
@@ -256,8 +276,7 @@ def test_wrong_settings_are_told_in_one_line(tmp_path: Path, override: str, word
 
 
 def test_populations_with_a_valve_in_common_are_refused(done: Path):
-    config = composed(f"paths.outputs={done / 'outputs'}")
-    store = ImagingStore(config)
+    store = store_of(f"paths.outputs={done / 'outputs'}")
     train, test = (store.population(which).valves for which in ("train", "test"))
     imaging.require_apart(train, test)
     with pytest.raises(ConfigurationError, match="two populations"):
@@ -271,7 +290,7 @@ def test_populations_with_a_valve_in_common_are_refused(done: Path):
 
 def test_keys_follow_what_they_are_of():
     def keys(*overrides: str) -> tuple[str, ...]:
-        store = ImagingStore(composed(*overrides))
+        store = store_of(*overrides)
         return store.population_key("train"), store.samples_key, store.model_key(6)
 
     base = keys()
@@ -287,7 +306,7 @@ def test_keys_follow_what_they_are_of():
     assert other[0] == base[0]
     assert other[1] != base[1]
     assert not set(keys("imaging.train.seed=9")) & set(base)
-    assert ImagingStore(composed()).model_key(3) != base[2]
+    assert store_of().model_key(3) != base[2]
 
 
 def test_samples_in_files_are_read_stage_by_stage(done: Path):
@@ -316,19 +335,19 @@ def volume(kind: str, number: int, size: float, confidence: float = 0.9) -> dict
         "confidence": confidence,
         "errors": errors | {"surface": 2 * size, "stages": {"landmarks": 3 * size}},
         "true": measured,
-        "found": measured | {"annulus_area_mm2": 90.0, "ap_diameter_mm": 31.5, "is_open": False},
+        "estimated": {"annulus_area_mm2": 90.0, "ap_diameter_mm": 31.5, "is_open": False},
     }  # fmt: skip
 
 
-def test_rows_have_signs_and_nothing_where_no_valve_was_found():
-    row = table_row(volume("shifted", 0, 1.0), 0.5)
-    assert row["surface_mm"] == 2.0
-    assert row["annulus_area_error_percent"] == pytest.approx(-10.0)
-    assert row["ap_error_mm"] == pytest.approx(1.5)
-    assert row["state_right"] is False
-    lost = table_row(volume("shifted", 0, 1.0, 0.4), 0.5)
-    assert lost["surface_mm"] is lost["ap_error_mm"] is lost["state_right"] is None
-    assert lost["seconds"] == 2.0
+def test_rows_have_signs_and_nothing_where_no_valve_was_detected():
+    row = detected_volume(volume("shifted", 0, 1.0), 0.5)
+    assert row.surface_mm == 2.0
+    assert row.annulus_area_error_percent == pytest.approx(-10.0)
+    assert row.ap_error_mm == pytest.approx(1.5)
+    assert row.state_right is False
+    lost = detected_volume(volume("shifted", 0, 1.0, 0.4), 0.5)
+    assert lost.surface_mm is lost.ap_error_mm is lost.state_right is None
+    assert lost.seconds == 2.0
 
 
 def test_trainings_are_compared_on_the_same_volumes():
@@ -336,7 +355,7 @@ def test_trainings_are_compared_on_the_same_volumes():
         10: [volume("shifted", 0, 4.0)],
         20: [volume("shifted", 0, 1.0), volume("shifted", 1, 100.0), volume("walls only", 0, 9.0)],
     }
-    found = {(row["training_volumes"], row["stage"]): row["median"] for row in learning_rows(rows)}
+    found = {(row.training_volumes, row.stage): row.median for row in learning_rows(rows)}
     assert found[10, "surface"] == 8.0
     assert found[20, "surface"] == 2.0
     assert found[20, "landmarks"] == 3.0
@@ -357,16 +376,16 @@ def sequence(confidence: float, off: float) -> tuple[dict, dict]:
     return {"frames": frames, "valve": f"{off}"}, {"errors": np.full((2, 4, 3), off)}
 
 
-def test_errors_are_told_of_valves_that_were_found_only():
+def test_errors_are_stated_of_valves_that_were_detected_only():
     held_out = HeldOut(
         {}, {"calibration": [sequence(0.9, 1.0), sequence(0.8, 30.0), sequence(0.3, 2.0)]}
     )
-    right = held_out.found("calibration", 0.5, 5.0)
+    right = held_out.detected("calibration", 0.5, 5.0)
     assert right.stacked("calibration", "errors").max() == 1.0
-    assert len(held_out.found("calibration", 0.5).sequences["calibration"]) == 2
-    config = {"imaging": {"detection": {"min_confidence": 0.5}, "held_out": {"wrong_mm": 5.0}}}
-    with pytest.raises(InputError, match="in 1 of 3 volumes the valve was found"):
-        imaging._calibrated(config, held_out)
+    assert len(held_out.detected("calibration", 0.5).sequences["calibration"]) == 2
+    settings = settings_of("imaging.detection.min_confidence=0.5", "imaging.held_out.wrong_mm=5.0")
+    with pytest.raises(InputError, match="in 1 of 3 volumes the valve was detected"):
+        imaging._calibrated(settings, held_out)
 
 
 def test_a_wrong_valve_counts_as_none():
@@ -376,17 +395,17 @@ def test_a_wrong_valve_counts_as_none():
         *({"kind": kind, "confidence": 0.2} for kind in ("walls only", "no tissue", "white noise")),
     ]
     sequences = {"calibration": [sequence(0.8, 1.0)[0]], "sequence": [], "shifted sequence": []}
-    found = _confidences(volumes, sequences, 0.5, 5.0)
-    assert found["highest_without_valve"] == 0.2
-    assert found["highest_wrong"] == 0.6
-    assert found["lowest_right"] == 0.8
-    assert found["best_threshold"] == pytest.approx(0.7)
-    rows = {row["kind"]: row for row in found["rows"]}
-    assert rows["in distribution"]["called a valve [%]"] == 100
-    assert rows["in distribution"]["wrongly called so [%]"] == 50
-    assert rows["walls only"]["wrongly called so [%]"] == 0
+    found = confidences(volumes, sequences, 0.5, 5.0)
+    assert found.highest_without_valve == 0.2
+    assert found.highest_wrong == 0.6
+    assert found.lowest_right == 0.8
+    assert found.best_threshold == pytest.approx(0.7)
+    rows = {row.kind: row for row in found.rows}
+    assert rows["in distribution"].called_percent == 100
+    assert rows["in distribution"].wrongly_percent == 50
+    assert rows["walls only"].wrongly_percent == 0
     assert "sequence" not in rows
 
 
 def test_the_small_scanner_is_the_simulators():
-    assert ImagingStore(composed()).training.acquisition == SMALL
+    assert store_of().training.acquisition == SMALL

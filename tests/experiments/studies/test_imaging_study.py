@@ -1,80 +1,117 @@
-"""What is told of a study of the image step: numbers in words, and what figures show."""
+"""What a study of the image step says: numbers in words, and what figures show."""
 
 import numpy as np
 import pytest
 
+from experiments.common.record import Record
+from experiments.studies.imaging.findings import (
+    Accuracy,
+    Confidences,
+    Correlations,
+    Coverage,
+    DetectedVolume,
+    Evaluation,
+    Findings,
+    ModelFile,
+    Population,
+    Spent,
+)
 from experiments.studies.imaging.report import (
     confidence_figure,
     correlation_figure,
     imaging_text,
     study_words,
-    write_imaging_study,
+    write_imaging,
 )
+from mvest.imaging.layout import ValveLayout
+from tests.experiments.studies.made_up import made_up
 
-CONFIDENCE = {
-    "least_confidence": 0.5,
-    "wrong_mm": 5.0,
-    "values": {"shifted": [0.9, 0.6], "walls only": [0.2], "sequence": []},
-    "off_mm": {"shifted": [1.0, 20.0], "walls only": [None], "sequence": []},
-    "highest_without_valve": 0.2,
-    "highest_wrong": 0.6,
-    "lowest_right": 0.9,
-    "best_threshold": 0.75,
-    "rows": [],
-}
-ACCURACY = {
-    "std_mm": [0.5] * 80,
-    "median_std_mm": 0.5,
-    "mean_error_mm": 0.3,
-    "sequences": 18,
-    "left_out": 2,
-    "correlation_length_mm": 8.0,
-    "correlogram": {"distance": [1.0, 8.0], "correlation": [0.97, 0.48], "pairs": [3, 4]},
-    "within_95": [
-        {
-            "setting": "shifted", "frame": "open", "sequences": 4, "share": 0.62,
-            "share_about_mean": 0.7,
-        }
-    ],
-}  # fmt: skip
-
-
-def spent(**cpu: float | None) -> dict:
-    return {part: {"cpu_s": cpu.get(part, 10.0)} for part in
-            ("valves", "volumes", "draft", "trees", "training")}  # fmt: skip
+CONFIDENCE = Confidences(
+    min_confidence=0.5,
+    wrong_mm=5.0,
+    values={"shifted": (0.9, 0.6), "walls only": (0.2,), "sequence": ()},
+    off_mm={"shifted": (1.0, 20.0), "walls only": (None,), "sequence": ()},
+    highest_without_valve=0.2,
+    highest_wrong=0.6,
+    lowest_right=0.9,
+    best_threshold=0.75,
+    rows=(),
+)
+ACCURACY = Accuracy(
+    std_mm=(0.5,) * 80,
+    median_std_mm=0.5,
+    mean_error_mm=0.3,
+    sequences=18,
+    left_out=2,
+    correlation_length_mm=8.0,
+    correlogram=Correlations((1.0, 8.0), (0.97, 0.48), (3, 4)),
+    within_95=(
+        Coverage(
+            setting="shifted", frame="open", sequences=4, share=0.62, share_about_mean=0.7,
+            rms_mm=1.0, stated_rms_mm=0.5,
+        ),
+    ),
+)  # fmt: skip
 
 
-def record(**more) -> dict:
-    return {
-        "row": "detectors", "reason": "trained", "rows": [], "targets": {},
-        "training_volumes": 24, "valves": {"train": {"count": 8}}, "spent": spent(training=120.0),
-    } | more  # fmt: skip
+def spent(**cpu: float | None) -> dict[str, Spent]:
+    parts = ("valves", "volumes", "draft", "trees", "training")
+    return {part: Spent(cpu.get(part, 10.0)) for part in parts}
+
+
+def volume(*, state_right: bool | None) -> DetectedVolume:
+    return DetectedVolume(
+        setting="shifted", valve="a", frame=0, confidence=0.9, surface_mm=1.0, point_mm=1.0,
+        tips_mm=1.0, annulus_area_error_percent=1.0, ap_error_mm=1.0, state_right=state_right,
+        seconds=1.0,
+    )  # fmt: skip
+
+
+def findings(**more) -> Findings:
+    return Findings(
+        **{
+            "seconds": 1.0, "memory_mb": 1.0, "detectors": "key", "layout": ValveLayout(16, 5),
+            "valves": {"train": Population(8, {})}, "training_volumes": 24, "targets": {},
+            "spent": spent(training=120.0), "tested": None, "measures": {},
+            "model_file": ModelFile("0", 1),
+        } | more
+    )  # fmt: skip
+
+
+def record(**more) -> Record[Findings]:
+    return made_up(findings(**more), row="detectors", reason="trained", experiment="imaging")
 
 
 def test_words_of_a_training_alone_are_its_cost(tmp_path):
-    words = study_words(record())
+    words = study_words(findings())
     assert words[0].startswith("Trained on 24 volumes of 8 simulated valves; CPU time 10 s for")
     assert words[0].endswith("2.0 minutes in all.")
     assert words[1:] == ["Not tested."]
     # What was not measured is not told.
-    unknown = study_words(record(spent=spent(valves=None, training=None)))[0]
+    unknown = study_words(findings(spent=spent(valves=None, training=None)))[0]
     assert "for valves" not in unknown
     assert "in all" not in unknown
     assert "Not tested" in imaging_text(record())
-    assert write_imaging_study(tmp_path, record()) == []
+    assert write_imaging(tmp_path, {"imaging": record()}, {}) == []
     assert list(tmp_path.iterdir()) == []
 
 
-def test_words_say_whether_the_errors_told_are_true():
-    rows = [{"state_right": True}, {"state_right": False}, {"state_right": None}]
-    words = " ".join(study_words(record(accuracy=ACCURACY, confidence=CONFIDENCE, rows=rows)))
+def test_words_say_whether_the_stated_errors_are_true():
+    tested = Evaluation(
+        rows=tuple(volume(state_right=right) for right in (True, False, None)),
+        training=(),
+        confidence=CONFIDENCE,
+        sequences=(),
+        accuracy=ACCURACY,
+    )
+    words = " ".join(study_words(findings(tested=tested)))
     assert "right in 1 of 2 volumes" in words
     assert "from 18 volumes over time" in words
     assert "taken for it: 2." in words
     assert "Shifted, open frame: 62 % of coordinates" in words
     assert "(70 % with the mean error taken off)" in words
     assert "without a valve: at most 0.20" in words
-    assert "0.75 would tell these apart" in words
+    assert "0.75 would part these" in words
 
 
 def test_the_figure_of_confidences_shows_wrong_valves_hollow():
