@@ -17,6 +17,7 @@ from mvest.reporting.style import BAD, GOOD, SMALL, headline, panels
 
 __all__ = [
     "REFERENCE",
+    "filters_answer",
     "filters_figure",
     "filters_table",
     "filters_words",
@@ -200,13 +201,36 @@ def _notes(model: Model | None) -> str:
     )
 
 
+def _width_off(problem: Problem, method: str, k: int) -> float:
+    """Relative difference of the width of an interval from that of Monte Carlo."""
+    own, reference = (np.ptp(np.log(problem.filters[m].interval(k))) for m in (method, REFERENCE))
+    return float(own / reference - 1)
+
+
+def _as_wide(findings: Findings) -> dict[str, tuple[int, int]]:
+    """Filter -> unknowns whose interval is as wide as that of Monte Carlo, and all unknowns."""
+    counts: dict[str, tuple[int, int]] = {}
+    for problem in findings.problems:
+        for method in problem.filters:
+            off = [_width_off(problem, method, k) for k in range(len(problem.parameters))]
+            right, of = counts.get(method, (0, 0))
+            counts[method] = right + sum(abs(v) <= TARGET for v in off), of + len(off)
+    del counts[REFERENCE]
+    return counts
+
+
+def filters_answer(findings: Findings) -> str:
+    """Which filters are as sure as they should be."""
+    best = [_label(m) for m, (right, of) in _as_wide(findings).items() if right == of]
+    return f"As wide as Monte Carlo everywhere: {' and '.join(best) or 'no filter'}"
+
+
 def filters_figure(findings: Findings) -> Figure:
     """95 % interval that each filter gives each unknown, on that of Monte Carlo."""
     unknowns = [(p, k) for p in findings.problems for k in range(len(p.parameters))]
-    methods = list(dict.fromkeys(m for p in findings.problems for m in p.filters))
-    methods.remove(REFERENCE)
+    counted = _as_wide(findings)
+    methods = list(counted)
     figure, grid = panels(1, len(unknowns), 0.32 * len(methods) + 2.7, sharey=True)
-    right = dict.fromkeys(methods, 0)
     for axes, (problem, k) in zip(grid[0], unknowns, strict=True):
         by = problem.filters[REFERENCE]
         reference = _in_std(by, by.interval(k), k)
@@ -217,9 +241,8 @@ def filters_figure(findings: Findings) -> Figure:
             if method not in problem.filters:
                 continue
             low, high = _in_std(by, problem.filters[method].interval(k), k)
-            off = (high - low) / (reference[1] - reference[0]) - 1
+            off = _width_off(problem, method, k)
             is_right = abs(off) <= TARGET
-            right[method] += is_right
             colour = GOOD if is_right else BAD
             axes.plot([low, high], [row, row], color=colour, linewidth=2.2)
             axes.plot((low + high) / 2, row, marker="o", markersize=4, color=colour)
@@ -234,14 +257,12 @@ def filters_figure(findings: Findings) -> Figure:
         name = problem.parameters[k]
         axes.set_title(textwrap.fill(axis_label(name), 14), fontsize=SMALL)
         axes.set_xlabel(textwrap.fill(problem.title, 14), fontsize=SMALL - 0.5)
-    counted = [sum(m in p.filters for p, _ in unknowns) for m in methods]
-    labels = [f"{_label(m)}, {right[m]} of {n}" for m, n in zip(methods, counted, strict=True)]
+    labels = [f"{_label(m)}, {right} of {of}" for m, (right, of) in counted.items()]
     grid[0, 0].set_yticks(range(len(methods)), labels)
     grid[0, 0].set_ylim(len(methods) - 0.4, -0.7)
-    best = [_label(m) for m, n in zip(methods, counted, strict=True) if right[m] == n]
     headline(
         figure,
-        f"As wide as Monte Carlo everywhere: {' and '.join(best) or 'no filter'}",
+        filters_answer(findings),
         f"95 % intervals in standard deviations from the mean of Monte Carlo (grey: its own). "
         f"Blue: width within {100 * TARGET:.0f} %;\norange: not, with the difference. Black: "
         "truth. Names: number of unknowns within. Simulated.",

@@ -17,6 +17,7 @@ from experiments.common.build import MADE_BY, filter_of
 from experiments.common.findings import vector
 from experiments.common.progress import SolveBar, say
 from experiments.common.record import Mesh, Outcome
+from experiments.common.report import answer_of_main
 from experiments.common.store import Store
 from experiments.common.study import Job, Section, Study
 from experiments.studies.filters.findings import (
@@ -33,7 +34,12 @@ from experiments.studies.filters.problem import (
     build_problem,
     fit_to_prior,
 )
-from experiments.studies.filters.report import REFERENCE, filters_words, write_filters
+from experiments.studies.filters.report import (
+    REFERENCE,
+    filters_answer,
+    filters_words,
+    write_filters,
+)
 from experiments.studies.filters.settings import FilterStudySettings, Settings
 from mvest.errors import ConfigurationError
 from mvest.estimation.estimate import Estimate, Filter
@@ -291,6 +297,7 @@ STUDY = Study(
                 "filters": "95 % interval that each filter gives each unknown, on that of Monte "
                 "Carlo: blue where it is as wide to 10 %. Simulated."
             },
+            answer=answer_of_main(lambda record: f"{filters_answer(record.findings)} (simulated)."),
         ),
     ),
 )

@@ -20,6 +20,7 @@ from mvest.reporting.style import SMALL, headline, panels, plain_number
 from mvest.typing import FloatArray
 
 __all__ = [
+    "designs_answer",
     "designs_figure",
     "identifiability_figures",
     "profiles_figure",
@@ -43,11 +44,10 @@ def identifiability_figures(record: Record[Findings]) -> dict[str, Figure]:
     return figures
 
 
-def designs_figure(findings: Findings) -> Figure:
-    """Deviation of the first modulus as a table in colours, one panel for each knowledge."""
-    settings = findings.settings
-    modulus = findings.designs[0].moduli[0].parameter
-    typical, target = f"{settings.typical_mm:g}", 100 * settings.target
+def _deviations(findings: Findings) -> pd.DataFrame:
+    """Deviation of the first modulus with the typical noise: one row for each different design."""
+    modulus = _modulus(findings)
+    typical = f"{findings.settings.typical_mm:g}"
     table = pd.DataFrame(
         {
             "knowledge": one.knowledge,
@@ -59,7 +59,27 @@ def designs_figure(findings: Findings) -> Figure:
         for one in design.moduli
         if one.parameter == modulus
     )
-    shown, knowledges = _without_twins(table), list(table["knowledge"].unique())
+    return _without_twins(table)
+
+
+def _modulus(findings: Findings) -> str:
+    return findings.designs[0].moduli[0].parameter
+
+
+def designs_answer(findings: Findings) -> str:
+    """How many designs would do."""
+    shown, target = _deviations(findings), 100 * findings.settings.target
+    within = shown[shown["percent"] <= target]
+    never = [k for k in shown["knowledge"].unique() if k not in set(within["knowledge"])]
+    text = f"{len(within)} of {len(shown)} designs would tell {axis_label(_modulus(findings))} to "
+    return text + f"{target:g} %" + (f"; none with {' or '.join(never)}" if never else "")
+
+
+def designs_figure(findings: Findings) -> Figure:
+    """Deviation of the first modulus as a table in colours, one panel for each knowledge."""
+    settings, shown = findings.settings, _deviations(findings)
+    typical, target = f"{settings.typical_mm:g}", 100 * settings.target
+    knowledges = list(shown["knowledge"].unique())
     seen, frames = list(shown["seen"].unique()), list(shown["frames"].unique())
     figure, grid = panels(1, len(knowledges), 0.3 * len(seen) + 2.6, sharey=True)
     colours = ListedColormap(SHADES)
@@ -83,13 +103,9 @@ def designs_figure(findings: Findings) -> Figure:
         axes.spines[:].set_visible(False)
         axes.tick_params(length=0, labelsize=SMALL - 1)
     grid[0, 0].set_yticks(range(len(seen)), seen)
-    within = shown[shown["percent"] <= target]
-    never = [k for k in knowledges if k not in set(within["knowledge"])]
-    text = f"{len(within)} of {len(shown)} designs would tell {axis_label(modulus)} to "
-    text += f"{target:g} %" + (f"; none with {' or '.join(never)}" if never else "")
     headline(
         figure,
-        text,
+        designs_answer(findings),
         f"Standard deviation expected [%] with {typical} mm of noise; dark: at most {target:g} %. "
         f"Simulated.",
     )

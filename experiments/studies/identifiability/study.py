@@ -14,7 +14,9 @@ from experiments.common.findings import finite, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import SolveBar, say
 from experiments.common.record import Outcome
+from experiments.common.report import answer_of_main
 from experiments.common.study import Job, Section, Study
+from experiments.studies.identifiability.figures import designs_answer
 from experiments.studies.identifiability.findings import Design, Expected, Findings, Joint, Profile
 from experiments.studies.identifiability.observed_sets import SETS, vertex_set
 from experiments.studies.identifiability.report import (
@@ -298,6 +300,7 @@ STUDY = Study(
                 "different frames; the floor "
                 "of the valley that the profile followed. Simulated.",
             },
+            answer=answer_of_main(lambda record: f"{designs_answer(record.findings)} (simulated)."),
         ),
     ),
 )

@@ -24,6 +24,7 @@ from mvest.reporting.style import COLOURS, GREY, MARKERS, SMALL, headline, panel
 __all__ = [
     "confidence_figure",
     "correlation_figure",
+    "imaging_answer",
     "imaging_text",
     "study_words",
     "write_imaging",
@@ -136,6 +137,19 @@ def imaging_text(record: Record[Findings]) -> str:
             )
         lines += [f"  {line}" for line in imaging_words(table, findings.targets)]
     return "\n".join([*lines, *(f"  {line}" for line in study_words(findings))])
+
+
+def imaging_answer(record: Record[Findings]) -> str:
+    """How near detected leaflets are to true ones."""
+    tested = record.findings.tested
+    if tested is None:
+        return "Trained, not tested."
+    rows = [
+        f"{row['surface median [mm]']:.2f} mm ({row['setting']}, "
+        f"{row['valve detected [%]']:.0f} % detected)"
+        for _, row in imaging_table(tested.rows).iterrows()
+    ]
+    return f"Median distance of leaflets detected in simulated volumes: {' and '.join(rows)}."
 
 
 def write_imaging(

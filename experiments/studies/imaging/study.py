@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from experiments.common.record import Outcome, Record
+from experiments.common.report import answer_of_main
 from experiments.common.schema import build
 from experiments.common.study import Job, Section, Study
 from experiments.studies.imaging.evaluation import findings_of, tested_of
 from experiments.studies.imaging.findings import DetectedVolume, Evaluation, Findings
 from experiments.studies.imaging.held_out import HeldOut, hold_out
-from experiments.studies.imaging.report import imaging_text, write_imaging
+from experiments.studies.imaging.report import imaging_answer, imaging_text, write_imaging
 from experiments.studies.imaging.settings import ImagingSettings, Settings
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.tables import imaging_table, imaging_words
@@ -282,6 +283,7 @@ STUDY = Study(
                 "imaging_std": "Standard deviation that the image step states of each point. "
                 "Simulated.",
             },
+            answer=answer_of_main(imaging_answer),
         ),
     ),
 )

@@ -20,6 +20,7 @@ from mvest.reporting.markup import MISSING, markdown_rows, number
 __all__ = [
     "SHOWN",
     "coverage",
+    "prediction_answer",
     "prediction_table",
     "prediction_words",
     "write_prediction",
@@ -269,6 +270,16 @@ def prediction_words(record: Record[Findings]) -> str:
             "papillary tips that stay where they are prescribed; a ventricle that dilates with it "
             "is not part of the model.",
         ]
+    )
+
+
+def prediction_answer(record: Record[Findings]) -> str:
+    """How often predictions hold the truth."""
+    findings = record.findings
+    return (
+        f"Of intervals predicted for an estimated valve under changed conditions "
+        f"{_totals(findings, 'own')} hold the simulated truth, "
+        f"{_totals(findings, 'wide')} with the mesh's error."
     )
 
 

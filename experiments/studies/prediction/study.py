@@ -19,6 +19,7 @@ from experiments.common.findings import Rows, rows, stored_arrays, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.record import Outcome
+from experiments.common.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.prediction.findings import (
     Findings,
@@ -28,7 +29,11 @@ from experiments.studies.prediction.findings import (
     Predicted,
     Scenario,
 )
-from experiments.studies.prediction.report import prediction_words, write_prediction
+from experiments.studies.prediction.report import (
+    prediction_answer,
+    prediction_words,
+    write_prediction,
+)
 from experiments.studies.prediction.settings import PredictionSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
@@ -311,6 +316,7 @@ STUDY = Study(
                 "conditions, seen from "
                 "the atrium, and measures of it with their 95 % intervals. Simulated."
             },
+            answer=answer_of_main(prediction_answer),
         ),
     ),
 )
