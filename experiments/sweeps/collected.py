@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -22,24 +21,10 @@ SCHEMA = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepJob:
-    """One job with one run per seed; vectors are in the order of the sweep's parameters.
+    """One job with one run per seed, without any where it died; vectors are ``(p,)``.
 
-    Attributes
-    ----------
-    hash, row : str
-    factors : mapping
-        What is varied, and its value here.
-    seed : int or None
-        The first of `repeats`; None where it is not known which seeds the job had.
-    status : {"converged", "failed"}
-    reason : str
-    model : Model or None
-    initial, truth : (p,) or None
-    P0, Q, R
-        Variance, variances or matrix; None where not stated.
-    filter : str or None
-    runs : tuple of SeedRun
-        None of them where the job died.
+    ``seed`` is the first of so many ``repeats``, None where it is not known which seeds the job
+    had; ``P0``, ``Q`` and ``R`` are a variance, variances or a matrix.
     """
 
     hash: str
@@ -76,7 +61,7 @@ class Cost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
-    """Jobs that differ in their factors.
+    """Jobs that differ in their factors, with p parameters.
 
     Attributes
     ----------
@@ -84,18 +69,15 @@ class Sweep:
     sweep : mapping
         Its name, kind and size, and the grids of its sizes.
     title : str
-    parameters : tuple of str, (p,)
+    parameters : tuple of str
     paper : Paper or None
     truth_hits, truth_misses : int
         Simulated truths that were in the store, and that were not.
-    provenance : Provenance
-        Of the file.
-    commits : tuple of str
-        Of the jobs.
+    provenance, commits : Provenance and tuple of str
+        Of the file, and of the jobs.
     settings : mapping
         Those of the first job, in what a sweep has in common.
-    jobs : tuple of SweepJob
-    cost : tuple of Cost
+    jobs, cost : tuple of SweepJob, and of Cost
     """
 
     schema: int
@@ -122,11 +104,6 @@ class Sweep:
         return str(self.sweep["kind"])
 
 
-@cache
-def _adapter() -> TypeAdapter[Sweep]:
-    return TypeAdapter(Sweep)
-
-
 def check_sweep(data: Any, where: str) -> Sweep:
     """A collected sweep from plain data.
 
@@ -140,7 +117,7 @@ def check_sweep(data: Any, where: str) -> Sweep:
     if data.get("schema", SCHEMA) != SCHEMA:
         raise InputError(f"{where} has schema {data['schema']}; this version reads {SCHEMA}")
     try:
-        sweep = _adapter().validate_python(data)
+        sweep = TypeAdapter(Sweep).validate_python(data)
     except ValidationError as error:
         first = error.errors()[0]
         *place, name = map(str, first["loc"])

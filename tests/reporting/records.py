@@ -58,7 +58,6 @@ RECORD: dict[str, Any] = {
     "iterate_std": [[0.1, 0.1], [0.03, 0.02], [0.02, 0.011], [0.02, 0.011]],
     "innovation": None,
     "identifiability": None,
-    "repeats": [],
     "confirmed_mm": None,
     "seconds_computing": 62.0,
     "truth_store": "miss",
@@ -80,9 +79,17 @@ RECORD: dict[str, Any] = {
 }
 
 
+OF_A_SEED = ("status", "reason", "detail", "estimate", "std", "relative_error", "distance_mm",
+             "distance_to_truth_mm", "iterations", "forward_solves", "seconds", "iterates",
+             "iterate_std")  # fmt: skip
+"""What an estimate from one seed says."""
+
+
 def record(**changes: Any) -> dict[str, Any]:
     """A record of its own, with changes."""
-    return {**copy.deepcopy(RECORD), **changes}
+    made = {**copy.deepcopy(RECORD), **changes}
+    made["repeats"] = [{"seed": 1, **{key: made[key] for key in OF_A_SEED}}]
+    return made
 
 
 def failed_record(**changes: Any) -> dict[str, Any]:

@@ -64,17 +64,18 @@ def _paper_row(record: Twin, paper: Paper) -> dict[str, Any]:
 
 def _row(record: Twin) -> dict[str, Any]:
     findings, model, mesh = record.findings, record.model, record.mesh
+    first, moduli = findings.first, findings.moduli_error_percent
     assert model is not None
     assert mesh is not None
     row: dict[str, Any] = {"run": record.row, "source": "mvest"}
-    errors = findings.relative_error
     for k, name in enumerate(record.parameters):
         row[f"truth {name}{_unit(name)}"] = findings.truth[k]
         row[f"start {name}{_unit(name)}"] = findings.initial[k]
-        row[f"estimate {name}{_unit(name)}"] = _at(findings.estimate, k)
-        row[f"std {name}{_unit(name)}"] = _at(findings.std, k)
-        row[f"error {name} [%]"] = None if errors is None else 100.0 * abs(errors[k])
-    moduli, distance = findings.moduli_error_percent, findings.distance_mm
+        row[f"estimate {name}{_unit(name)}"] = _at(first.estimate, k)
+        row[f"std {name}{_unit(name)}"] = _at(first.std, k)
+        error = _at(first.relative_error, k)
+        row[f"error {name} [%]"] = None if error is None else 100.0 * abs(error)
+    distance = first.distance_mm
     closed = (findings.closure or {}).get("closed")
     measured = closed if isinstance(closed, ClosureMeasurements) else None
     return row | {
@@ -91,9 +92,9 @@ def _row(record: Twin) -> dict[str, Any]:
         "nodes": mesh.nodes,
         "filter": model.filter,
         "noise [mm]": model.noise_mm,
-        "iterations": findings.iterations,
+        "iterations": first.iterations or 0,
         "forward solves": record.forward_solves,
-        "time [s]": findings.seconds,
+        "time [s]": first.seconds,
         "status": record.status,
         "reason": record.reason,
     }
@@ -210,7 +211,7 @@ def write_twin(folder: Path, records: Mapping[str, Twin], arrays: Mapping[str, P
 def write_twin_run(folder: Path, record: Twin) -> list[Path]:
     """The table and the figures of one run."""
     fields = folder / "fields.npz"
-    fitted = record.findings.distance_mm is not None and fields.is_file()
+    fitted = record.findings.first.distance_mm is not None and fields.is_file()
     return [
         *write_tables(folder, record.table, [record]),
         *_figures(folder / "iterates", folder / "valve", record, fields if fitted else None),
@@ -221,14 +222,11 @@ def _figures(iterates: Path, valve: Path, record: Twin, fields: Path | None) -> 
     """How the estimate came about, and the fitted valve if its arrays are there."""
     from mvest.reporting.figures import iterates_figure, save_figure_with, valve_figure
 
-    findings, written = record.findings, []
-    if findings.iterates:
+    first, written = record.findings.first, []
+    if first.iterates:
+        title, names = f"{record.title}: {record.row}", record.parameters
         figure = iterates_figure(
-            f"{record.title}: {record.row}",
-            record.parameters,
-            findings.iterates,
-            findings.iterate_std,
-            findings.truth,
+            title, names, first.iterates, first.iterate_std, record.findings.truth
         )
         written += save_figure_with(iterates, figure, record.line)
     if fields is not None:
