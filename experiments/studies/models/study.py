@@ -16,7 +16,7 @@ import numpy as np
 import mvest
 from experiments.common.build import build_filter
 from experiments.common.findings import rows, vector
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
 from experiments.common.record import Outcome
 from experiments.common.report import write_each
 from experiments.common.study import Job, Section, Study
@@ -149,7 +149,7 @@ def _estimate(
     data: str, y: FloatArray, name: str, model: ObservationModel, problem: SheetProblem
 ) -> Row:
     """Moduli that one model estimates from the data of one code."""
-    print(f"{name} from data of {data}", file=sys.stderr, flush=True)
+    say(f"{name} from data of {data}")
     runs = model.runs if isinstance(model, ProcessModel) else 0
     began = time.perf_counter()
     with SolveBar(name, 0, TYPICAL_SOLVES, PARAMETERS) as bar:
@@ -183,7 +183,7 @@ def _difference(sheet: Sheet, cells: tuple[int, ...], truth: FloatArray) -> Diff
     """How far apart the codes are on one mesh, at the true moduli."""
     along, across, layers = cells
     finer = replace(sheet, cells=(along, across), layers=layers)
-    print(f"both codes on {along} x {across} x {layers} cells", file=sys.stderr, flush=True)
+    say(f"both codes on {along} x {across} x {layers} cells")
     second, alike = SecondSheet(finer)(truth), SecondSheet(finer, thickness_points=2)(truth)
     return Difference(
         tuple(cells),
