@@ -12,24 +12,11 @@ __all__ = ["Estimated", "Findings", "Problem", "Repeats", "SurrogateFit"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimated:
-    """What a filter says of p unknowns from one observation, with the model itself.
+    """What a filter says of unknowns ``(p,)`` from one observation, with the model itself.
 
-    Attributes
-    ----------
-    converged : bool
-    reason, detail : str
-        Why it ended.
-    forward_solves, iterations : int
-    seconds, model_seconds : float
-        CPU time, in all and of the model.
-    estimate : (p,)
-        In units of the parameters.
-    log_mean, log_std : (p,)
-        Of the logarithms.
-    low, high : (p,)
-        Ends of 95 % intervals.
-    skewness : (p,) or None
-        Of the draws of the logarithms; None without draws.
+    Estimate and the ends of its 95 % interval are in units of the parameters, ``log_mean`` and
+    ``log_std`` of their logarithms, and so is the skewness of the draws, None without draws. CPU
+    seconds are in all, and of the model.
     """
 
     converged: bool
@@ -55,14 +42,9 @@ class Estimated:
 class Repeats:
     """What a filter says of many observations, by the surrogate; None where it always failed.
 
-    Attributes
-    ----------
-    runs, failed : int
-    coverage : (p,) or None
-        Share of 95 % intervals that hold the truth; a failed run holds nothing.
-    log_rms_error : (p,) or None
-    width_ratio : (p,) or None
-        Median width of intervals over that of the reference.
+    ``coverage (p,)`` is the share of 95 % intervals that hold the truth, where a failed run holds
+    nothing, ``log_rms_error (p,)`` is of the logarithms, and ``width_ratio (p,)`` the median width
+    of intervals over that of the reference.
     """
 
     runs: int
@@ -74,16 +56,7 @@ class Repeats:
 
 @dataclass(frozen=True, slots=True)
 class SurrogateFit:
-    """How far the surrogate is from the model.
-
-    Attributes
-    ----------
-    runs, held_out : int
-        To which it was fitted, and further ones.
-    degree : int
-    rms_mm, largest_mm : float
-        Error of a coordinate over the held-out runs.
-    """
+    """How far the surrogate is from the model: errors of a coordinate over the held-out runs."""
 
     runs: int
     held_out: int
@@ -94,24 +67,10 @@ class SurrogateFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """One problem of p unknowns, and what all filters say of it.
+    """One problem, and by name what all filters say of it.
 
-    Attributes
-    ----------
-    name, title, about : str
-    parameters : tuple of str, (p,)
-    truth, initial : (p,)
-        In units of the parameters; the latter are medians of the prior.
-    log_std : (p,)
-        Of the prior, of the logarithms.
-    noise_mm : float
-        Standard deviation of a coordinate.
-    observations : int
-    surrogate : SurrogateFit
-    filters : mapping
-        By name.
-    repeats : mapping
-        By name of the filter.
+    Truth and medians of the prior ``(p,)`` are in units of the parameters, ``log_std (p,)`` is of
+    the prior's logarithms, and ``noise_mm`` of a coordinate.
     """
 
     name: str
@@ -130,14 +89,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What follows for all problems.
-
-    Attributes
-    ----------
-    problems : tuple of Problem
-    seconds : float
-        CPU time of all estimates with the model itself.
-    """
+    """All problems, and the CPU seconds of all estimates with the model itself."""
 
     problems: tuple[Problem, ...]
     seconds: float

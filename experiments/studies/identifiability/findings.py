@@ -14,19 +14,11 @@ __all__ = ["Design", "Expected", "Findings", "Joint", "Profile"]
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What a design tells of one modulus, with one knowledge of the nuisances.
+    """What a design tells of one modulus, with one of ``settings.knowledge`` of the nuisances.
 
-    Attributes
-    ----------
-    knowledge : str
-        One of ``settings.knowledge``.
-    parameter : str
-    std : mapping
-        Noise in mm, as text -> relative standard deviation; None where it is unbounded.
-    needed_noise_mm : float or None
-        With which the modulus is known to the target; None if any will do.
-    needed_repeats : float or None
-        Observations with the typical noise that are needed for that; None if no number will do.
+    ``std`` is relative, by the noise in mm as text, None where it is unbounded. With
+    ``needed_noise_mm`` the modulus is known to the target, None if any will do; that takes
+    ``needed_repeats`` observations with the typical noise, None if no number will do.
     """
 
     knowledge: str
@@ -40,14 +32,8 @@ class Expected:
 class Joint:
     """What a design tells of q parameters together, those that profiles hold being known.
 
-    Attributes
-    ----------
-    names : tuple of str, (q,)
-    covariance : (q, q)
-        Relative, with the typical noise; None where it is unbounded.
-    confounded : tuple of mapping
-        See :func:`mvest.reporting.expectation.confounded_record`.
-    condition_number : float or None
+    ``covariance (q, q)`` is relative, with the typical noise, None where it is unbounded;
+    ``confounded`` is of :func:`mvest.reporting.expectation.confounded_record`.
     """
 
     names: tuple[str, ...]
@@ -58,25 +44,11 @@ class Joint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
-    """One observation, before it is made.
+    """One observation, before it is made: ``points`` vertices in frames and with errors in words.
 
-    Attributes
-    ----------
-    frames : str
-        In words.
-    frame_count : int
-    vertices, vertices_words : str
-        Name of the set of vertices, and what a reader calls it.
-    points : int
-        Number of these vertices.
-    errors : str
-        How they are correlated.
-    moduli : tuple of Expected
-    joint : Joint or None
-        Of designs with all vertices.
-    pressure : mapping
-        Modulus -> relative standard deviation of the pressure beforehand with which it is known to
-        the target; None if the pressure need not be known.
+    ``joint`` is of designs with all vertices only. ``pressure`` says for each modulus how well, as
+    a relative standard deviation, the pressure must be known beforehand for the modulus to be known
+    to the target; None if it need not be known.
     """
 
     frames: str
@@ -92,23 +64,11 @@ class Design:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Profile:
-    """A profile likelihood of one of q parameters, at k points.
+    """A profile likelihood of one of q parameters from one observation, at k points.
 
-    Attributes
-    ----------
-    label, vertices : str
-        Of the observation that was followed.
-    parameter : str
-    parameters : tuple of str, (q,)
-    path : (k, q)
-        Parameters with the least misfit where this one is held.
-    deviance : (k,)
-    threshold : float
-        Of the deviance, for 95 %.
-    low, high : float or None
-        Ends of the interval; None where the profile does not reach the threshold.
-    ends : (2,)
-        Why the profile was not followed farther, below and above.
+    ``path (k, q)`` are the parameters with the smallest misfit where this one is held, ``deviance
+    (k,)`` is to be compared with ``threshold`` for 95 %, ``low`` and ``high`` are None where that
+    is not reached, and ``ends`` says why the profile was not followed farther, below and above.
     """
 
     label: str
@@ -130,16 +90,7 @@ class Profile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for p parameters; no designs of a valve that does not close.
-
-    Attributes
-    ----------
-    assumed : (p,)
-        Values at which everything is computed.
-    settings : DesignsSettings
-    designs : tuple of Design
-    profiles : tuple of Profile
-    """
+    """What follows at the assumed values ``(p,)``; no designs of a valve that does not close."""
 
     assumed: Vector
     settings: DesignsSettings

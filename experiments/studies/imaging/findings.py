@@ -9,43 +9,19 @@ from typing import Any
 from experiments.common.findings import Vector
 from mvest.imaging.layout import ValveLayout
 
-__all__ = [
-    "Accuracy",
-    "Confidences",
-    "Correlations",
-    "Coverage",
-    "DetectedVolume",
-    "Evaluation",
-    "Findings",
-    "KindOfVolume",
-    "Learning",
-    "ModelFile",
-    "Population",
-    "Sequence",
-    "Spent",
-]
+__all__ = ["Accuracy", "Confidences", "Correlations", "Coverage", "DetectedVolume", "Evaluation",
+           "Findings", "KindOfVolume", "Learning", "ModelFile", "Population", "Sequence",
+           "Spent"]  # fmt: skip
 
 Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectedVolume:
-    """A valve in one volume of one frame.
+    """A valve in one volume of one frame, errors with sign, mean distances without.
 
-    Attributes
-    ----------
-    setting, valve : str
-        How the volume was drawn, and of which valve.
-    frame : int
-    confidence : float
-    surface_mm, point_mm, tips_mm : float or None
-        Mean distance of the surfaces, of the same points of tissue, and of the papillary tips.
-    annulus_area_error_percent, ap_error_mm : float or None
-        With sign.
-    state_right : bool or None
-        Whether an open orifice is seen as open and a closed one as closed.
-    seconds : float
-        CPU time of one thread.
+    ``state_right`` says whether an open orifice is seen as open and a closed one as closed, and
+    ``seconds`` are of the CPU, of one thread.
     """
 
     setting: str
@@ -63,18 +39,7 @@ class DetectedVolume:
 
 @dataclass(frozen=True, slots=True)
 class Learning:
-    """Errors of one stage after training on so many volumes.
-
-    Attributes
-    ----------
-    stage : str
-    training_volumes : int
-    setting : str
-    median, p90 : float
-    unit : str
-    volumes : int
-        On which it was tested.
-    """
+    """Errors of one stage after training on so many volumes, tested on ``volumes``."""
 
     stage: str
     training_volumes: int
@@ -89,20 +54,7 @@ class Learning:
 class Sequence:
     """A valve in a volume over time; means over the frames, errors without sign.
 
-    Attributes
-    ----------
-    setting, valve : str
-    frames : int
-    confidence : float
-        Of the best frame.
-    detected, wrong : bool
-        Whether it is called a valve, and whether it is called so and is not the valve.
-    surface_mm, points_mm, tips_mm : float
-    surface_open_mm, surface_closed_mm : float
-        Of the open and of the closed frame.
-    annulus_area_error_percent, ap_error_mm, state_right_percent : float or None
-    seconds : float
-        CPU time of one thread.
+    Confidence is that of the best frame. What is wrong is called a valve and is not the valve.
     """
 
     setting: str
@@ -124,16 +76,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class KindOfVolume:
-    """Confidence in volumes of one kind.
-
-    Attributes
-    ----------
-    kind : str
-    volumes : int
-    lowest, median, highest : float
-    called_percent, wrongly_percent : float
-        That are called a valve, and wrongly so.
-    """
+    """Confidence in volumes of one kind, and how many are called a valve, and wrongly so."""
 
     kind: str
     volumes: int
@@ -146,22 +89,12 @@ class KindOfVolume:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Confidences:
-    """How sure detectors are of a valve, with and without one.
+    """How sure detectors are of a valve, with and without one, by kind of volume.
 
-    Attributes
-    ----------
-    min_confidence : float
-        From which on something is called a valve.
-    wrong_mm : float
-        Mean distance of its points from which on it is not the valve.
-    rows : tuple of KindOfVolume
-    values : mapping
-        Kind -> confidence of each volume; over time, of the best frame.
-    off_mm : mapping
-        Kind -> mean distance of the points in each volume; None without a valve.
-    highest_without_valve, highest_wrong : float
-    lowest_right, best_threshold : float or None
-        The latter parts right from wrong best; None where nothing is right.
+    From ``min_confidence`` on something is called a valve, and it is not the valve where its points
+    are on average ``wrong_mm`` off or more; ``off_mm`` is None without a valve. Volumes over time
+    count with their best frame. ``best_threshold`` parts right from wrong best, and is None where
+    nothing is right.
     """
 
     min_confidence: float
@@ -177,12 +110,7 @@ class Confidences:
 
 @dataclass(frozen=True, slots=True)
 class Correlations:
-    """Correlation of errors against distance, in b bins.
-
-    Attributes
-    ----------
-    distance, correlation, pairs : (b,)
-    """
+    """Correlation of errors against distance, in bins ``(b,)``."""
 
     distance: Vector
     correlation: Vector
@@ -193,13 +121,7 @@ class Correlations:
 class Coverage:
     """Errors of one frame of volumes over time beside the standard deviations that are stated.
 
-    Attributes
-    ----------
-    setting, frame : str
-    sequences : int
-    share, share_about_mean : float
-        Of coordinates within 1.96 of these; with the mean error taken off.
-    rms_mm, stated_rms_mm : float
+    Shares are of coordinates within 1.96 of these, one with the mean error taken off.
     """
 
     setting: str
@@ -215,15 +137,8 @@ class Coverage:
 class Accuracy:
     """Errors that detectors state, from volumes over time of valves of their own.
 
-    Attributes
-    ----------
-    std_mm : (n,)
-        Standard deviation of a coordinate of each vertex.
-    median_std_mm, correlation_length_mm, mean_error_mm : float
-    sequences, left_out : int
-        Volumes; those in which the valve was not detected, or something else was.
-    correlogram : Correlations
-    within_95 : tuple of Coverage
+    ``std_mm (n,)`` is of a coordinate of each vertex. Volumes in which the valve was not detected,
+    or something else was, are left out.
     """
 
     std_mm: Vector
@@ -240,18 +155,8 @@ class Accuracy:
 class Evaluation:
     """What detectors do in volumes of valves that no training saw.
 
-    Attributes
-    ----------
-    rows : tuple of DetectedVolume
-    training : tuple of Learning
-    confidence : Confidences
-    sequences : tuple of Sequence
-    accuracy : Accuracy
-    volumes : mapping
-        Volumes trained on -> rows of :func:`experiments.studies.imaging.trials.try_volume`; not
-        kept in the results.
-    sequence_frames : mapping
-        Kind -> rows of :func:`experiments.studies.imaging.trials.try_sequence`; neither.
+    ``volumes`` (by the number trained on) and ``sequence_frames`` (by kind) are rows of
+    :mod:`experiments.studies.imaging.trials`, which the results do not keep.
     """
 
     rows: tuple[DetectedVolume, ...]
@@ -265,14 +170,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """A population of simulated valves.
-
-    Attributes
-    ----------
-    count : int
-    refused : mapping
-        Why a drawn valve was not taken -> how often.
-    """
+    """A population of simulated valves, and how often a drawn one was refused, by reason."""
 
     count: int
     refused: Mapping[str, int]
@@ -280,14 +178,7 @@ class Population:
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What one part of the study cost.
-
-    Attributes
-    ----------
-    cpu_s : float or None
-        Of all processes together; None where it was not measured.
-    wall_s : float or None
-    """
+    """What one part of the study cost, of all processes together; None if not measured."""
 
     cpu_s: float | None
     wall_s: float | None = None
@@ -295,13 +186,7 @@ class Spent:
 
 @dataclass(frozen=True, slots=True)
 class ModelFile:
-    """The detectors' file.
-
-    Attributes
-    ----------
-    sha256 : str
-    bytes : int
-    """
+    """The detectors' file."""
 
     sha256: str
     bytes: int
@@ -309,29 +194,10 @@ class ModelFile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What a study of detectors costs, and what came of it.
+    """What a study of detectors costs, by part, and what came of it; not all are tested.
 
-    Attributes
-    ----------
-    seconds : float
-        CPU time of the training; 0 where it was not measured.
-    memory_mb : float
-        Largest, of the process.
-    detectors : str
-        Their key in the store.
-    layout : ValveLayout
-    valves : mapping
-        Population -> what it is of.
-    training_volumes : int
-    spent : mapping
-        Part -> what it cost.
-    targets : mapping
-        Setting -> column of the table -> limit.
-    tested : Evaluation or None
-        None for a training alone.
-    measures : mapping
-        What runs are compared by.
-    model_file : ModelFile
+    ``detectors`` is their key in the store, ``seconds`` the CPU time of the training, 0 where it
+    was not measured. Targets are limits by setting and column of the table.
     """
 
     seconds: float

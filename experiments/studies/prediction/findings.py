@@ -16,25 +16,11 @@ __all__ = ["Findings", "MeshStress", "Observed", "Patient", "Predicted", "Scenar
 class Predicted:
     """A measure of one valve under one condition, in its own unit; None where it is not known.
 
-    Attributes
-    ----------
-    estimate : float
-        At the estimated parameters.
-    first_order_std : float or None
-        By the derivative of the closed shape.
-    mean, std, low, high : float or None
-        Of the samples, with the ends of their 95 % interval.
-    samples : int
-        That have it.
-    mesh_error : float or None
-        Standard deviation by the estimator's mesh.
-    wide_low, wide_high : float or None
-        95 % interval of samples and mesh.
-    truth_own_mesh, truth_same_mesh : float or None
-        Of the true parameters on the truth's mesh, and on that of the estimator.
-    inside_own_mesh, inside_same_mesh, inside_wide : bool or None
-        Whether the interval of the samples holds one and the other truth, and whether that of
-        samples and mesh holds the first.
+    It is known at the estimated parameters, with a standard deviation by the derivative of the
+    closed shape, and over the samples that have it (95 % from ``low`` to ``high``). ``mesh_error``
+    is a standard deviation by the estimator's mesh, and the wide interval is of samples and mesh.
+    The true parameters are on the truth's own mesh and on that of the estimator; whether the
+    interval of the samples holds one and the other, and the wide one the first, is ``inside_...``.
     """
 
     estimate: float
@@ -86,20 +72,10 @@ def _inside(low: float, true: float | None, high: float) -> bool | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """What is predicted under one condition; reasons are empty where there is none.
+    """What is predicted under one condition, by measure; reasons are empty where there is none.
 
-    Attributes
-    ----------
-    failure, truth_failure, finer_failure : str
-        Why there is no closed valve at the estimate, of the truth, on the finer mesh.
-    samples : int
-        That were tried.
-    failures : tuple of str
-        Reasons of those without a closed valve.
-    sampled : tuple of mapping
-        Measure -> value, of each sample.
-    measures : mapping
-        By name.
+    A valve may fail to close at the estimate, with the truth and on the finer mesh; ``failures``
+    are the reasons of samples, and ``sampled`` the measures of each.
     """
 
     failure: str
@@ -113,19 +89,9 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Patient:
-    """A simulated patient; no scenarios where there is no estimate.
+    """A simulated patient, with ``(p,)`` in units of the parameters and ``correlation (p, p)``.
 
-    Attributes
-    ----------
-    seed : int
-    truth : (p,)
-        In units of the parameters.
-    estimate, std, relative_error : (p,) or None
-    reason : str
-        Why the estimation ended.
-    correlation : (p, p) or None
-    scenarios : mapping
-        By name.
+    There are no scenarios where there is no estimate; ``reason`` is why the estimation ended.
     """
 
     seed: int
@@ -140,17 +106,9 @@ class Patient:
 
 @dataclass(frozen=True, slots=True)
 class MeshStress:
-    """Peak stress of the first patient as observed, on one mesh.
+    """Peak stress in MPa, by measure, of the first patient as observed, on one mesh.
 
-    Attributes
-    ----------
-    cells : (2,)
-        Around and along the leaflets.
-    gap_mm2 : float or None
-    stress : mapping
-        Measure -> MPa.
-    reason : str
-        Why it did not close; empty if it did.
+    The cells are around and along the leaflets; the reason is empty if the valve closed.
     """
 
     cells: tuple[int, ...]
@@ -161,17 +119,10 @@ class MeshStress:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observed:
-    """How patients were seen.
+    """How patients were seen: the truth's mesh, around and along, and errors of a coordinate.
 
-    Attributes
-    ----------
-    vertices : int
-    truth_cells : (2,)
-        Around and along.
-    truth_element : str
-    noise_mm, correlated_mm : float
-        Standard deviation of independent errors of a coordinate, and of those that are alike.
-    correlation_length_mm : float
+    ``noise_mm`` is of independent errors, ``correlated_mm`` of those that are alike over
+    ``correlation_length_mm``, all standard deviations.
     """
 
     vertices: int
@@ -184,23 +135,11 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for all patients.
+    """What follows for all patients; runs are compared by the estimate of the first.
 
-    Attributes
-    ----------
-    patients : tuple of Patient
-    estimate, std, relative_error : (p,) or None
-        Of the first patient, by which runs are compared.
-    scenarios : mapping
-        Name -> what a reader calls it.
-    stress_meshes : tuple of MeshStress
-    reach_mm : float
-        Distance of midsurfaces within which leaflets touch.
-    check_mesh : tuple of int
-        Cells of the mesh that shows the mesh's error; empty if there is none.
-    observed : Observed
-    measures : mapping
-        Measure -> what it means; empty where nothing was predicted.
+    ``scenarios`` and ``measures`` say what their names mean, the latter are empty where nothing was
+    predicted. Leaflets touch whose midsurfaces are nearer than ``reach_mm``. ``check_mesh (2,)``
+    are the cells of the mesh that shows the mesh's error, if there is one.
     """
 
     patients: tuple[Patient, ...]
