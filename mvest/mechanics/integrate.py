@@ -209,6 +209,7 @@ class _Stepper:
         self.last_only = False
         self.passing = False  # whether the steps now taken are not wanted for themselves
         self._pairs: ContactPairs | None = None
+        self._detect = False  # whether collisions are looked for whatever the distances
 
     def advance(self, state: _State, start: float, step: Step, records: list[StepRecord]) -> _State:
         """State at ``step.time``; halves the step where it fails."""
@@ -289,7 +290,14 @@ class _Stepper:
         solved = self._newton(state, loads, rate, mass_factor, push, move)
         contact = self.system.contact
         if contact is not None and contact.intersects(contact.points(solved.x)):
-            raise _StepError(StepReason.INTERSECTION)
+            if self._detect:
+                raise _StepError(StepReason.INTERSECTION)
+            # Neighbours have folded through each other, which only detection keeps them from.
+            self._detect = True
+            try:
+                return self._step(state, end, dt, static)
+            finally:
+                self._detect = False
         new_v = (solved.x - state.x) / dt if not static else np.zeros_like(state.v)
         strain = self.system.solid.law.strain(solved.evaluation.solid.green)
         advanced = 0.0 if static else dt
@@ -317,7 +325,7 @@ class _Stepper:
             factor = min(1.0, newton.largest_move / max(float(np.abs(move).max()), 1e-300))
             if system.contact is not None and pairs is not None:
                 y, dy = system.contact.points(x), system.contact.points(factor * move)
-                factor *= _largest_step(system.contact, pairs, y, dy)
+                factor *= _largest_step(system.contact, pairs, y, dy, detect=self._detect)
             x += factor * move
         if fixed.size:
             x[fixed] = loads.fixed
@@ -407,7 +415,7 @@ class _Stepper:
         factor = min(1.0, self.newton.largest_move / max(float(np.abs(d).max()), 1e-300))
         if contact is not None and pairs is not None:
             y, dy = contact.points(x), contact.points(d)
-            factor *= _largest_step(contact, pairs, y, factor * dy)
+            factor *= _largest_step(contact, pairs, y, factor * dy, detect=self._detect)
         if self.newton.single_solve:
             return x + factor * d, evaluate(x + factor * d)
         norm = float(np.linalg.norm(current.residual))
@@ -475,10 +483,12 @@ class _Stepper:
         )
 
 
-def _largest_step(contact: Contact, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> float:
+def _largest_step(
+    contact: Contact, pairs: ContactPairs, y: FloatArray, dy: FloatArray, *, detect: bool
+) -> float:
     """Share of the displacement ``dy`` that is free of collisions; a failed step where none is."""
     try:
-        return contact.largest_step(pairs, y, dy)
+        return contact.largest_step(pairs, y, dy, detect=detect)
     except MemoryError as error:
         # What iterates that have run away sweep over is more than there is room for.
         raise _StepError(StepReason.NO_CONVERGENCE) from error

@@ -21,6 +21,7 @@ from mvest.mechanics import (
     simulate,
     simulate_body,
 )
+from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
@@ -168,6 +169,31 @@ def test_an_expected_move_is_followed_as_far_as_contact_admits():
     assert -5.0 < expected.min() < -1e-3
     np.testing.assert_allclose(expected[expected < -1e-12], expected.min(), rtol=1e-9)
     np.testing.assert_allclose(again.frames[-1], closed.frames[-1], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_step_that_ends_intersecting_is_repeated_with_detection(monkeypatch, always):
+    true_step, true_intersects, detected = Contact.largest_step, Contact.intersects, []
+
+    def largest_step(self, pairs, y, dy, *, detect):
+        detected.append(detect)
+        return true_step(self, pairs, y, dy, detect=detect)
+
+    def intersects(self, y):
+        assert not true_intersects(self, y)
+        return always or not detected[-1]
+
+    monkeypatch.setattr(Contact, "largest_step", largest_step)
+    monkeypatch.setattr(Contact, "intersects", intersects)
+    system, loading = sandwich(cells=2, samples=11)
+    settings = NewtonSettings(max_halvings=0)
+    result = simulate(system, loading, [Step(0.1)], newton=settings)
+    assert detected[0] is False
+    assert detected[-1] is True
+    # Once, from the beginning of the step; what intersects in spite of it is not accepted.
+    assert np.count_nonzero(np.diff(detected)) == 1
+    reason = StepReason.INTERSECTION if always else StepReason.COMPLETED
+    assert result.reason is reason
 
 
 def test_a_run_that_cannot_converge_is_a_value():

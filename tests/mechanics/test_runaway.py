@@ -10,13 +10,13 @@ from tests.closure.test_model import AT, CLOSING, TINY, model_of
 
 
 class NoRoom:
-    def largest_step(self, pairs, y, dy):
+    def largest_step(self, pairs, y, dy, *, detect):
         raise MemoryError("std::bad_alloc")
 
 
 def test_collision_detection_without_room_is_a_failed_step():
     with pytest.raises(_StepError) as raised:
-        _largest_step(NoRoom(), None, np.zeros((1, 3)), np.ones((1, 3)))
+        _largest_step(NoRoom(), None, np.zeros((1, 3)), np.ones((1, 3)), detect=False)
     assert raised.value.reason is StepReason.NO_CONVERGENCE
 
 

@@ -3,11 +3,18 @@
 Its Hessian is compared with differences among the tangents of all loads.
 """
 
+import ipctk
 import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.contact import APPROACH, BARRIER, Contact, ContactPairs
+from mvest.mechanics.forces.contact import (
+    APPROACH,
+    BARRIER,
+    Contact,
+    ContactPairs,
+    _longest_edges,
+)
 from mvest.mechanics.forces.pair_search import NEIGHBOUR
 from mvest.mechanics.settings import ContactSettings
 from mvest.valve.mesh.embedding import Embedding
@@ -224,6 +231,119 @@ def test_a_step_takes_from_a_pair_at_most_its_share_of_the_way_to_the_barrier():
     after = np.linalg.norm(np.diff(y + factor * dy, axis=0)[0])
     assert after == pytest.approx(RB + (1 - APPROACH) * (1.4 - RB), rel=1e-6)
     assert contact.largest_step(pairs, y, -dy) == 1.0
+
+
+# -- proofs in place of collision detection --------------------------------------------------------
+def two_sheets(gap, spacing=0.7, points=9):
+    """Two flat sheets that were far apart at rest, with what lies between them."""
+    line = spacing * np.arange(points)
+    plane = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
+    lower = np.column_stack([plane, np.zeros(len(plane))])
+    upper = np.column_stack([plane + 0.3 * spacing, np.full(len(plane), gap)])
+    triangles = grid_triangles(points)
+    contact = contact_of(
+        np.concatenate([lower, upper + np.array([0, 0, FAR])]),
+        triangles=np.concatenate([triangles, triangles + len(plane)]),
+    )
+    return contact, np.concatenate([lower, upper]), np.repeat([0.0, 1.0], len(plane))
+
+
+@pytest.fixture
+def detections(monkeypatch):
+    """How often collisions were looked for."""
+    true, seen = ipctk.compute_collision_free_stepsize, []
+
+    def detect(*arguments, **options):
+        seen.append(1)
+        return true(*arguments, **options)
+
+    monkeypatch.setattr(ipctk, "compute_collision_free_stepsize", detect)
+    return seen
+
+
+def test_no_collision_is_looked_for_where_points_stay_apart(detections):
+    contact, y, upper = two_sheets(gap=1.6)
+    pairs = contact.search(y)
+    down = np.outer(upper, [0.0, 0.0, -0.4])
+    assert contact.largest_step(pairs, y, down) == 1.0
+    assert not detections
+    assert contact.largest_step(pairs, y, down, detect=True) == 1.0
+    assert len(detections) == 1
+
+
+@pytest.mark.parametrize(
+    ("spacing", "gap", "moved", "down"),
+    [(1.6, 1.4, 0.0, 0.1), (0.7, 6.0, 0.0, 2.0), (0.7, 1.6, 0.49, 0.4)],
+    ids=["long edges", "beyond the search", "long after the search"],
+)
+def test_collisions_are_looked_for_where_nothing_is_proved(detections, spacing, gap, moved, down):
+    contact, y, upper = two_sheets(gap, spacing)
+    pairs = contact.search(y)
+    y = y + np.outer(1 - upper, [moved, 0.0, 0.0])
+    assert not contact.stale(pairs, y)
+    contact.largest_step(pairs, y, np.outer(upper, [0.0, 0.0, -down]))
+    assert len(detections) == 1
+
+
+def test_nothing_is_proved_of_sheets_that_are_close_at_rest():
+    # Half a millimetre apart as at a commissure: the search leaves such pairs out at any distance.
+    contact, y, upper = two_sheets(gap=0.5)
+    close = contact_of(y, triangles=contact.triangles)
+    pairs = close.search(y)
+    distance = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
+    assert distance.min() > 0.7
+    assert not close._stays_apart(pairs, y, np.outer(upper, [0.0, 0.0, -0.1]))
+    # Neighbours in one sheet are as close, and nothing is asked of them.
+    y = y + np.outer(upper, [0.0, 0.0, 3.0])
+    assert close._stays_apart(close.search(y), y, np.outer(upper, [0.0, 0.0, -0.1]))
+
+
+def test_nothing_is_proved_of_a_meeting_half_way():
+    # One triangle goes by under the other; before and after they are two millimetres apart.
+    corner = np.array([[0.0, 0, 0], [0.7, 0, 0], [0, 0.7, 0]])
+    y = np.concatenate([corner, corner + np.array([2.5, 0, -0.5])])
+    triangles = np.array([[0, 1, 2], [3, 4, 5]])
+    contact = contact_of(
+        y + np.outer(np.repeat([0, 1], 3), [0, 0, FAR]), triangles=triangles, skin=20.0
+    )
+    pairs, aside = contact.search(y), np.outer(np.repeat([0, 1], 3), [-5.0, 0, 0])
+    assert not contact._stays_apart(pairs, y, aside)
+    assert contact._stays_apart(pairs, y - np.outer(np.repeat([0, 1], 3), [0, 0, 0.6]), aside)
+
+
+def test_edges_are_as_long_as_they_get_on_the_way():
+    random = np.random.default_rng(5)
+    y, move = random.normal(size=(2, 12, 3))
+    triangles = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7], [7, 8, 0]])
+    expected = np.zeros(12)
+    for t in np.linspace(0, 1, 11):
+        for triangle in triangles:
+            corners = (y + t * move)[triangle]
+            longest = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).max()
+            expected[triangle] = np.maximum(expected[triangle], longest)
+    np.testing.assert_allclose(_longest_edges(y, move, triangles), expected, rtol=1e-14)
+
+
+def test_what_is_proved_apart_is_free_of_collisions():
+    # Random states and moves; where distances prove that nothing meets, detection agrees. The
+    # points of a third are neighbours at rest but not in the sheet, as at a commissure.
+    random = np.random.default_rng(11)
+    proved = 0
+    for k in range(60):
+        contact, y, upper = two_sheets(gap=random.uniform(0.8, 3.0), points=6)
+        if k % 3 == 0:
+            rest = contact.rest - np.outer(upper, [0.0, 0.0, FAR - 0.5])
+            contact = contact_of(rest, triangles=contact.triangles)
+        y = y + random.normal(scale=0.05, size=y.shape)
+        pairs = contact.search(y)
+        move = random.uniform(0, 2) * np.outer(upper, random.uniform(-1, 1, 3))
+        move += random.normal(scale=0.1, size=y.shape)
+        if contact._stays_apart(pairs, y, move):
+            proved += 1
+            start, end = np.asfortranarray(y), np.asfortranarray(y + move)
+            mesh = contact._collision_mesh
+            assert ipctk.compute_collision_free_stepsize(mesh, start, end) == 1.0
+    assert proved > 5
 
 
 def crossed(height):
