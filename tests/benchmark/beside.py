@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 ONE_THREAD = {
     f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM")
 }
+OF_A_SWEEP = ("publish=false", "confirm=false", "figures=false", "measure=false")
 FARTHER = [1.3, 1 / 1.3]
 
 
@@ -82,10 +83,10 @@ MEASURED: dict[str, Callable[[], float]] = {
     "Table 1, command to end": lambda: command("experiment=table1"),
     "job of a sweep": lambda: command(
         "experiment=table1",
-        "publish=false",
+        *OF_A_SWEEP,
         "filter=iterated",
         "filter.initial=[4.1,2.7]",
-        first=("experiment=table1", "publish=false"),
+        first=("experiment=table1", *OF_A_SWEEP),
     ),
 }
 
