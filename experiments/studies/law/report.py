@@ -13,7 +13,7 @@ from experiments.common.record import Record
 from experiments.studies.law.findings import Findings
 from mvest.reporting.figures import COLOURS
 
-__all__ = ["biaxial_figure", "curves_figure", "law_table", "law_text", "law_words"]
+__all__ = ["biaxial_figure", "curves_figure", "law_answer", "law_table", "law_text", "law_words"]
 
 DIRECTIONS = ("along the fibres", "across the fibres")
 TRUTH, EXPONENTIAL, LINEAR = "black", COLOURS[0], COLOURS[1]
@@ -178,6 +178,25 @@ def _scatter(record: Record[Findings]) -> list[str]:
             f"{own.max():.3g} | {inside[k]} of {len(done)} |"
         )
     return lines
+
+
+def law_answer(record: Record[Findings]) -> str:
+    """What is known of the exponential law, and whether the data tell the laws apart."""
+    found = record.findings
+    misfits = ", ".join(
+        f"{fit.law} {fit.chi_square:.2f}" for fit in found.fits if fit.chi_square is not None
+    )
+    held = [
+        low <= truth <= high
+        for sample in found.samples
+        for low, truth, high in zip(sample.low, found.truth, sample.high, strict=True)
+    ]
+    low, high = found.chi_square_band or (float("nan"),) * 2
+    return (
+        f"One simulated closed frame fitted by two laws: χ² per coordinate {misfits} (a right "
+        f"model: {low:.2f} to {high:.2f}); {sum(held)} of {len(held)} intervals of the "
+        "exponential law hold the truth."
+    )
 
 
 def law_words(record: Record[Findings]) -> str:

@@ -13,7 +13,7 @@ from experiments.common.findings import rows, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.law.findings import (
     Band,
@@ -29,6 +29,7 @@ from experiments.studies.law.findings import (
 from experiments.studies.law.report import (
     biaxial_figure,
     curves_figure,
+    law_answer,
     law_table,
     law_text,
     law_words,
@@ -294,6 +295,7 @@ STUDY = Study(
                 "the exponential law, and with the linear law from the same data. Simulated.",
                 "law_biaxial": "The exponential law with the coefficients of excised leaflets.",
             },
+            answer=answer_of_main(law_answer),
         ),
     ),
 )

@@ -17,7 +17,7 @@ from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.markup import MISSING, markdown_rows, number
 from mvest.typing import FloatArray
 
-__all__ = ["models_figure", "models_table", "models_text"]
+__all__ = ["models_answer", "models_figure", "models_table", "models_text"]
 
 AGAINST = (
     "this project, the same elements",
@@ -106,6 +106,22 @@ def _words(record: Record[Findings]) -> str:
         "data. ± is one standard deviation. The estimates that belong to one set of data see the "
         "same numbers, so that what they differ by is the model."
     )
+
+
+def models_answer(record: Record[Findings]) -> str:
+    """How alike two codes are on the same elements, and what the model is worth in moduli."""
+    found = record.findings
+    alike = [row.hex27.max_mm for row in found.differences if row.hex27 is not None]
+    same = f"at most {max(alike):.1g} mm apart" if alike else "not compared"
+    own = {row.data: row.estimate for row in found.rows if row.model == row.data}
+    apart = [
+        abs(e / o - 1)
+        for row in found.rows
+        if row.converged and row.model != row.data and row.model in own
+        for e, o in zip(row.estimate, own[row.data], strict=True)
+    ]
+    moduli = f"; with other elements, moduli up to {100 * max(apart):.2g} % apart" if apart else ""
+    return f"Simulated sheet in two finite-element codes, the same elements: {same}{moduli}."
 
 
 def models_text(record: Record[Findings]) -> str:

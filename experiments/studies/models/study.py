@@ -18,10 +18,15 @@ from experiments.common.build import build_filter
 from experiments.common.findings import rows, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
 from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.models.findings import Apart, Difference, Findings, Row
-from experiments.studies.models.report import models_figure, models_table, models_text
+from experiments.studies.models.report import (
+    models_answer,
+    models_figure,
+    models_table,
+    models_text,
+)
 from experiments.studies.models.settings import ModelsSettings, Settings
 from experiments.studies.models.sheet.own import OwnSheet
 from experiments.studies.models.sheet.second import SecondSheet
@@ -217,6 +222,7 @@ STUDY = Study(
                 " iterate under each model, and how the codes differ on finer meshes. "
                 "Simulated."
             },
+            answer=answer_of_main(models_answer),
         ),
     ),
 )

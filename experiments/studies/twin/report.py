@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "frame",
+    "meshes_answer",
     "readable",
     "table1_answer",
     "text_table",
@@ -232,6 +233,20 @@ def _figures(iterates: Path, valve: Path, record: Twin, fields: Path | None) -> 
     if fields is not None:
         written += save_figure_with(valve, valve_figure(fields), record.line)
     return written
+
+
+def meshes_answer(records: Mapping[str, Twin]) -> str:
+    """How much moduli depend on the estimator's mesh."""
+    errors = [
+        abs(error)
+        for record in records.values()
+        for error in record.findings.first.relative_error or ()
+        if error is not None
+    ]
+    return (
+        f"Estimated on {len(records)} meshes from one simulated truth on another, moduli are up "
+        f"to {100 * max(errors):.2g} % off."
+    )
 
 
 def table1_answer(records: Mapping[str, Twin]) -> str:

@@ -28,6 +28,7 @@ from experiments.common.record import Mesh, Outcome
 from experiments.common.study import Job, Section, Study
 from experiments.studies.twin.findings import Findings
 from experiments.studies.twin.report import (
+    meshes_answer,
     table1_answer,
     text_table,
     write_twin,
@@ -232,6 +233,11 @@ STUDY = Study(
             headline=True,
             opens="table1_valve",
         ),
-        Section("mesh_independence", title="Independence of the mesh", validation=True),
+        Section(
+            "mesh_independence",
+            title="Independence of the mesh",
+            validation=True,
+            answer=meshes_answer,
+        ),
     ),
 )
