@@ -6,18 +6,21 @@ options and no content.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import median
 
-import yaml
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
+from experiments.common.cases.findings import Findings as OfPatients
+from experiments.common.cases.skill import median_errors
+from experiments.results.keep import records_of
+from experiments.studies.imaged_patient.findings import Findings as OfVolumes
+from experiments.studies.imaged_patient.report import answered_of_volumes
+from experiments.studies.patient.report import answered_of_patients
 from mvest.mechanics.parameters import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -73,43 +76,22 @@ def sweep_list() -> str:
 
 def guess_comparison() -> str:
     """Median errors of estimates, and of guessing the generic moduli for everybody."""
-    nuisances = ROOT / "conf" / "personal" / "nuisances.yaml"
-    unknowns = yaml.safe_load(nuisances.read_text(encoding="utf-8"))["unknowns"]
-    generic = {
-        leaflet: float(unknowns[f"E_f.{leaflet}"]["mean"]) for leaflet in ("anterior", "posterior")
-    }
-
-    def row(title: str, found: list[tuple[str, float, float]]) -> list[str]:
-        """One row; ``found`` are leaflets with their true and estimated modulus."""
-        cells = [title]
-        for wanted in (("anterior",), ("posterior",), tuple(generic)):
-            some = [(name, true, value) for name, true, value in found if name in wanted]
-            estimate = median(abs(value / true - 1) for _, true, value in some)
-            guess = median(abs(generic[name] / true - 1) for name, true, _ in some)
-            cells.append(f"{100 * estimate:.1f} / {100 * guess:.1f}")
-        return cells
-
-    drawn = [
-        (line["name"].removeprefix("E_f."), float(line["truth"]), float(line["estimate"]))
-        for line in read_csv("population")
-        if line["name"].startswith("E_f.") and line["estimation"] == "with nuisances"
-    ]
-    imaged = [
-        (line["modulus"], float(line["truth [MPa]"]), float(line["estimate [MPa]"]))
-        for line in read_csv("volume")
-    ]
-    head = ["median size of the error: estimate / generic guess (%)", *generic, "both"]
-    rows = [
-        row(f"known geometry, {len(drawn) // 2} virtual patients", drawn),
-        row(f"simulated volumes, {len(imaged) // 2} virtual patients", imaged),
-    ]
+    leaflets = ("anterior", "posterior")
+    rows = []
+    results = ROOT / "results"
+    for title, records, answered in (
+        ("known geometry", records_of(results, "population", OfPatients), answered_of_patients),
+        ("simulated volumes", records_of(results, "volume", OfVolumes), answered_of_volumes),
+    ):
+        moduli = answered(records.values())
+        cells = [f"{title}, {len(records)} virtual patients"]
+        for wanted in ((leaflets[0],), (leaflets[1],), leaflets):
+            errors = median_errors([one for one in moduli if one.leaflet in wanted])
+            assert errors is not None
+            cells.append(f"{100 * errors[0]:.1f} / {100 * errors[1]:.1f}")
+        rows.append(cells)
+    head = ["median size of the error: estimate / generic guess (%)", *leaflets, "both"]
     return markdown(head, rows)
-
-
-def read_csv(name: str) -> list[dict[str, str]]:
-    """The rows of a table of ``results/``, its comments left out."""
-    lines = (ROOT / "results" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
-    return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
 def directive(table: Callable[[], str]) -> type[SphinxDirective]:

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
-
 import numpy as np
 
 from experiments.common.estimates import (
-    Confounded,
     EstimatedModulus,
     Identified,
     Innovation,
@@ -20,84 +14,20 @@ from experiments.common.estimates import (
 from experiments.common.findings import Vector, finite, rows, vector
 from mvest.estimation.estimate import Estimate
 from mvest.problem.estimate import StudyResult
-from mvest.provenance import provenance
-from mvest.reporting.expectation import confounded_record
+from mvest.reporting.expectation import alike
+from mvest.reporting.findings import spread
 from mvest.typing import FloatArray
 
 __all__ = [
     "identified_of",
     "innovation_of",
-    "make_record",
     "moduli_error",
     "moduli_of",
     "seed_run",
-    "spread",
 ]
 
-SCHEMA = 1
-"""Version of the layout of ``result.json``."""
 
-Values = Mapping[str, Any]
-
-
-def make_record(
-    result: StudyResult,
-    config: Values,
-    *,
-    config_hash: str,
-    meshes: Mapping[str, Any],
-    closure: Mapping[str, Any] | None,
-    truth_values: FloatArray | None,
-    started: float,
-) -> dict[str, Any]:
-    """Plain data of a finished run, failed or not.
-
-    Values that do not exist are None. Lists of parameters are in the order of ``parameters``;
-    relative errors are signed parts of the truth.
-    """
-    run = asdict(seed_run(config["seed"], result))
-    innovation, identified = innovation_of(result.filtered), identified_of(result)
-    error = moduli_error(result)
-    kept = ("status", "reason", "detail", "estimate", "std", "relative_error", "distance_mm",
-            "distance_to_truth_mm", "iterates", "iterate_std", "seconds")  # fmt: skip
-    return {
-        "schema": SCHEMA,
-        "experiment": config["name"],
-        "title": config["title"],
-        "row": config["row"],
-        "table": config["table"],
-        "paper": config["paper"],
-        "parameters": list(result.parameters),
-        "truth": _known(truth_values),
-        "initial": list(config["filter"]["initial"]),
-        **{name: run[name] for name in kept},
-        "moduli": [asdict(modulus) for modulus in moduli_of(result)],
-        "moduli_error_percent": None if error is None else asdict(error),
-        "closure": None if closure is None else dict(closure),
-        "iterations": run["iterations"] or 0,
-        "forward_solves": run["forward_solves"] or 0,
-        "seconds_total": time.time() - started,
-        "innovation": None if innovation is None else asdict(innovation),
-        "identifiability": None if identified is None else asdict(identified),
-        "mesh": dict(meshes),
-        "model": {
-            "element": config["mechanics"]["element"],
-            "cells": [config["mesh"][key] for key in ("columns", "rows", "layers")],
-            "source": config["mesh"]["source"],
-            "filter": config["filter"]["mode"],
-            "noise_mm": config["observation"]["noise_mm"],
-        },
-        "provenance": {
-            **provenance(),
-            "config_hash": config_hash,
-            "mesh_hash": meshes["sha256"],
-            "seed": config["seed"],
-            "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        },
-    }
-
-
-def seed_run(seed: int, result: StudyResult) -> SeedRun:
+def seed_run(seed: int | None, result: StudyResult) -> SeedRun:
     """The estimate from one seed."""
     filtered = result.filtered
     innovation, identified = innovation_of(result.filtered), identified_of(result)
@@ -124,17 +54,6 @@ def seed_run(seed: int, result: StudyResult) -> SeedRun:
 
 def _known(values: FloatArray | None) -> Vector | None:
     return None if values is None else vector(values)
-
-
-def spread(values: FloatArray | None) -> Spread | None:
-    """Mean, standard deviation and largest of what is finite; None where nothing is."""
-    if values is None:
-        return None
-    # A vertex that is not seen has no distance.
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return None
-    return Spread(float(values.mean()), float(values.std()), float(values.max()))
 
 
 def moduli_of(result: StudyResult) -> tuple[EstimatedModulus, ...]:
@@ -168,13 +87,5 @@ def identified_of(result: StudyResult) -> Identified | None:
         tuple(map(finite, known.std)),
         finite(known.condition_number),
         tuple(known.flat()),
-        tuple(
-            Confounded(
-                tuple(group["parameters"]),
-                tuple(group["changes"]),
-                tuple(group["relative"]),
-                group["correlation"],
-            )
-            for group in confounded_record(known)
-        ),
+        alike(known),
     )

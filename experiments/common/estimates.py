@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
+from mvest.reporting.findings import Identified, Innovation, Spread
 
-__all__ = ["Confounded", "Data", "EstimatedModulus", "Identified", "Innovation", "Paper", "SeedRun",
-           "Spread"]  # fmt: skip
+__all__ = ["Data", "EstimatedModulus", "Identified", "Innovation", "Paper", "SeedRun", "Spread"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +34,6 @@ class Paper:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """Mean, standard deviation and largest of some values."""
-
-    mean: float
-    std: float
-    max: float
-
-
-@dataclass(frozen=True, slots=True)
 class EstimatedModulus:
     """One modulus of a leaflet in MPa, estimated or following from one that is."""
 
@@ -52,46 +43,6 @@ class EstimatedModulus:
     std: float | None
     truth: float | None = None
     relative_error: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Innovation:
-    """What of the ``size`` numbers observed the first prediction leaves over, in their unit.
-
-    ``nis`` is the normalised innovation squared; 95 % of such values lie in ``nis_band``.
-    """
-
-    size: int
-    rms: float
-    max_abs: float
-    nis: float
-    nis_band: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Confounded:
-    """Parameters ``(g,)`` that the data hardly tell apart, and changes of them that hardly show.
-
-    Changes ``(g,)`` are in units of the parameters, and relative to their scales.
-    """
-
-    parameters: tuple[str, ...]
-    changes: Vector
-    relative: Vector
-    correlation: float
-
-
-@dataclass(frozen=True, slots=True)
-class Identified:
-    """What the data alone could tell at best: the Cramér-Rao bound ``(p,)``.
-
-    None where they determine a parameter not at all; ``flat`` are combinations known badly.
-    """
-
-    cramer_rao_std: tuple[float | None, ...]
-    condition_number: float | None
-    flat: tuple[str, ...]
-    confounded: tuple[Confounded, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

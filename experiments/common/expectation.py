@@ -98,12 +98,13 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     MvestError
         If the case is not in order.
     """
-    from experiments.common.cases.own_case import read_configured, settings_of
+    from experiments.common.cases.own_case import meshes_of, read_configured, settings_of
+    from experiments.common.cases.settings import PersonalSettings
 
-    case, settings = read_configured(config), settings_of(config)
-    store = Path(config["paths"]["outputs"]) / "meshes"
+    case = read_configured(config["case"])
+    settings = settings_of(config, build(PersonalSettings, config["personal"]))
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        expected = expect_case(case, settings, store=store, on_step=bar.step)
+        expected = expect_case(case, settings, store=meshes_of(config), on_step=bar.step)
     uncertainty = case.uncertainty
     length = uncertainty.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"

@@ -149,6 +149,10 @@ class Outcome(Generic[F]):
         Why it ended.
     mesh : Mesh or None
     forward_solves : int
+    row : str
+    parameters : tuple of str
+    model : Model or None
+        As in `Record`, where the data say them and not the configuration.
     """
 
     findings: F
@@ -157,6 +161,9 @@ class Outcome(Generic[F]):
     detail: str = ""
     mesh: Mesh | None = None
     forward_solves: int = 0
+    row: str = ""
+    parameters: tuple[str, ...] = ()
+    model: Model | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,16 +257,16 @@ def stamp(
         study=values["study"],
         experiment=values["name"],
         title=values["title"],
-        row=values["row"],
+        row=outcome.row or values["row"],
         table=values["table"],
         status=outcome.status,
         reason=outcome.reason,
         detail=outcome.detail,
-        parameters=tuple(values["parameters"]),
+        parameters=outcome.parameters or tuple(values["parameters"]),
         factors=dict(values["factors"]),
         seconds_total=time.time() - started,
         forward_solves=outcome.forward_solves,
-        model=model_of_values(values),
+        model=outcome.model or model_of_values(values),
         mesh=outcome.mesh,
         provenance=here_and_now(
             config_hash, "none" if outcome.mesh is None else outcome.mesh.sha256, values["seed"]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.information.identifiability import Confounded, Identifiability
+from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.transform import Transform
+from mvest.reporting.findings import Alike
 from mvest.reporting.markup import MISSING, number
 from mvest.typing import FloatArray
 
-__all__ = ["alike_words", "confounded_record", "confounded_words", "expectation_text"]
+__all__ = ["alike", "alike_words", "confounded_words", "expectation_text"]
 
 STEP = 0.1
 """Change by which it is shown how parameters make up for each other, in parts of a scale."""
@@ -90,51 +90,48 @@ def expectation_text(
 
 def confounded_words(data: Identifiability) -> list[str]:
     """One sentence for each group of parameters that the data hardly tell apart."""
-    return [alike_words(group) for group in confounded_record(data)]
+    return [alike_words(group) for group in alike(data)]
 
 
-def confounded_record(data: Identifiability) -> list[dict[str, Any]]:
-    """The same as plain data, for a record: parameters and a change of each that hardly shows.
+def alike(data: Identifiability) -> tuple[Alike, ...]:
+    """Parameters that the data hardly tell apart, and a change of each that hardly shows.
 
-    Changes are in the parameters' own units, for a change of the first by a tenth of its scale.
+    For a change of the first by a tenth of its scale.
     """
-    return [_plain(group, data) for group in data.confounded()]
+    return tuple(
+        Alike(
+            group.names,
+            tuple(
+                STEP * exchange * float(data.scale[data.names.index(name)])
+                for name, exchange in zip(group.names, group.exchange, strict=True)
+            ),
+            tuple(STEP * exchange for exchange in group.exchange),
+            group.correlation,
+        )
+        for group in data.confounded()
+    )
 
 
-def _plain(group: Confounded, data: Identifiability) -> dict[str, Any]:
-    at = [data.names.index(name) for name in group.names]
-    return {
-        "parameters": list(group.names),
-        "changes": [
-            STEP * exchange * float(data.scale[k])
-            for exchange, k in zip(group.exchange, at, strict=True)
-        ],
-        "relative": [STEP * exchange for exchange in group.exchange],
-        "correlation": group.correlation,
-    }
-
-
-def alike_words(group: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> str:
+def alike_words(group: Alike, labels: Mapping[str, str] | None = None) -> str:
     """``The data hardly tell apart A and B: +10 % of A with −5 % of B looks almost the same``.
 
     Parameters
     ----------
-    group : mapping
-        Of `confounded_record`.
+    group : Alike
     labels : mapping, optional
         What parameters are called.
     """
-    names: Sequence[str] = group["parameters"]
+    names = group.parameters
     labelled = [(labels or {}).get(name, name) for name in names]
     moved = [
         f"{_change(name, change, relative)} of {label}"
         for name, label, change, relative in zip(
-            names, labelled, group["changes"], group["relative"], strict=True
+            names, labelled, group.changes, group.relative, strict=True
         )
     ]
     return (
         f"The data hardly tell apart {_listed(labelled)} (correlations of at least "
-        f"{np.floor(1000 * group['correlation']) / 1000:.3g}): {moved[0]} with "
+        f"{np.floor(1000 * group.correlation) / 1000:.3g}): {moved[0]} with "
         f"{_listed(moved[1:])} looks almost the same."
     )
 

@@ -6,7 +6,7 @@ also distinguished by its marker. Nothing touches matplotlib's global state or n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reporting.files import provenance_line
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -25,7 +24,6 @@ __all__ = [
     "LEAFLET_COLOURS",
     "MARKERS",
     "iterates_figure",
-    "save_figure",
     "save_figure_with",
     "valve_figure",
 ]
@@ -137,17 +135,6 @@ def valve_figure(fields: Path) -> Figure:
     bar = figure.colorbar(shown, ax=[axes[1], axes[3]], shrink=0.6, pad=0.02)
     bar.set_label(f"distance, fitted to observed [{unit}]")
     return figure
-
-
-def save_figure(base: Path, figure: Figure, record: Mapping[str, Any]) -> list[Path]:
-    """Write ``base.png`` and ``base.pdf`` with the provenance in print and in their metadata.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
-    """
-    return save_figure_with(base, figure, provenance_line(record))
 
 
 def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:

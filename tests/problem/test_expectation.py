@@ -9,7 +9,7 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
 from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
-from mvest.reporting.expectation import alike_words, confounded_record, expectation_text
+from mvest.reporting.expectation import alike, alike_words, expectation_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")
 TRUTH = np.array([6.0, 2.0, 1.0])
@@ -77,9 +77,9 @@ def test_the_text_names_what_is_told_badly_and_how_it_hides():
     assert text.count("+10 % of") == 3
     assert "Known badly from the data alone" in text
     assert text.endswith("No estimation was run.")
-    (group,) = confounded_record(found.data)
-    assert sorted(group["parameters"]) == sorted(NAMES)
-    change = dict(zip(group["parameters"], group["changes"], strict=True))
+    (group,) = alike(found.data)
+    assert sorted(group.parameters) == sorted(NAMES)
+    change = dict(zip(group.parameters, group.changes, strict=True))
     assert change == pytest.approx(
         {"E_f.anterior": 0.6, "E_f.posterior": 0.2, "pressure_scale": 0.1}, rel=0.02
     )

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.reporting.figures import iterates_figure, save_figure, valve_figure
+from mvest.reporting.figures import iterates_figure, save_figure_with, valve_figure
 from tests.reporting.records import failed_record, record
+
+LINE = "table1: mvest 0.1.0, commit 0123456789ab, configuration cdcdcdcdcdcd, seed 1"
 
 
 @pytest.fixture
@@ -90,7 +92,7 @@ def test_missing_or_damaged_fields_are_named(tmp_path) -> None:
 def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
     names = []
     for base in ("a", "b"):
-        names.append(save_figure(tmp_path / base, drawn(record()), record()))
+        names.append(save_figure_with(tmp_path / base, drawn(record()), LINE))
     for first, second in zip(*names, strict=True):
         assert first.read_bytes() == second.read_bytes()
     assert [path.suffix for path in names[0]] == [".png", ".pdf"]
@@ -101,4 +103,4 @@ def test_files_are_reproducible_and_say_where_they_come_from(tmp_path) -> None:
 def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
-        save_figure(tmp_path / "file" / "a", drawn(record()), record())
+        save_figure_with(tmp_path / "file" / "a", drawn(record()), LINE)

@@ -14,19 +14,24 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 import experiments
-from experiments.common.cases.own_case import run_case
+from experiments.common.cases.findings import Findings
+from experiments.common.cases.own_case import read_configured, run_case
+from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.cases.volume import run_volume
-from experiments.common.config import register
+from experiments.common.record import Outcome, read_data
+from experiments.common.schema import build
 from mvest.errors import InputError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
 
-__all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "seal"]
+__all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "read_estimate", "seal"]
 
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
@@ -59,15 +64,14 @@ def seal(folder: Path) -> None:
 
 
 def estimate_blindly(
-    values: Mapping[str, Any], config_hash: str, folder: Path, case: Path, sealed: Path
-) -> dict[str, Any]:
-    """Personalise a case, or what is found in a volume, in a process apart: its record.
+    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
+) -> Outcome[Findings]:
+    """Personalise a case, or the valve in a volume, in a process apart.
 
     Parameters
     ----------
     values : mapping
         The configuration; what describes the patient is left out.
-    config_hash : str
     folder : Path
         Output folder of the job, which exists.
     case : Path
@@ -78,12 +82,11 @@ def estimate_blindly(
     Raises
     ------
     InputError
-        If the process left no record; the message ends with its last words.
+        If the process left no outcome; the message ends with its last words.
     """
     given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
         "values": {k: v for k, v in values.items() if k not in SECRET} | given,
-        "config_hash": config_hash,
         "folder": str(folder),
         "sealed": str(sealed),
     }
@@ -108,7 +111,18 @@ def estimate_blindly(
     if ended.returncode or not path.is_file():
         last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
         raise InputError(f"the estimation of {case} left no result: {last.removeprefix('error: ')}")
-    return dict(json.loads(path.read_text(encoding="utf-8")))
+    return read_estimate(folder)
+
+
+def read_estimate(folder: Path) -> Outcome[Findings]:
+    """What the process left in the output folder.
+
+    Raises
+    ------
+    InputError
+        If it left nothing.
+    """
+    return TypeAdapter(Outcome[Findings]).validate_python(read_data(folder / ESTIMATE))
 
 
 def main() -> int:
@@ -118,13 +132,16 @@ def main() -> int:
     request = json.load(sys.stdin)
     folder = Path(request["folder"])
     seal(Path(request["sealed"]))
-    register()
-    # The case says what it is; nothing here does.
-    values = request["values"] | {"seed": None, "parameters": [], "row": None}
+    values = request["values"]
     try:
-        run = run_case if values.get("volume") is None else run_volume
-        record, _ = run(values, request["config_hash"], folder, time.time())
-        write_json(folder / ESTIMATE, record)
+        if values.get("volume") is None:
+            case = read_configured(values["case"])
+            outcome = run_case(values, build(PersonalSettings, values["personal"]), case, folder)
+        else:
+            personal = build(PersonalSettings, values["personal"])
+            imaged = build(ImagedSettings, values["imaged"])
+            outcome = run_volume(values, values["volume"], imaged, personal, folder)
+        write_json(folder / ESTIMATE, asdict(outcome))
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""A case from its folder to its moduli, its record and its report."""
+"""A case from its folder to its moduli."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import mechanics_of
-from experiments.common.cases.record import case_record, fields_of
+from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar
-from experiments.common.schema import build
+from experiments.common.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError
 from mvest.personalise.chain import personalise_case
 from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
+from mvest.reporting.case.findings import ImageStep
 
-__all__ = [
-    "read_configured",
-    "run_case",
-    "settings_of",
-]
+__all__ = ["FIELDS", "meshes_of", "read_configured", "run_case", "settings_of"]
 
 Values = Mapping[str, Any]
+
+FIELDS = "fields.npz"
+"""Arrays of the report, in the folder of a run."""
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
 
 
-def settings_of(config: Values) -> PersonaliseSettings:
+def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettings:
     """How the configuration wants a case to be personalised.
 
     Raises
@@ -41,7 +41,6 @@ def settings_of(config: Values) -> PersonaliseSettings:
     MvestError
         If a setting is inadmissible.
     """
-    personal = build(PersonalSettings, config["personal"])
     known = [treatment.value for treatment in Treatment]
     unknowns = []
     for name, about in personal.unknowns.items():
@@ -53,7 +52,7 @@ def settings_of(config: Values) -> PersonaliseSettings:
         unknowns.append(Unknown(name, about.mean, about.std, Treatment(about.treatment)))
     return PersonaliseSettings(
         tuple(unknowns),
-        mechanics_of(config),
+        mechanics_of(values),
         personal.mesh,
         personal.tolerance,
         personal.max_iterations,
@@ -65,50 +64,44 @@ def settings_of(config: Values) -> PersonaliseSettings:
     )
 
 
-def read_configured(config: Values) -> ValveCase:
-    """The case that the configuration names."""
-    if config["case"] is None:
+def read_configured(place: str | None) -> ValveCase:
+    """The case that a configuration names."""
+    if place is None:
         raise ConfigurationError(
             "case is not given; expected case=FOLDER, a folder with case.yaml; "
             "mvest/cases/README.md says what it holds"
         )
-    return read_case(Path(config["case"]))
+    return read_case(Path(place))
+
+
+def meshes_of(values: Values) -> Path:
+    """Where meshes are kept."""
+    return Path(values["paths"]["outputs"]) / "meshes"
 
 
 def run_case(
-    config: Values,
-    config_hash: str,
+    values: Values,
+    personal: PersonalSettings,
+    case: ValveCase,
     folder: Path,
-    started: float,
-    about: Values | None = None,
-) -> tuple[dict[str, Any], list[Path]]:
-    """Read a case and personalise it: its record; fields and report are written.
-
-    ``about`` is added to the record, before the report is.
-    """
-    from mvest.reporting.case.report import write_case_report
-
-    fields = folder / "fields.npz"
+    image_step: ImageStep | None = None,
+) -> Outcome[Findings]:
+    """Personalise a case; its arrays are written to ``folder``."""
+    fields = folder / FIELDS
     # Of an earlier run: there are none where no estimate is reached now.
     fields.unlink(missing_ok=True)
-    case = read_configured(config)
     for sentence in case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
-    settings = settings_of(config)
+    settings = settings_of(values, personal)
     steps = len(settings.mechanics.protocol.steps())
-    store = Path(config["paths"]["outputs"]) / "meshes"
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
     # As they are estimated: those of the closure first.
     names = sorted(free, key=lambda name: name in REGISTRATION)
     with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
-        personalised = personalise_case(
-            case, settings, store=store, on_step=bar.step, on_iterate=bar.iterate
+        fit = personalise_case(
+            case, settings, store=meshes_of(values), on_step=bar.step, on_iterate=bar.iterate
         )
-    record = {**case_record(config, personalised, config_hash, started), **(about or {})}
-    files: list[Path] = []
-    if personalised.distances:
-        np.savez_compressed(fields, **fields_of(personalised))
-        files.append(fields)
-        if config["figures"]:
-            files += write_case_report(folder, {**record, "parameters": record["unknowns"]}, fields)
-    return record, files
+    if fit.distances:
+        np.savez_compressed(fields, **fields_of(fit))
+    shown = {key: dict(values[key]) for key in ("personal", "mechanics")}
+    return outcome_of_case(fit, shown, image_step)

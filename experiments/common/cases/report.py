@@ -1,56 +1,103 @@
-"""Text and table of a case and of a virtual patient."""
+"""Text, table and page of a case and of a virtual patient."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from experiments.common.cases.findings import Findings
+from experiments.common.cases.own_case import FIELDS
+from experiments.common.record import Record
 from mvest.files import write_atomically
+from mvest.reporting.case.findings import CaseFindings, FrameDistances, UnknownRow
 from mvest.reporting.markup import MISSING, number
 
-__all__ = ["case_text", "interval_words", "write_case_tables"]
+__all__ = [
+    "case_text",
+    "estimation_text",
+    "interval_words",
+    "write_case",
+    "write_case_run",
+    "write_cases",
+]
 
-Record = Mapping[str, Any]
 
-
-def case_text(record: Record) -> str:
+def case_text(record: Record[Findings]) -> str:
     """What a finished case says on the terminal."""
-    lines = [f"{record['case']['name']}: {record['reason']}"]
-    for row in record["unknowns"]:
+    case = record.findings.case
+    title = f"{case.about.name}: {record.reason}"
+    return estimation_text(title, case.unknowns, case.distances)
+
+
+def estimation_text(
+    title: str, unknowns: Sequence[UnknownRow], distances: Sequence[FrameDistances]
+) -> str:
+    """Unknowns and distances, a line each."""
+    lines = [title]
+    for row in unknowns:
+        value = f"  {row.label:28s} {interval_words(row)} {row.unit}".rstrip()
+        truth = "" if row.truth is None else f"  (hidden truth {number(row.truth)})"
+        lines.append(value + truth)
+    for one in distances:
         lines.append(
-            f"  {row['label']:28s} {interval_words(row)} {row['unit']}".rstrip() + _truth(row)
-        )
-    for row in record["distances"]:
-        lines.append(
-            f"  frame {row['frame']}{'' if row['seen'] else ' (not shown to the filter)'}: "
-            f"{row['generic']['mean']:.2f} mm generic, {row['registered']['mean']:.2f} registered, "
-            f"{row['personalised']['mean']:.2f} personalised"
+            f"  frame {one.frame}{'' if one.seen else ' (not shown to the filter)'}: "
+            f"{one.generic.mean:.2f} mm generic, {one.registered.mean:.2f} registered, "
+            f"{one.personalised.mean:.2f} personalised"
         )
     return "\n".join(lines)
 
 
-def interval_words(row: Mapping[str, Any]) -> str:
+class Interval(Protocol):
+    """An estimate with its 95 % interval, and whether that contains the truth."""
+
+    @property
+    def estimate(self) -> float | None: ...
+    @property
+    def low(self) -> float | None: ...
+    @property
+    def high(self) -> float | None: ...
+    @property
+    def inside(self) -> bool | None: ...
+
+
+def interval_words(row: Interval) -> str:
     """Estimate and interval of an unknown, crossed if the truth is not in it."""
-    if row["estimate"] is None:
+    if row.estimate is None:
         return MISSING
-    outside = " ✗" if row.get("inside") is False else ""
-    return f"{number(row['estimate'])} ({number(row['low'])} to {number(row['high'])}){outside}"
+    outside = " ✗" if row.inside is False else ""
+    return f"{number(row.estimate)} ({number(row.low)} to {number(row.high)}){outside}"
 
 
-def _truth(row: Mapping[str, Any]) -> str:
-    return "" if row["truth"] is None else f"  (hidden truth {number(row['truth'])})"
+def write_cases(
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
+) -> list[Path]:
+    """Table and page of each case."""
+    return [path for record in records.values() for path in write_case_run(folder, record)]
 
 
-def write_case_tables(folder: Path, record: Record) -> list[Path]:
-    """``unknowns.csv`` of one case."""
+def write_case_run(folder: Path, record: Record[Findings]) -> list[Path]:
+    """``unknowns.csv`` of a case, and its page where its run left arrays."""
+    return write_case(folder, record.findings.case, record)
+
+
+def write_case(folder: Path, case: CaseFindings, record: Record[Any]) -> list[Path]:
+    """The same of findings that are not the record's own."""
     import pandas as pd
 
-    rows = [{key: row.get(key) for key in UNKNOWN_COLUMNS} for row in record["unknowns"]]
-    return [write_atomically(folder / "unknowns.csv", pd.DataFrame(rows).to_csv(index=False))]
+    from mvest.reporting.case.report import write_case_report
+
+    rows = pd.DataFrame([asdict(row) for row in case.unknowns], columns=UNKNOWN_COLUMNS)
+    written = [write_atomically(folder / "unknowns.csv", rows.to_csv(index=False))]
+    fields = folder / FIELDS
+    if fields.is_file():
+        source = asdict(record.provenance)
+        written += write_case_report(folder, case, fields, record.line, source)
+    return written
 
 
-UNKNOWN_COLUMNS = (
+UNKNOWN_COLUMNS = [
     "name", "unit", "treatment", "prior_mean", "prior_std", "estimate", "std", "low", "high",
     "truth",
-)  # fmt: skip
+]  # fmt: skip

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mvest.personalise.settings import CaseMesh, PaperSettings
-from mvest.simulation.virtual_patient import Deviations, PatientSimulation
 
-__all__ = ["ImagedSettings", "PatientSettings", "PersonalSettings", "UnknownSettings"]
+__all__ = ["ImagedSettings", "PersonalSettings", "UnknownSettings"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,18 +59,3 @@ class ImagedSettings:
     source: str = ""
     licence: str = ""
     simulated: bool = False  # does the volume come from a simulation
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PatientSettings:
-    """A virtual patient. Nothing of it reaches the estimator but the case that it writes."""
-
-    name: str
-    description: str
-    moduli: dict[str, float] = field(default_factory=dict)  # MPa
-    moduli_spread: float = 0.0  # SD of the logarithm by which they are drawn about these
-    variation: float = 0.0  # size of the random variation of the anatomy; 0: as configured
-    simulation: PatientSimulation = field(default_factory=PatientSimulation)
-    deviations: Deviations = field(default_factory=Deviations)
-    paper_moduli: tuple[float, ...] = ()  # MPa, of the paper's patient
-    paper_distance_mm: tuple[float, ...] = ()  # generic, personalised

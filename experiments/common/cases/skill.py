@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-__all__ = ["Answered", "skill_words"]
+from mvest.reporting.case.findings import UnknownRow
+
+__all__ = ["Answered", "median_errors", "skill_words"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +17,7 @@ class Answered:
 
     Attributes
     ----------
+    leaflet : str
     truth : float
     estimate, low, high : float or None
         With its 95 % interval; None where a run ended without an estimate.
@@ -22,26 +25,38 @@ class Answered:
         The value of the literature, which is what is said of a valve without an estimation.
     """
 
+    leaflet: str
     truth: float
     estimate: float | None
     low: float | None
     high: float | None
     generic: float
 
+    @classmethod
+    def of(cls, row: UnknownRow) -> Answered:
+        """A modulus whose truth was revealed."""
+        assert row.truth is not None
+        leaflet = row.name.partition(".")[2]
+        return cls(leaflet, row.truth, row.estimate, row.low, row.high, row.prior_mean)
 
-def skill_words(moduli: Iterable[Answered]) -> str:
+
+def median_errors(moduli: Sequence[Answered]) -> tuple[float, float] | None:
+    """Median error of the estimates that there are, and of the generic guess for all, relative."""
+    errors = [abs(one.estimate / one.truth - 1) for one in moduli if one.estimate is not None]
+    guesses = [abs(one.generic / one.truth - 1) for one in moduli]
+    return (median(errors), median(guesses)) if errors else None
+
+
+def skill_words(moduli: Sequence[Answered]) -> str:
     """Coverage and median error, beside the error of the generic guess, runs lost included."""
-    asked = list(moduli)
-    estimated = [one for one in asked if one.estimate is not None]
+    lost = sum(one.estimate is None for one in moduli)
     inside = sum(
         one.low is not None and one.high is not None and one.low <= one.truth <= one.high
-        for one in estimated
+        for one in moduli
     )
-    text = f"{inside} of {len(asked)} moduli lie inside their 95 % intervals"
-    if estimated:
-        error = median(abs(one.estimate / one.truth - 1) for one in estimated if one.estimate)
-        guess = median(abs(one.generic / one.truth - 1) for one in asked)
-        text += f"; the median error is {100 * error:.1f} %, "
-        text += f"that of the generic guess {100 * guess:.1f} %"
-    lost = len(asked) - len(estimated)
+    text = f"{inside} of {len(moduli)} moduli lie inside their 95 % intervals"
+    errors = median_errors(moduli)
+    if errors:
+        text += f"; the median error is {100 * errors[0]:.1f} %, "
+        text += f"that of the generic guess {100 * errors[1]:.1f} %"
     return f"{text}; {lost} without an estimate." if lost else f"{text}."

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import run_case
-from experiments.common.cases.settings import ImagedSettings
+from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.progress import PartBar
-from experiments.common.schema import build
+from experiments.common.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.csv_files import read_numbers
+from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
@@ -28,7 +30,6 @@ from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import (
-    DetectionModel,
     default_model,
     load_model,
 )
@@ -38,6 +39,7 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["DetectedValve", "detect_in_volume", "run_volume", "write_image_step"]
@@ -73,30 +75,28 @@ class DetectedValve:
 
 
 def run_volume(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Find the valve of the configured volume and personalise it: its record, and the files."""
-    detected = detect_in_volume(config)
-    about = write_image_step(detected, folder)
-    for sentence in about["sentences"]:
+    values: Values,
+    file: str | None,
+    settings: ImagedSettings,
+    personal: PersonalSettings,
+    folder: Path,
+) -> Outcome[Findings]:
+    """Find the valve in the configured volume and personalise it."""
+    step = write_image_step(detect_in_volume(file, settings), folder)
+    for sentence in step.sentences:
         print(sentence, file=sys.stderr)
-    case = folder / CASE
-    record, files = run_case(
-        {**config, "case": str(case)}, config_hash, folder, started, {"image_step": about}
-    )
-    return record, files
+    return run_case(values, personal, read_case(folder / CASE), folder, step)
 
 
-def detect_in_volume(config: Values) -> DetectedValve:
-    """The valve of the configured volume, and the case that it makes.
+def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValve:
+    """The valve in the configured volume, and the case that it makes.
 
     Raises
     ------
     MvestError
         If the volume cannot be read, shows no valve, or the valve found makes no case.
     """
-    settings = build(ImagedSettings, config["imaged"])
-    if config["volume"] is None:
+    if file is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
     # What is asked for, before anything that takes long.
     by_hand = _landmarks(_pairs("landmarks", settings.landmarks, str))
@@ -104,7 +104,7 @@ def detect_in_volume(config: Values) -> DetectedValve:
     curve = _pressure_curve(settings)
     thickness = _thickness(settings.thickness_mm)
     volume = read_volume(
-        Path(config["volume"]),
+        Path(file),
         modality=_modality(settings.modality),
         frame_interval_s=settings.frame_interval_s,
         time_unit=settings.time_unit,
@@ -141,7 +141,7 @@ def detect_in_volume(config: Values) -> DetectedValve:
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = _frames(settings, curve, held, valve, rows)
     texts = CaseTexts(
-        settings.name or Path(config["volume"]).name.partition(".")[0],
+        settings.name or Path(file).name.partition(".")[0],
         settings.description,
         settings.source or volume.source,
         settings.licence,
@@ -168,11 +168,15 @@ def detect_in_volume(config: Values) -> DetectedValve:
             f"({off.mean():.2f} mm in the closed frame)",
         ),
     )
-    return DetectedValve(volume, valve, rows, frames, case, _about(model))
+    about = {"sha256": model.sha256, "trained_on": model.trained_on}
+    return DetectedValve(volume, valve, rows, frames, case, about)
 
 
-def write_image_step(detected: DetectedValve, folder: Path) -> dict[str, Any]:
-    """Write pictures, measures, surfaces, landmarks and the case; what the record says of it."""
+def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
+    """Write pictures, measures, surfaces, landmarks and the case.
+
+    They are drawn here, where the volume is at hand.
+    """
     from mvest.reporting.figures import save_figure_with
     from mvest.reporting.images.figures import measures_figure
     from mvest.reporting.images.montage import montage_figure
@@ -198,7 +202,7 @@ def write_image_step(detected: DetectedValve, folder: Path) -> dict[str, Any]:
     pictures = {}
     for key, (figure, caption) in drawn.items():
         save_figure_with(folder / key, figure, line)
-        pictures[key] = {"file": f"{key}.png", "caption": caption}
+        pictures[key] = Picture(f"{key}.png", caption)
     write_measures(images, detected.rows)
     write_surfaces(images, detected.valve)
     write_for_slicer(
@@ -209,32 +213,33 @@ def write_image_step(detected: DetectedValve, folder: Path) -> dict[str, Any]:
         [detected.frames.open, detected.frames.closed],
     )
     write_case(case, detected.case)
-    return {
-        "pictures": pictures,
-        "sentences": _sentences(detected),
-        "frames": [dict(row) for row in detected.rows],
-        "files": [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"],
-        "model": detected.model,
-        "volume": {
-            "source": detected.volume.source,
-            "sha256": detected.volume.sha256,
-            "modality": detected.volume.modality.value,
-            "shape": list(detected.volume.frames.shape),
-            "spacing_mm": detected.volume.spacing.tolist(),
-        },
-        "open_frame": detected.frames.open,
-        "closed_frame": detected.frames.closed,
-        "confidence": detected.valve.frame_confidence.tolist(),
-        "std_mm": detected.case.uncertainty.typical_mm,
-        "correlation_length_mm": detected.case.uncertainty.correlation_length_mm,
-    }
+    volume, uncertainty = detected.volume, detected.case.uncertainty
+    return ImageStep(
+        pictures=pictures,
+        sentences=_sentences(detected),
+        frames=tuple(dict(row) for row in detected.rows),
+        files=(f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"),
+        model=detected.model,
+        volume=VolumeAbout(
+            volume.source,
+            volume.sha256,
+            volume.modality.value,
+            volume.frames.shape,
+            tuple(volume.spacing.tolist()),
+        ),
+        open_frame=detected.frames.open,
+        closed_frame=detected.frames.closed,
+        confidence=tuple(detected.valve.frame_confidence.tolist()),
+        std_mm=uncertainty.typical_mm,
+        correlation_length_mm=uncertainty.correlation_length_mm,
+    )
 
 
-def _sentences(detected: DetectedValve) -> list[str]:
+def _sentences(detected: DetectedValve) -> tuple[str, ...]:
     volume, valve = detected.volume, detected.valve
     confidence = valve.frame_confidence
     size = " x ".join(map(str, volume.frames.shape[1:]))
-    return [
+    return (
         f"{volume.source}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
         f"Valve found with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
         f"(open frame {detected.frames.open}: {confidence[detected.frames.open]:.2f}, closed frame "
@@ -243,7 +248,7 @@ def _sentences(detected: DetectedValve) -> list[str]:
         f"{detected.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
         f"{detected.case.uncertainty.correlation_length_mm:.0f} mm.",
         *(f"Derived: {sentence}." for sentence in detected.case.derived),
-    ]
+    )
 
 
 def _modality(name: str | None) -> Modality | None:
@@ -341,7 +346,3 @@ def _frames(
 def _thinned(count: int, wanted: int) -> IntArray:
     """Numbers of evenly spread samples of the errors, at most ``wanted``."""
     return np.unique(np.linspace(0, count - 1, wanted).round().astype(np.int64))
-
-
-def _about(model: DetectionModel) -> dict[str, Any]:
-    return {"sha256": model.sha256, "trained_on": model.trained_on}

@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.common.cases.own_case import read_configured, run_case, settings_of
-from experiments.common.cases.report import case_text, write_case_tables
+from experiments.common.cases.findings import Findings
+from experiments.common.cases.own_case import meshes_of, read_configured, run_case, settings_of
+from experiments.common.cases.report import case_text, write_cases
+from experiments.common.cases.settings import PersonalSettings
 from experiments.common.expectation import expect_own
-from experiments.common.plain import Plain, each, flat, plain_run
-from experiments.common.study import Study
+from experiments.common.record import Outcome
+from experiments.common.schema import build
+from experiments.common.study import Job, Study
 from experiments.studies.case.settings import Settings
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.personalise.model import build_model
@@ -19,13 +22,17 @@ from mvest.reporting.case.fields import turn_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["STUDY", "check_case"]
-
-Values = Mapping[str, Any]
+__all__ = ["STUDY", "check_case", "run_own_case"]
 
 
-def check_case(config: Values, folder: Path) -> str:
-    """Read, check and draw a case without simulating anything: what to tell the user.
+def run_own_case(job: Job[Settings]) -> Outcome[Findings]:
+    """Read the configured case and personalise it."""
+    case = read_configured(job.settings.case)
+    return run_case(job.values, job.settings.personal, case, job.folder)
+
+
+def check_case(values: Mapping[str, Any], folder: Path) -> str:
+    """Read, check and draw a case without simulating anything, and describe it.
 
     Raises
     ------
@@ -34,9 +41,9 @@ def check_case(config: Values, folder: Path) -> str:
     """
     from mvest.reporting.figures import save_figure_with
 
-    case = read_configured(config)
-    settings = settings_of(config)
-    model = build_model(case, settings, Path(config["paths"]["outputs"]) / "meshes")
+    case = read_configured(values["case"])
+    settings = settings_of(values, build(PersonalSettings, values["personal"]))
+    model = build_model(case, settings, meshes_of(values))
     files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
     surface = case.surface
     lines = [
@@ -86,9 +93,9 @@ def _frame_words(frame: Frame) -> str:
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_case),
-    words=lambda record: case_text(flat(record)),
-    write=each(write_case_tables),
+    findings=Findings,
+    run=run_own_case,
+    words=case_text,
+    write=write_cases,
     checks=lambda: (check_case, expect_own),
 )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import build_filter
-from experiments.common.estimate_record import innovation_of, spread
+from experiments.common.estimate_record import innovation_of
 from experiments.common.findings import rows, vector
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Outcome
@@ -34,6 +34,7 @@ from mvest.external.contract import read_points, write_points
 from mvest.external.differences import Differences
 from mvest.external.model import ProcessModel
 from mvest.external.process import Command
+from mvest.reporting.findings import spread
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "check_external", "model_of", "run_external"]

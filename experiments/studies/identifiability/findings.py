@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from experiments.common.findings import Rows, Vector
 from experiments.studies.identifiability.settings import DesignsSettings
+from mvest.reporting.findings import Alike
 
 __all__ = ["Design", "Expected", "Findings", "Joint", "Profile"]
 
@@ -32,13 +32,12 @@ class Expected:
 class Joint:
     """What a design tells of q parameters together, those that profiles hold being known.
 
-    ``covariance (q, q)`` is relative, with the typical noise, None where it is unbounded;
-    ``confounded`` is of :func:`mvest.reporting.expectation.confounded_record`.
+    ``covariance (q, q)`` is relative, with the typical noise, None where it is unbounded.
     """
 
     names: tuple[str, ...]
     covariance: tuple[tuple[float | None, ...], ...]
-    confounded: tuple[Mapping[str, Any], ...]
+    confounded: tuple[Alike, ...]
     condition_number: float | None
 
 

@@ -34,7 +34,7 @@ from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.transform import Log
 from mvest.estimation.wrappers import rows_of, stacked
 from mvest.observation.errors import SpatialCorrelation
-from mvest.reporting.expectation import confounded_record
+from mvest.reporting.expectation import alike
 from mvest.typing import BoolArray, FloatArray
 
 __all__ = ["STUDY", "run_identifiability"]
@@ -196,7 +196,7 @@ def _joint(settings: DesignsSettings, design: information.Design) -> Joint:
     return Joint(
         tuple(bound.names),
         tuple(tuple(map(finite, row)) for row in bound.covariance),
-        tuple(confounded_record(bound)),
+        alike(bound),
         finite(bound.condition_number),
     )
 

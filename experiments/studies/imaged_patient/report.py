@@ -1,44 +1,55 @@
-"""What the results keep of moduli from simulated volumes, and the table of all of them."""
+"""Moduli from simulated volumes: text and pages of a run, and the table of all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from experiments.common.cases.blind import ESTIMATE, read_estimate
+from experiments.common.cases.report import estimation_text, write_case
 from experiments.common.cases.skill import Answered, skill_words
-from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
+from experiments.studies.imaged_patient.findings import KNOWN, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables
 
-__all__ = ["kept_of_volume", "volumes_answer", "write_volumes"]
-
-KEPT = ("rows", "unknowns", "known_geometry", "image_errors")
+__all__ = ["answered_of_volumes", "volume_text", "volumes_answer", "write_run", "write_volumes"]
 
 
-def volumes_answer(records: Mapping[str, Record[Plain]]) -> str:
+def volume_text(record: Record[Findings]) -> str:
+    """What a finished run says on the terminal."""
+    findings = record.findings
+    title = f"{record.row}: {record.reason}"
+    return estimation_text(title, findings.unknowns, findings.distances)
+
+
+def answered_of_volumes(records: Iterable[Record[Findings]]) -> list[Answered]:
+    """The modulus of each leaflet of each patient."""
+    return [
+        Answered(row.modulus, row.truth, row.estimate, row.low, row.high, row.generic)
+        for record in records
+        for row in record.findings.rows
+    ]
+
+
+def volumes_answer(records: Mapping[str, Record[Findings]]) -> str:
     """How good moduli from volumes are, in one line."""
-    answered = []
-    for record in records.values():
-        generic = {row["name"]: row["prior_mean"] for row in record.findings["unknowns"]}
-        answered += [
-            Answered(
-                row["truth"], row["estimate"], row["low"], row["high"],
-                generic[f"E_f.{row['modulus']}"],
-            )
-            for row in record.findings["rows"]
-        ]  # fmt: skip
-    return f"{len(records)} simulated volumes: {skill_words(answered)}"
+    words = skill_words(answered_of_volumes(records.values()))
+    return f"{len(records)} simulated volumes: {words}"
 
 
-def kept_of_volume(record: Record[Plain]) -> Record[Plain]:
-    """What the table needs of a record, and what else was estimated."""
-    return replace(record, findings={key: record.findings.get(key) for key in KEPT})
+def write_run(folder: Path, record: Record[Findings]) -> list[Path]:
+    """Table and page of both estimations, as far as they left something."""
+    return [
+        path
+        for place in (folder, folder / KNOWN)
+        if (place / ESTIMATE).is_file()
+        for path in write_case(place, read_estimate(place).findings.case, record)
+    ]
 
 
 def write_volumes(
-    folder: Path, records: Mapping[str, Record[Plain]], _arrays: Mapping[str, Path]
+    folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
 ) -> list[Path]:
     """The table of all volumes."""
-    rows = [row for record in records.values() for row in record.findings["rows"]]
-    return write_volume_tables(folder, {**flat(list(records.values())[-1]), "rows": rows})
+    rows = [row for record in records.values() for row in record.findings.rows]
+    return write_volume_tables(folder, rows, list(records.values())[-1].line)

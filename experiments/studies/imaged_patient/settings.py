@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from experiments.common.cases.settings import ImagedSettings, PatientSettings, PersonalSettings
+from experiments.common.cases.settings import ImagedSettings, PersonalSettings
+from experiments.common.virtual_patients import EchoSettings, PatientSettings
 
-__all__ = ["EchoSettings", "Settings"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EchoSettings:
-    """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
-
-    spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
-    tip_motion_mm: tuple[float, ...] = (1.0, 3.0)  # of papillary tips
+__all__ = ["Settings"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

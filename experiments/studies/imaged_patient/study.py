@@ -11,19 +11,31 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import mechanics_of, template_of
+from experiments.common.cases import findings as of_cases
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.cases.report import case_text, write_case_tables
-from experiments.common.plain import Plain, flat, plain_run
-from experiments.common.schema import build
+from experiments.common.record import Outcome, Status
 from experiments.common.store import Store
-from experiments.common.study import Section, Study
-from experiments.studies.imaged_patient.report import kept_of_volume, volumes_answer, write_volumes
+from experiments.common.study import Job, Section, Study
+from experiments.common.virtual_patients import (
+    EchoSettings,
+    PatientSettings,
+    draw_patient_values,
+    first_that_closes,
+    require_patient,
+)
+from experiments.studies.imaged_patient.findings import KNOWN, Findings, KnownGeometry, Row
+from experiments.studies.imaged_patient.report import (
+    volume_text,
+    volumes_answer,
+    write_run,
+    write_volumes,
+)
 from experiments.studies.imaged_patient.settings import Settings
 from mvest.cases.case import ValveCase
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
 from mvest.imaging.simulator.probe import Probe, draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
@@ -31,19 +43,17 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing.slicer import write_sequence_nrrd
 from mvest.provenance import write_json
+from mvest.reporting.case.findings import UnknownRow
 from mvest.simulation.motion.closing import MotionSettings
 from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion.population import draw_tip_motion
-from mvest.simulation.virtual_patient import Deviations, draw_hidden
-from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.variation import vary
 
 __all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient", "volume_rows"]
 
 Values = Mapping[str, Any]
 
-VOLUME, KNOWN, TRUTH, HIDDEN = "volume.seq.nrrd", "known", "truth", "hidden.json"
+VOLUME, TRUTH, HIDDEN = "volume.seq.nrrd", "truth", "hidden.json"
 MAX_DRAWS = 10
 """Anatomies that are drawn, one after another, until one closes as a valve does."""
 
@@ -79,83 +89,102 @@ class ImagedPlace:
         return self.hidden / TRUTH
 
 
-def run_imaged_patient(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Simulate, estimate apart from the volume and from the true positions, reveal: the record."""
-    place = make_imaged_patient(config)
+def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
+    """Simulate, estimate apart from the volume and from the true positions, reveal.
+
+    Raises
+    ------
+    InputError
+        If neither estimation left anything.
+    """
+    values, folder = job.values, job.folder
+    place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
     hidden = json.loads((place.truth / HIDDEN).read_text(encoding="utf-8"))
-    imaged = {**config["imaged"], **hidden["stated"]}
-    reason, found = "", None
-    try:
-        found = estimate_blindly(
-            {**config, "imaged": imaged}, config_hash, folder, place.volume, place.hidden
-        )
-    except InputError as fault:
-        reason = str(fault)
+    stated = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
+    volume = _estimated(stated, folder, place.volume, place.hidden)
     # Of the known shape nothing is in error but what the estimator cannot know.
     beside = folder / KNOWN
     beside.mkdir(exist_ok=True)
-    known: Values = NO_ESTIMATE
+    known = _estimated(values, beside, place.known, place.truth)
+    if isinstance(volume, str):
+        if isinstance(known, str):
+            raise InputError(known)
+        run, status, reason, detail = known, FAILED, volume, ""
+    else:
+        run, status, reason, detail = volume, volume.status, volume.reason, volume.detail
+    found = None if isinstance(volume, str) else volume.findings
+    findings = Findings(
+        rows=volume_rows(job.settings.patient.name, volume, known, hidden["values"]),
+        unknowns=found.case.unknowns if found else (),
+        known_geometry=KnownGeometry(False, known)
+        if isinstance(known, str)
+        else KnownGeometry(known.status != FAILED, known.reason, known.findings.case.unknowns),
+        image_errors=found.case.image_errors if found else None,
+        distances=found.case.distances if found else (),
+        repeats=(replace(found.repeats[0], seed=values["seed"]),) if found else (),
+        data=found.data if found else None,
+        anatomies_drawn=hidden["anatomies_drawn"],
+    )
+    return Outcome(
+        findings=findings,
+        status=status,
+        reason=reason,
+        detail=detail,
+        mesh=run.mesh,
+        forward_solves=run.forward_solves,
+        parameters=run.parameters,
+        model=run.model,
+    )
+
+
+FAILED: Status = "failed"
+
+Estimation = Outcome[of_cases.Findings] | str
+"""What an estimation apart left, or why it left nothing."""
+
+
+def _estimated(values: Values, folder: Path, case: Path, sealed: Path) -> Estimation:
     try:
-        known = estimate_blindly(config, config_hash, beside, place.known, place.truth)
+        return estimate_blindly(values, folder, case, sealed)
     except InputError as fault:
-        if found is None:
-            raise
-        known = NO_ESTIMATE | {"reason": str(fault)}
-    record = {**known, **NO_ESTIMATE, "reason": reason} if found is None else found
-    record = {
-        **record,
-        "rows": volume_rows(config["patient"]["name"], found, known, hidden["values"]),
-        "known_geometry": {
-            key: known.get(key) for key in ("status", "reason", "estimate", "std", "unknowns")
-        },
-        "made_from": hidden["made_from"],
-        "anatomies_drawn": hidden["anatomies_drawn"],
-        "row": config["row"],
-    }
-    record["provenance"] = {**record["provenance"], "seed": config["seed"]}
-    return record, []
-
-
-NO_ESTIMATE: dict[str, Any] = {
-    "status": "failed", "detail": "", "estimate": None, "std": None, "relative_error": None,
-}  # fmt: skip
-"""Of a record of an estimation that found nothing, or left nothing behind."""
+        return str(fault)
 
 
 def volume_rows(
-    patient: str, found: Values | None, known: Values, truth: Mapping[str, float]
-) -> list[dict[str, Any]]:
-    """What was found of each modulus, from the volume and from the known geometry, MPa.
-
-    As `experiments.studies.imaged_patient.tables.volume_table` wants them.
-    """
+    patient: str, volume: Estimation, known: Estimation, truth: Mapping[str, float]
+) -> tuple[Row, ...]:
+    """Each modulus as estimated from the volume and from the known geometry."""
     rows = []
     for name in sorted(name for name in truth if name.startswith("E_f.")):
-        one = _unknown(found, name)
+        one, other = _unknown(volume, known, name), _unknown(known, volume, name)
         rows.append(
-            {
-                "patient": patient,
-                "modulus": name.partition(".")[2],
-                "truth": truth[name],
-                "estimate": one.get("estimate"),
-                "low": one.get("low"),
-                "high": one.get("high"),
-                "known_geometry": _unknown(known, name).get("estimate"),
-            }
+            Row(
+                patient=patient,
+                modulus=name.partition(".")[2],
+                truth=truth[name],
+                generic=one.prior_mean,
+                estimate=one.estimate,
+                low=one.low,
+                high=one.high,
+                known_geometry=other.estimate,
+            )
         )
-    return rows
+    return tuple(rows)
 
 
-def _unknown(record: Values | None, name: str) -> Values:
-    """What a record says of an unknown; nothing where it found no estimate."""
-    if record is None or record["status"] != "converged":
-        return {}
-    return next((row for row in record["unknowns"] if row["name"] == name), {})
+def _unknown(estimation: Estimation, other: Estimation, name: str) -> UnknownRow:
+    """What an estimation says of an unknown; what it was believed to be if it did not converge."""
+    left = other if isinstance(estimation, str) else estimation
+    assert not isinstance(left, str)
+    (row,) = [row for row in left.findings.case.unknowns if row.name == name]
+    if left is estimation and left.status != FAILED:
+        return row
+    return replace(row, estimate=None, low=None, high=None)
 
 
-def make_imaged_patient(config: Values) -> ImagedPlace:
+def make_imaged_patient(
+    values: Values, patient: PatientSettings | None, echo: EchoSettings
+) -> ImagedPlace:
     """Simulate and image the configured patient, unless that was done: where it lies.
 
     Raises
@@ -163,27 +192,25 @@ def make_imaged_patient(config: Values) -> ImagedPlace:
     MvestError
         If the configuration is inadmissible or no anatomy that is drawn closes.
     """
-    patient = config["patient"]
-    if patient is None:
-        raise ConfigurationError("patient is not given; expected one of conf/patient")
+    patient = require_patient(patient)
     described = {
         "patient": {
-            key: patient[key]
+            key: values["patient"][key]
             for key in ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
         },
-        "echo": config["echo"],
-        "valve": config["valve"],
-        "mechanics": config["mechanics"],
+        "echo": values["echo"],
+        "valve": values["valve"],
+        "mechanics": values["mechanics"],
         "uncertainty": KNOWN_UNCERTAINTY,
-        "seed": config["seed"],
+        "seed": values["seed"],
     }
-    store = Store(config["paths"]["outputs"])
+    store = Store(values["paths"]["outputs"])
     entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
 
     def write(root: Path, made: _Made) -> None:
         _write(ImagedPlace.within(root), made, patient, described)
 
-    return entry.get_or_make(lambda: _simulate(config), write)
+    return entry.get_or_make(lambda: _simulate(values, patient, echo), write)
 
 
 def _place(root: Path) -> ImagedPlace:
@@ -200,22 +227,26 @@ _Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, how it was imaged, and how many anatomies were drawn for it."""
 
 
-def _simulate(config: Values) -> _Made:
-    patient, echo = config["patient"], config["echo"]
-    rng = np.random.default_rng(config["seed"])
-    moduli = {
-        name: float(value * np.exp(patient["moduli_spread"] * rng.standard_normal()))
-        for name, value in sorted(patient["moduli"].items())
-    }
-    values = draw_hidden(moduli, build(Deviations, patient["deviations"]), rng)
-    made, draws = _drawn(config, values, rng)
-    acquisition = draw_acquisition(rng, spread=echo["spread"])
+def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> _Made:
+    rng = np.random.default_rng(values["seed"])
+    hidden, mechanics = draw_patient_values(patient, rng), mechanics_of(values)
+
+    def simulate(drawn: Template) -> ImagedPatient:
+        motion = draw_tip_motion(drawn, echo.tip_motion_mm, rng)
+        return simulate_imaged_patient(
+            patient.name, drawn, hidden, IMAGED, MotionSettings(), mechanics, motion
+        )
+
+    made, draws = first_that_closes(
+        template_of(values), patient.variation, MAX_DRAWS, rng, simulate
+    )
+    acquisition = draw_acquisition(rng, spread=echo.spread)
     probe = draw_probe(rng, acquisition)
-    return made, probe, simulate_volume(made.valve, acquisition, probe, config["seed"]), draws
+    return made, probe, simulate_volume(made.valve, acquisition, probe, values["seed"]), draws
 
 
-def _write(place: ImagedPlace, found: _Made, patient: Values, described: Values) -> None:
-    made, probe, volume, draws = found
+def _write(place: ImagedPlace, imaged: _Made, patient: PatientSettings, described: Values) -> None:
+    made, probe, volume, draws = imaged
     place.truth.mkdir(parents=True)
     # The source of what is simulated names the patient; a file has its name alone.
     write_sequence_nrrd(place.volume, volume)
@@ -232,34 +263,7 @@ def _write(place: ImagedPlace, found: _Made, patient: Values, described: Values)
     )
 
 
-def _drawn(
-    config: Values, values: Mapping[str, float], rng: np.random.Generator
-) -> tuple[ImagedPatient, int]:
-    """The first anatomy that closes as a valve does, and how many were drawn."""
-    template, scale = template_of(config), config["patient"]["variation"]
-    reach = (float(config["echo"]["tip_motion_mm"][0]), float(config["echo"]["tip_motion_mm"][1]))
-    for draws in range(1, MAX_DRAWS + 1):
-        drawn = Template(vary(template.parameters, rng, scale)) if scale else template
-        motion: FloatArray = draw_tip_motion(drawn, reach, rng)
-        try:
-            made = simulate_imaged_patient(
-                config["patient"]["name"],
-                drawn,
-                values,
-                IMAGED,
-                MotionSettings(),
-                mechanics_of(config),
-                motion,
-            )
-        except GeometryError:
-            if draws == MAX_DRAWS:
-                raise
-            continue
-        return made, draws
-    raise AssertionError("unreachable")
-
-
-def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: Values) -> ValveCase:
+def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSettings) -> ValveCase:
     n = sequence.layout.size
     stated = replace(
         sequence,
@@ -267,19 +271,18 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: Values) ->
         correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
     )
     texts = CaseTexts(
-        patient["name"], f"{patient['description']}, its true positions", "simulated", "MIT", True
+        patient.name, f"{patient.description}, its true positions", "simulated", "MIT", True
     )
     return case_of_sequence(stated, frames, texts)
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_imaged_patient),
-    words=lambda record: case_text(flat(record)),
+    findings=Findings,
+    run=run_imaged_patient,
+    words=volume_text,
     write=write_volumes,
-    write_run=lambda folder, record: write_case_tables(folder, flat(record)),
-    keep=kept_of_volume,
+    write_run=write_run,
     keeps_failures=True,
     sections=(
         Section(

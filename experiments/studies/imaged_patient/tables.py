@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
 
 from experiments.common.cases.report import interval_words
-from experiments.common.tables import checked_rows, write_table
+from experiments.common.tables import write_table
+from experiments.studies.imaged_patient.findings import Row
 from mvest.errors import InputError
-from mvest.reporting.files import provenance_line
 from mvest.reporting.markup import MISSING, number
 
 __all__ = ["volume_table", "volume_words", "write_volume_tables"]
-
-Record = Mapping[str, Any]
-Row = Mapping[str, Any]
 
 TRUTH_OF_MODULI: Final = (
     "Moduli estimated from simulated transoesophageal echo (TEE) volumes of simulated valves. The "
@@ -32,28 +30,20 @@ TRUTH_OF_MODULI: Final = (
 def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
     """One row for each patient and modulus E_f estimated from a volume, MPa and %.
 
-    Parameters
-    ----------
-    rows : sequence of mapping
-        ``patient``, ``modulus``, ``truth``, ``estimate``, ``low`` and ``high`` (95 % interval) and
-        ``known_geometry`` (the estimate from the true geometry), all MPa; None where an estimation
-        found none.
-
     Raises
     ------
     InputError
-        No rows, an entry that is missing, or a truth that is not positive.
+        No rows, or a truth that is not positive.
     """
-    wanted = ("patient", "modulus", "truth", "estimate", "low", "high", "known_geometry")
-    table = checked_rows(rows, wanted, "moduli from volumes")
-    numbers = table[list(wanted[2:])].astype(float)
+    if not rows:
+        raise InputError("moduli from volumes: no rows, expected at least one")
+    table = pd.DataFrame([asdict(row) for row in rows])
+    numbers = table[["truth", "estimate", "low", "high", "known_geometry"]].astype(float)
     truth = numbers["truth"]
     if not (truth > 0).all():
         raise InputError(f"moduli from volumes: truth {truth.min()} MPa, expected > 0")
     error = 100.0 * (numbers["estimate"] - truth) / truth
     known = 100.0 * (numbers["known_geometry"] - truth) / truth
-    inside = (numbers["low"] <= truth) & (truth <= numbers["high"])
-    has_interval = numbers["low"].notna() & numbers["high"].notna()
     return pd.DataFrame(
         {
             "patient": table["patient"],
@@ -62,7 +52,7 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
             "estimate [MPa]": numbers["estimate"],
             "95 % low [MPa]": numbers["low"],
             "95 % high [MPa]": numbers["high"],
-            "inside": inside.astype(object).where(has_interval, None),
+            "inside": pd.Series([row.inside for row in rows], dtype=object),
             "error [%]": error,
             "error from known geometry [%]": known,
             "part from the images [%]": error - known,
@@ -95,37 +85,28 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     return out
 
 
-def write_volume_tables(results: Path, record: Record) -> list[Path]:
-    """``volume.*`` from a record with ``rows`` as for `volume_table`.
+def write_volume_tables(results: Path, rows: Sequence[Row], line: str) -> list[Path]:
+    """``volume.*`` from rows as for `volume_table`; ``line`` says where they came from.
 
     Raises
     ------
     InputError
         As `volume_table`, or a file that cannot be written.
     """
-    table = volume_table(record["rows"])
-    readable = []
-    for _, row in table.iterrows():
-        readable.append(
-            {
-                "patient (simulated)": str(row["patient"]).replace("_", " "),
-                "modulus": str(row["modulus"]),
-                "truth [MPa]": number(row["truth [MPa]"]),
-                "estimate, 95 % [MPa]": MISSING
-                if pd.isna(row["estimate [MPa]"])
-                else interval_words(
-                    {
-                        "estimate": row["estimate [MPa]"],
-                        "low": row["95 % low [MPa]"],
-                        "high": row["95 % high [MPa]"],
-                        "inside": row["inside"],
-                    }
-                ),
-                **{
-                    name: MISSING if pd.isna(row[name]) else f"{row[name]:+.1f}"
-                    for name in table.columns[-3:]
-                },
-            }
-        )
-    notes = [TRUTH_OF_MODULI, *volume_words(table)]
-    return write_table(results / "volume", table, readable, provenance_line(record), notes)
+    table = volume_table(rows)
+    readable = [
+        {
+            "patient (simulated)": row.patient.replace("_", " "),
+            "modulus": row.modulus,
+            "truth [MPa]": number(row.truth),
+            "estimate, 95 % [MPa]": interval_words(row),
+            **{
+                str(name): MISSING if pd.isna(value) else f"{value:+.1f}"
+                for name, value in errors.items()
+            },
+        }
+        for row, (_, errors) in zip(rows, table[table.columns[-3:]].iterrows(), strict=True)
+    ]
+    return write_table(
+        results / "volume", table, readable, line, [TRUTH_OF_MODULI, *volume_words(table)]
+    )

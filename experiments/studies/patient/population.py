@@ -10,41 +10,42 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import beta
 
+from experiments.common.cases.findings import Findings
+from experiments.common.record import Record
 from experiments.common.tables import write_table
-from experiments.studies.patient.tables import Record, distance_words, provenance_of, table3
-from mvest.reporting.figures import save_figure
+from experiments.studies.patient.tables import distance_words, provenance_of, table3
+from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import MISSING
 
 __all__ = ["population_frame", "write_population_tables"]
 
+COLUMNS = ("name", "unit", "truth", "estimate", "std", "low", "high", "inside")
+"""What is listed of an unknown."""
 
-def population_frame(records: Sequence[Record]) -> pd.DataFrame:
+
+def population_frame(records: Sequence[Record[Findings]]) -> pd.DataFrame:
     """One row for each patient and unknown: truth, estimate and interval."""
     rows = []
     for record in records:
-        for key, source in (
-            ("with nuisances", record["unknowns"]),
-            (
-                "without nuisances",
-                []
-                if record["without_nuisances"] is None
-                else record["without_nuisances"]["parameters"],
-            ),
+        case = record.findings.case
+        alone = case.without_nuisances
+        for estimation, unknowns in (
+            ("with nuisances", case.unknowns),
+            ("without nuisances", alone.parameters if alone else ()),
         ):
-            for row in source:
-                rows.append(
-                    {
-                        "patient": record["case"]["name"],
-                        "estimation": key,
-                        "status": record["status"],
-                        **{k: row.get(k) for k in ("name", "unit", "truth", "estimate", "std")},
-                        **{k: row.get(k) for k in ("low", "high", "inside")},
-                    }
-                )
+            rows += [
+                {
+                    "patient": case.about.name,
+                    "estimation": estimation,
+                    "status": record.status,
+                    **{name: getattr(row, name) for name in COLUMNS},
+                }
+                for row in unknowns
+            ]
     return pd.DataFrame(rows)
 
 
-def write_population_tables(results: Path, records: Sequence[Record]) -> list[Path]:
+def write_population_tables(results: Path, records: Sequence[Record[Findings]]) -> list[Path]:
     """``population.*`` from kept patients drawn at random."""
     table = population_frame(records)
     readable = []
@@ -75,8 +76,9 @@ def write_population_tables(results: Path, records: Sequence[Record]) -> list[Pa
         *_both_moduli(table),
         *distance_words(distances),
     ]
-    written = write_table(results / "population", table, readable, provenance_of(records), notes)
-    return [*written, *save_figure(results / "population", population_figure(table), records[0])]
+    base = results / "population"
+    written = write_table(base, table, readable, provenance_of(records), notes)
+    return [*written, *save_figure_with(base, population_figure(table), records[0].line)]
 
 
 def _both_moduli(table: pd.DataFrame) -> list[str]:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.common.cases.findings import Findings
 from experiments.common.cases.skill import Answered, skill_words
-from experiments.common.plain import Plain, flat
 from experiments.common.record import Record
 
-__all__ = ["arrays_of_patient", "kept_of_patient", "patients_answer", "write_patients"]
+__all__ = [
+    "answered_of_patients",
+    "arrays_of_patient",
+    "kept_of_patient",
+    "patients_answer",
+    "write_patients",
+]
 
 KEPT_ARRAYS = (
     "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
@@ -23,39 +29,45 @@ KEPT_ARRAYS = (
 
 
 def write_patients(
-    folder: Path, records: Mapping[str, Record[Plain]], arrays: Mapping[str, Path]
+    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """Tables 2 and 3 and Figure 3, or the table of the population."""
     from experiments.studies.patient.population import write_population_tables
     from experiments.studies.patient.tables import POPULATION, in_order, write_patient_tables
 
-    kept = in_order({name: flat(record) for name, record in records.items()})
+    kept = in_order(records)
     if next(iter(records.values())).table == POPULATION:
         return write_population_tables(folder, list(kept.values()))
     return write_patient_tables(folder, kept, arrays)
 
 
-def patients_answer(records: Mapping[str, Record[Plain]]) -> str:
-    """How good the moduli of the patients are, in one line."""
-    answered = [
-        Answered(row["truth"], row["estimate"], row["low"], row["high"], row["prior_mean"])
-        for record in records.values()
-        for row in record.findings["unknowns"]
-        if row["name"].startswith("E_f.")
+def answered_of_patients(records: Iterable[Record[Findings]]) -> list[Answered]:
+    """The modulus of each leaflet of each patient."""
+    return [
+        Answered.of(row)
+        for record in records
+        for row in record.findings.case.unknowns
+        if row.is_modulus
     ]
-    return f"{len(records)} simulated patients, known geometry: {skill_words(answered)}"
 
 
-def kept_of_patient(record: Record[Plain]) -> Record[Plain]:
+def patients_answer(records: Mapping[str, Record[Findings]]) -> str:
+    """How good the moduli of the patients are, in one line."""
+    words = skill_words(answered_of_patients(records.values()))
+    return f"{len(records)} simulated patients, known geometry: {words}"
+
+
+def kept_of_patient(record: Record[Findings]) -> Record[Findings]:
     """What tables need of a record; the settings are in ``conf``."""
     from experiments.studies.patient.tables import POPULATION
 
-    dropped = ("settings", "measurements") if record.table == POPULATION else ()
-    findings = {key: value for key, value in record.findings.items() if key not in dropped}
-    return replace(record, findings=findings)
+    if record.table != POPULATION:
+        return record
+    case = replace(record.findings.case, settings={}, measurements={})
+    return replace(record, findings=replace(record.findings, case=case))
 
 
-def arrays_of_patient(record: Record[Plain], path: Path) -> dict[str, Any]:
+def arrays_of_patient(record: Record[Findings], path: Path) -> dict[str, Any]:
     """Arrays that Figure 3 needs, in single precision."""
     from experiments.studies.patient.tables import PATIENTS
 

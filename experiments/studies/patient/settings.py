@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.cases.settings import PatientSettings, PersonalSettings
+from experiments.common.cases.settings import PersonalSettings
+from experiments.common.virtual_patients import PatientSettings
 
 __all__ = ["Settings"]
 

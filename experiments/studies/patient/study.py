@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,21 @@ import numpy as np
 
 from experiments.common.build import mechanics_of, template_of
 from experiments.common.cases.blind import estimate_blindly
-from experiments.common.cases.record import of_all_unknowns
-from experiments.common.cases.report import case_text, write_case_tables
+from experiments.common.cases.findings import Findings, Revealed
+from experiments.common.cases.own_case import FIELDS
+from experiments.common.cases.report import case_text, write_case_run
+from experiments.common.estimates import SeedRun
 from experiments.common.expectation import expect_own
-from experiments.common.plain import Plain, flat, plain_run
+from experiments.common.record import Outcome
 from experiments.common.schema import build
 from experiments.common.store import Store
-from experiments.common.study import Section, Study
+from experiments.common.study import Job, Section, Study
+from experiments.common.virtual_patients import (
+    PatientSettings,
+    draw_patient_values,
+    first_that_closes,
+    require_patient,
+)
 from experiments.studies.patient.report import (
     arrays_of_patient,
     kept_of_patient,
@@ -29,18 +36,12 @@ from experiments.studies.patient.report import (
 from experiments.studies.patient.settings import Settings
 from experiments.studies.patient.tables import PATIENTS
 from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.errors import InputError
 from mvest.provenance import write_json
-from mvest.simulation.virtual_patient import (
-    Deviations,
-    PatientSimulation,
-    VirtualPatient,
-    draw_hidden,
-    simulate_patient,
-)
+from mvest.reporting.case.findings import FrameDistances, ModuliAlone, ToTruth, UnknownRow
+from mvest.reporting.findings import Spread
+from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.variation import vary
 
 __all__ = ["STUDY", "PatientPlace", "make_patient", "reveal", "run_patient"]
 
@@ -67,28 +68,15 @@ class PatientPlace:
     hidden: Path
 
 
-def run_patient(
-    config: Values, config_hash: str, folder: Path, started: float
-) -> tuple[dict[str, Any], list[Path]]:
-    """Simulate, estimate apart, reveal: the record, and the files written to ``folder``."""
-    from mvest.reporting.case.report import write_case_report
-
-    place = make_patient(config)
-    record = estimate_blindly(config, config_hash, folder, place.case, place.hidden)
-    fields = folder / "fields.npz"
-    record = reveal(record, place, fields)
-    record["provenance"]["seed"] = config["seed"]
-    record["paper_patient"] = {
-        "moduli": list(config["patient"]["paper_moduli"]),
-        "distance_mm": list(config["patient"]["paper_distance_mm"]),
-    }
-    files: list[Path] = []
-    if config["figures"] and fields.is_file():
-        files = write_case_report(folder, of_all_unknowns(record), fields)
-    return record, files
+def run_patient(job: Job[Settings]) -> Outcome[Findings]:
+    """Simulate, estimate apart, reveal."""
+    patient = job.settings.patient
+    place = make_patient(job.values, patient)
+    estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden)
+    return reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
 
 
-def make_patient(config: Values) -> PatientPlace:
+def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
     """Simulate the configured patient, unless that was done: where it lies.
 
     Raises
@@ -96,22 +84,20 @@ def make_patient(config: Values) -> PatientPlace:
     MvestError
         If the configuration is inadmissible or the valve does not close.
     """
-    patient = config["patient"]
-    if patient is None:
-        raise ConfigurationError("patient is not given; expected one of conf/patient")
+    patient = require_patient(patient)
     described = {
-        "patient": {k: v for k, v in patient.items() if not k.startswith("paper")},
-        "valve": config["valve"],
-        "mechanics": config["mechanics"],
-        "seed": config["seed"],
+        "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
+        "valve": values["valve"],
+        "mechanics": values["mechanics"],
+        "seed": values["seed"],
     }
-    store = Store(config["paths"]["outputs"])
+    store = Store(values["paths"]["outputs"])
     entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
 
     def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
         _write(root, *made, described)
 
-    return entry.get_or_make(lambda: _simulate(config), write)
+    return entry.get_or_make(lambda: _simulate(values, patient), write)
 
 
 def _place(root: Path) -> PatientPlace:
@@ -120,37 +106,20 @@ def _place(root: Path) -> PatientPlace:
     return place
 
 
-def _simulate(config: Values) -> tuple[VirtualPatient, int]:
+def _simulate(values: Values, patient: PatientSettings) -> tuple[VirtualPatient, int]:
     """A patient, and how many anatomies were drawn for it."""
-    patient = config["patient"]
-    rng = np.random.default_rng(config["seed"])
-    moduli = {
-        name: float(value * np.exp(patient["moduli_spread"] * rng.standard_normal()))
-        for name, value in sorted(patient["moduli"].items())
-    }
-    values = draw_hidden(moduli, build(Deviations, patient["deviations"]), rng)
-    template = template_of(config)
-    draws = 0
-    while True:
-        draws += 1
-        drawn = template
-        if patient["variation"]:
-            drawn = Template(vary(template.parameters, rng, patient["variation"]))
-        try:
-            made = simulate_patient(
-                patient["name"],
-                patient["description"],
-                drawn,
-                values,
-                build(PatientSimulation, patient["simulation"]),
-                mechanics_of(config),
-                rng,
-            )
-        except GeometryError:
-            if not patient["variation"] or draws == MAX_DRAWS:
-                raise
-            continue
-        return made, draws
+    rng = np.random.default_rng(values["seed"])
+    hidden = draw_patient_values(patient, rng)
+    mechanics = mechanics_of(values)
+    return first_that_closes(
+        template_of(values),
+        patient.variation,
+        MAX_DRAWS if patient.variation else 1,
+        rng,
+        lambda drawn: simulate_patient(
+            patient.name, patient.description, drawn, hidden, patient.simulation, mechanics, rng
+        ),
+    )
 
 
 def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> None:
@@ -164,16 +133,25 @@ def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> N
     write_json(folder / HIDDEN, about)
 
 
-def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[str, Any]:
-    """The finished record of an estimation, beside what its case had hidden.
+def reveal(
+    estimated: Outcome[Findings],
+    place: PatientPlace,
+    fields: Path,
+    patient: PatientSettings,
+    seed: int,
+) -> Outcome[Findings]:
+    """The outcome of an estimation, beside what its case had hidden.
 
     Parameters
     ----------
-    record : dict
+    estimated : Outcome
         Of the estimation, which is over.
     place : PatientPlace
     fields : Path
         The estimation's arrays; the true positions are added to them.
+    patient : PatientSettings
+    seed : int
+        Of the patient.
     """
     try:
         hidden = json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
@@ -181,66 +159,66 @@ def reveal(record: dict[str, Any], place: PatientPlace, fields: Path) -> dict[st
             positions = {name: stored[name] for name in stored.files}
     except (OSError, ValueError) as error:
         raise InputError(f"{place.hidden} does not hold what a patient hides: {error}") from error
-    values = hidden["values"]
-    revealed = copy.deepcopy(record)
-    groups = [revealed["unknowns"]] + [
-        revealed[key]["parameters"]
-        for key in ("without_nuisances", "as_in_the_paper")
-        if revealed[key] is not None
-    ]
-    for rows in groups:
-        for row in rows:
-            row["truth"] = values[row["name"]]
-            row["inside"] = (
-                None if row["low"] is None else bool(row["low"] <= row["truth"] <= row["high"])
-            )
-    for modulus in revealed["moduli"]:
-        truth = values[f"E_f.{modulus['region']}"]
-        ratio = modulus["estimate"] / _estimate(record, f"E_f.{modulus['region']}")
-        modulus["truth"] = ratio * truth
-        modulus["relative_error"] = (modulus["estimate"] - modulus["truth"]) / modulus["truth"]
-    revealed["truth"] = [values[name] for name in record["parameters"]]
-    if record["estimate"] is not None:
-        revealed["relative_error"] = [
-            (estimate - true) / true
-            for estimate, true in zip(record["estimate"], revealed["truth"], strict=True)
-        ]
-    if fields.is_file():
-        _reveal_positions(revealed, positions, fields)
-    revealed["made_from"] = hidden["made_from"]
-    revealed["anatomies_drawn"] = hidden["anatomies_drawn"]
-    return revealed
+    truth, case = hidden["values"], estimated.findings.case
+    moduli = []
+    for modulus in case.moduli:
+        name = f"E_f.{modulus.region}"
+        (own,) = [row.estimate for row in case.unknowns if row.name == name]
+        assert own is not None
+        moduli.append(replace(modulus, truth=modulus.estimate / own * truth[name]))
+    revealed = replace(
+        case,
+        unknowns=_known(case.unknowns, truth),
+        moduli=tuple(moduli),
+        without_nuisances=_alone(case.without_nuisances, truth),
+        as_in_the_paper=_alone(case.as_in_the_paper, truth),
+        distances=_to_truth(case.distances, positions, fields),
+    )
+    drawn = Revealed(hidden["anatomies_drawn"], patient.paper_moduli, patient.paper_distance_mm)
+    true = tuple(truth[name] for name in estimated.parameters)
+    (run,) = estimated.findings.repeats
+    run = replace(_against(run, true), seed=seed)
+    findings = replace(estimated.findings, case=revealed, repeats=(run,), revealed=drawn)
+    return replace(estimated, findings=findings)
 
 
-def _estimate(record: Mapping[str, Any], name: str) -> float:
-    return float(next(row["estimate"] for row in record["unknowns"] if row["name"] == name))
+def _known(rows: tuple[UnknownRow, ...], truth: Mapping[str, float]) -> tuple[UnknownRow, ...]:
+    return tuple(replace(row, truth=truth[row.name]) for row in rows)
 
 
-def _reveal_positions(
-    record: dict[str, Any], positions: Mapping[str, FloatArray], fields: Path
-) -> None:
-    """Distances to where the valve truly was, and its shape among the arrays."""
+def _alone(alone: ModuliAlone | None, truth: Mapping[str, float]) -> ModuliAlone | None:
+    return None if alone is None else replace(alone, parameters=_known(alone.parameters, truth))
+
+
+def _against(run: SeedRun, truth: tuple[float, ...]) -> SeedRun:
+    if run.estimate is None:
+        return run
+    error = tuple((a - b) / b for a, b in zip(run.estimate, truth, strict=True))
+    return replace(run, relative_error=error)
+
+
+def _to_truth(
+    distances: tuple[FrameDistances, ...], positions: Mapping[str, FloatArray], fields: Path
+) -> tuple[FrameDistances, ...]:
+    """Distances to where the valve truly was, whose shape is put among the arrays."""
+    if not fields.is_file():
+        return distances
     with np.load(fields, allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     frames = [str(name) for name in arrays["frames"]]
     arrays["truth"] = np.stack([positions[name] for name in frames]).astype(np.float32)
-    for k, row in enumerate(record["distances"]):
-        row["to_truth"] = {
-            which: _spread(np.linalg.norm(arrays[key][k] - arrays["truth"][k], axis=1))
-            for which, key in (
-                ("generic", "generic"),
-                ("registered", "registered"),
-                ("personalised", "fitted"),
-            )
-        }
     np.savez_compressed(fields, **arrays)
 
+    def off(name: str, k: int) -> Spread:
+        return Spread.of(np.linalg.norm(arrays[name][k] - arrays["truth"][k], axis=1))
 
-def _spread(values: FloatArray) -> dict[str, float]:
-    return {"mean": float(values.mean()), "std": float(values.std()), "max": float(values.max())}
+    return tuple(
+        replace(row, to_truth=ToTruth(off("generic", k), off("registered", k), off("fitted", k)))
+        for k, row in enumerate(distances)
+    )
 
 
-def expect_patient(config: Values, folder: Path | None = None) -> str:
+def expect_patient(values: Values, folder: Path | None = None) -> str:
     """The answer for the case of a virtual patient, which is simulated first unless it is there.
 
     Raises
@@ -248,16 +226,17 @@ def expect_patient(config: Values, folder: Path | None = None) -> str:
     MvestError
         If the configuration is inadmissible or the patient's valve does not close.
     """
-    return expect_own({**config, "case": str(make_patient(config).case)}, folder)
+    patient = values["patient"] and build(PatientSettings, values["patient"])
+    return expect_own({**values, "case": str(make_patient(values, patient).case)}, folder)
 
 
 STUDY = Study(
     settings=Settings,
-    findings=Plain,
-    run=plain_run(run_patient),
-    words=lambda record: case_text(flat(record)),
+    findings=Findings,
+    run=run_patient,
+    words=case_text,
     write=write_patients,
-    write_run=lambda folder, record: write_case_tables(folder, flat(record)),
+    write_run=write_case_run,
     keep=kept_of_patient,
     keep_arrays=arrays_of_patient,
     keeps_failures=True,

@@ -1,6 +1,6 @@
 """Tables 2 and 3 and Figure 3 of the paper for the virtual patients.
 
-Made from the kept records (``results/patients``, simulated), each with the truth that was revealed
+Made from the kept records (simulated), each with the truth that was revealed
 after its estimation.
 """
 
@@ -16,20 +16,22 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import interval_words
+from experiments.common.record import Record
 from experiments.common.tables import write_table
 from mvest.errors import InputError
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, same_scale
 from mvest.reporting.case.fields import CaseFields, read_case_fields
-from mvest.reporting.case.figures import corner_colours, distance_top, spread
-from mvest.reporting.figures import DISTANCE_MAP, save_figure
-from mvest.reporting.files import provenance_line
+from mvest.reporting.case.figures import corner_colours, distance_top
+from mvest.reporting.case.findings import ModuliAlone, UnknownRow
+from mvest.reporting.figures import DISTANCE_MAP, save_figure_with
+from mvest.reporting.findings import Spread
 from mvest.reporting.markup import MISSING, number
 
 __all__ = [
     "PATIENTS",
     "POPULATION",
-    "Record",
     "distance_words",
     "in_order",
     "provenance_of",
@@ -37,8 +39,6 @@ __all__ = [
     "table3",
     "write_patient_tables",
 ]
-
-Record = Mapping[str, Any]
 
 PATIENTS, POPULATION = "patients", "population"
 """Folders of the kept records within the results."""
@@ -56,71 +56,72 @@ NOTE = (
 )
 
 
-def in_order(records: Mapping[str, Record]) -> dict[str, Record]:
+def in_order(records: Mapping[str, Record[Findings]]) -> dict[str, Record[Findings]]:
     """Name -> record, in the order of the tables."""
 
-    def place(item: tuple[str, Record]) -> tuple[int, str]:
-        name = item[1]["case"]["name"]
+    def place(item: tuple[str, Record[Findings]]) -> tuple[int, str]:
+        name = _patient(item[1])
         return (ORDER.index(name) if name in ORDER else len(ORDER)), name
 
     return dict(sorted(records.items(), key=place))
 
 
 # -- Tables 2 and 3 -------------------------------------------------------------------------------
-def table2(records: Sequence[Record]) -> pd.DataFrame:
+def table2(records: Sequence[Record[Findings]]) -> pd.DataFrame:
     """One row for each patient and modulus E_f: estimates with intervals beside the truth, MPa."""
     rows = []
     for record in records:
-        for k, row in enumerate(_moduli(record["unknowns"])):
+        case, revealed = record.findings.case, record.findings.revealed
+        paper = revealed.paper_moduli if revealed else ()
+        for k, row in enumerate(_moduli(case.unknowns)):
             plain: dict[str, Any] = {
-                "patient": record["case"]["name"],
-                "modulus": row["name"],
-                "hidden truth [MPa]": row["truth"],
-                "estimate [MPa]": row["estimate"],
-                "95 % low [MPa]": row["low"],
-                "95 % high [MPa]": row["high"],
-                "inside": row.get("inside"),
+                "patient": case.about.name,
+                "modulus": row.name,
+                "hidden truth [MPa]": row.truth,
+                "estimate [MPa]": row.estimate,
+                "95 % low [MPa]": row.low,
+                "95 % high [MPa]": row.high,
+                "inside": row.inside,
             }
-            for key, words in (
-                ("without_nuisances", "without nuisances"),
-                ("as_in_the_paper", "paper's filter"),
+            for alone, words in (
+                (case.without_nuisances, "without nuisances"),
+                (case.as_in_the_paper, "paper's filter"),
             ):
-                other = record[key]
-                found = None if other is None else _moduli(other["parameters"])[k]
+                other = _moduli(alone.parameters)[k] if alone else None
                 plain |= {
-                    f"{words} [MPa]": None if found is None else found["estimate"],
-                    f"{words} 95 % low [MPa]": None if found is None else found["low"],
-                    f"{words} 95 % high [MPa]": None if found is None else found["high"],
-                    f"{words} inside": None if found is None else found.get("inside"),
-                    f"{words} ended": None if other is None else other["reason"],
+                    f"{words} [MPa]": other and other.estimate,
+                    f"{words} 95 % low [MPa]": other and other.low,
+                    f"{words} 95 % high [MPa]": other and other.high,
+                    f"{words} inside": other and other.inside,
+                    f"{words} ended": alone and alone.reason,
                 }
-            paper = record["paper_patient"]["moduli"]
             plain["paper's estimate for its patient [MPa]"] = paper[k] if paper else None
             rows.append(plain)
     return pd.DataFrame(rows)
 
 
-def table3(records: Sequence[Record]) -> pd.DataFrame:
+def table3(records: Sequence[Record[Findings]]) -> pd.DataFrame:
     """One row for each patient and frame: distances generic, registered, personalised, mm."""
     rows = []
     for record in records:
-        for distance in record["distances"]:
+        revealed = record.findings.revealed
+        for distance in record.findings.case.distances:
             plain: dict[str, Any] = {
-                "patient": record["case"]["name"],
-                "frame": distance["frame"],
-                "shown to the filter": distance["seen"],
+                "patient": _patient(record),
+                "frame": distance.frame,
+                "shown to the filter": distance.seen,
             }
-            for which in WHICH:
-                plain[f"{which} mean [mm]"] = distance[which]["mean"]
-                plain[f"{which} SD [mm]"] = distance[which]["std"]
-            generic, own = distance["generic"]["mean"], distance["personalised"]["mean"]
+            models = (distance.generic, distance.registered, distance.personalised)
+            for which, spread in zip(WHICH, models, strict=True):
+                plain[f"{which} mean [mm]"] = spread.mean
+                plain[f"{which} SD [mm]"] = spread.std
+            generic, own = distance.generic.mean, distance.personalised.mean
             plain["closer [%]"] = 100.0 * (generic - own) / generic
-            truth = distance["to_truth"]
+            truth = distance.to_truth
             for which in WHICH:
-                plain[f"{which} to the truth [mm]"] = (
-                    None if truth is None else truth[which]["mean"]
-                )
-            paper = record["paper_patient"]["distance_mm"] if distance["seen"] else []
+                off: Spread | None = getattr(truth, which) if truth else None
+                plain[f"{which} to the truth [mm]"] = off and off.mean
+            paper = revealed.paper_distance_mm if revealed and distance.seen else ()
             plain["paper generic [mm]"] = paper[0] if paper else None
             plain["paper personalised [mm]"] = paper[1] if paper else None
             rows.append(plain)
@@ -128,7 +129,7 @@ def table3(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def write_patient_tables(
-    results: Path, kept: Mapping[str, Record], arrays: Mapping[str, Path]
+    results: Path, kept: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
 ) -> list[Path]:
     """``table2.*``, ``table3.*`` and ``figure3.*`` from kept patients and their arrays.
 
@@ -148,41 +149,38 @@ def write_patient_tables(
             results / "table3", third, _readable3(third), line, [NOTE, *distance_words(third)]
         )
     fields = {
-        record["case"]["name"]: read_case_fields(arrays[name])
+        _patient(record): read_case_fields(arrays[name])
         for name, record in kept.items()
         if name in arrays
     }
     if fields:
-        written += save_figure(results / "figure3", figure3(fields), records[0])
+        written += save_figure_with(results / "figure3", figure3(fields), records[0].line)
     return written
 
 
-def _readable2(records: Sequence[Record]) -> list[dict[str, str]]:
+def _readable2(records: Sequence[Record[Findings]]) -> list[dict[str, str]]:
     rows = []
     for record in records:
-        row = {"patient (simulated)": _name(record)}
-        others = {
-            "without nuisances": record["without_nuisances"],
-            "paper's filter": record["as_in_the_paper"],
-        }
-        for k, found in enumerate(_moduli(record["unknowns"])):
+        case = record.findings.case
+        row = {"patient (simulated)": _words(case.about.name)}
+        for k, unknown in enumerate(_moduli(case.unknowns)):
             short = "E_AL" if k == 0 else "E_PL"
-            row[f"{short} truth"] = number(found["truth"])
-            row[f"{short} estimate, 95 %"] = interval_words(found)
-            for words, other in others.items():
-                row[f"{short} {words}"] = _other_words(other, k)
+            row[f"{short} truth"] = number(unknown.truth)
+            row[f"{short} estimate, 95 %"] = interval_words(unknown)
+            row[f"{short} without nuisances"] = _other_words(case.without_nuisances, k)
+            row[f"{short} paper's filter"] = _other_words(case.as_in_the_paper, k)
         rows.append(row)
     return rows
 
 
-def _other_words(other: Mapping[str, Any] | None, k: int) -> str:
+def _other_words(other: ModuliAlone | None, k: int) -> str:
     """What another estimation says of modulus k."""
     if other is None:
         return MISSING
-    row = _moduli(other["parameters"])[k]
-    if row["estimate"] is None:
+    row = _moduli(other.parameters)[k]
+    if row.estimate is None:
         return "none found"
-    return interval_words(row) + ("" if other["status"] == "converged" else ", not converged")
+    return interval_words(row) + ("" if other.converged else ", not converged")
 
 
 def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
@@ -210,7 +208,7 @@ def _mean_and_sd(row: Any, which: str) -> str:
     return f"{row[f'{which} mean [mm]']:.2f} ± {row[f'{which} SD [mm]']:.2f}"
 
 
-def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
+def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[str]:
     """What Table 2 says, in numbers."""
     known = table[table["inside"].notna()]
     said = [
@@ -235,13 +233,13 @@ def _words2(table: pd.DataFrame, records: Sequence[Record]) -> list[str]:
     return out
 
 
-def _narrower(records: Sequence[Record]) -> list[str]:
+def _narrower(records: Sequence[Record[Findings]]) -> list[str]:
     """By how much intervals would shrink if something were known, the largest share first."""
     ratios: dict[str, list[float]] = {}
     for record in records:
-        for row in record["narrow"]:
-            what = row["what"].partition(", ")[2]
-            ratios.setdefault(what, []).append(1.0 - row["std_if_known"] / row["std_now"])
+        for row in record.findings.case.narrow:
+            what = row.what.partition(", ")[2]
+            ratios.setdefault(what, []).append(1.0 - row.std_if_known / row.std_now)
     ordered = sorted(ratios.items(), key=lambda item: -np.mean(item[1]))
     return [f"{what} by {100 * np.mean(values):.0f} %" for what, values in ordered]
 
@@ -312,7 +310,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
             colours = corner_colours(scale, distance[k], found.triangles)
             draw_valve(axes, found, positions[k], colours, ATRIUM, k + 1, strength=0.3)
             title = f"{_words(name)}\n" if row == 0 else ""
-            axes.set_title(f"{title}{spread(distance[k])}", fontsize=9)
+            axes.set_title(f"{title}{Spread.of(distance[k])} mm", fontsize=9)
             if column == 0:
                 axes.text(
                     -0.06, 0.5, words, transform=axes.transAxes, rotation=90, va="center",
@@ -329,19 +327,19 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
 
 
 # -- words ----------------------------------------------------------------------------------------
-def _moduli(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    return [row for row in rows if row["name"].startswith("E_f.")]
+def _moduli(rows: Sequence[UnknownRow]) -> list[UnknownRow]:
+    return [row for row in rows if row.is_modulus]
 
 
-def _name(record: Record) -> str:
-    return _words(record["case"]["name"])
+def _patient(record: Record[Findings]) -> str:
+    return record.findings.case.about.name
 
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def provenance_of(records: Sequence[Record]) -> str:
+def provenance_of(records: Sequence[Record[Findings]]) -> str:
     """Where the first of several records came from, and how many there are besides."""
-    lines = sorted({provenance_line(record) for record in records})
+    lines = sorted({record.line for record in records})
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")

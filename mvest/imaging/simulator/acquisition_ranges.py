@@ -132,7 +132,7 @@ from that of training, and mostly on the worse side."""
 def draw_acquisition(
     rng: np.random.Generator,
     base: Acquisition | None = None,
-    spread: AcquisitionRanges | Literal["training", "shifted"] = "training",
+    spread: AcquisitionRanges | str = "training",
 ) -> Acquisition:
     """An acquisition drawn about a base; the result records every value.
 
@@ -141,7 +141,7 @@ def draw_acquisition(
     rng : numpy Generator
     base : Acquisition, optional
         The default one if none is given.
-    spread : AcquisitionRanges or its name
+    spread : AcquisitionRanges or its name, "training" or "shifted"
         What is drawn, and from where.
 
     Raises

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,48 +25,20 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.information import Information
 from mvest.reporting.figures import DISTANCE_MAP
+from mvest.reporting.findings import Spread
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
-    "FieldSummary",
     "case_figure",
     "distance_top",
     "figure3_caption",
     "information_figure",
     "innovation_map_figure",
     "shapes_figure",
-    "spread",
 ]
 
 INFORMATION_MAP = "YlOrRd"
 HIGH_QUANTILE = 0.99
-
-
-@dataclass(frozen=True, slots=True)
-class FieldSummary:
-    """Mean, standard deviation and largest of a field over the vertices that have a value."""
-
-    mean: float
-    std: float
-    largest: float
-    count: int
-
-    def __str__(self) -> str:
-        return f"{self.mean:.2f} ± {self.std:.2f} mm"
-
-
-def spread(values: FloatArray) -> FieldSummary:
-    """Mean ± SD over vertices, NaN left out.
-
-    Raises
-    ------
-    InputError
-        If no vertex has a value.
-    """
-    known = values[np.isfinite(values)]
-    if not known.size:
-        raise InputError("a field of distances without a single value")
-    return FieldSummary(float(known.mean()), float(known.std()), float(known.max()), known.size)
 
 
 def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
@@ -132,7 +103,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
             colours = corner_colours(scale, distance, fields.triangles)
             draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
             if row == 0:
-                axes.set_title(f"{title}\n{spread(distance)}", fontsize=11, pad=10)
+                axes.set_title(f"{title}\n{Spread.of(distance)} mm", fontsize=11, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
         _say_view(grid[row, 0], view.name)
@@ -155,12 +126,13 @@ def figure3_caption(fields: CaseFields) -> str:
     k = fields.closed
     if fields.distance_generic is None or fields.distance_fitted is None:
         raise InputError("Figure 3 needs the distances of the generic and the personalised valve")
-    generic, fitted = spread(fields.distance_generic[k]), spread(fields.distance_fitted[k])
+    generic, fitted = Spread.of(fields.distance_generic[k]), Spread.of(fields.distance_fitted[k])
+    count = np.isfinite(fields.distance_fitted[k]).sum()
     return (
         f"The closed valve (frame “{fields.frames[k]}”), coloured by the distance of each point "
-        f"from where the valve was observed; mean ± standard deviation over {fitted.count} points. "
-        f"Left: generic stiffness, {generic} (largest {generic.largest:.2f} mm). Right: "
-        f"personalised stiffness, {fitted} (largest {fitted.largest:.2f} mm). Both on one colour "
+        f"from where the valve was observed; mean ± standard deviation over {count} points. "
+        f"Left: generic stiffness, {generic} mm (largest {generic.max:.2f} mm). Right: "
+        f"personalised stiffness, {fitted} mm (largest {fitted.max:.2f} mm). Both on one colour "
         "scale; black line: annulus. Grey: not observed. " + MIDSURFACES
     )
 

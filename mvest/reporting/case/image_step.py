@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mvest.reporting.case.findings import CaseFindings
 from mvest.reporting.case.words import percent
 
 __all__ = ["frame_rows", "image_error_words"]
@@ -32,19 +33,20 @@ def frame_rows(frames: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     ]
 
 
-def image_error_words(record: Mapping[str, Any]) -> list[str]:
+def image_error_words(case: CaseFindings) -> list[str]:
     """What errors of the frames do to the intervals; empty where nothing is known of them."""
-    found = record.get("image_errors")
-    if not found:
+    errors = case.image_errors
+    if errors is None:
         return []
     out = [
-        f"The valve was closed anew with {found['samples']} samples of the errors of its images: "
+        f"The valve was closed anew with {errors.samples} samples of the errors of its images: "
         "of the open shape, annulus, tips and chordae as well as of the closed frame."
     ]
-    failures = found.get("failures") or []
-    if failures:
-        out.append(f"{len(failures)} of them did not close and were left out: {failures[0]}.")
-    labels = {row["name"]: row.get("label", row["name"]) for row in record.get("unknowns") or []}
-    for name, share in (found.get("share_of_variance") or {}).items():
+    if errors.failures:
+        out.append(
+            f"{len(errors.failures)} of them did not close and were left out: {errors.failures[0]}."
+        )
+    labels = {row.name: row.label for row in case.unknowns}
+    for name, share in (errors.share_of_variance or {}).items():
         out.append(f"Of the variance of {labels.get(name, name)} they make {percent(share)}.")
     return out

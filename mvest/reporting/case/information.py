@@ -9,7 +9,7 @@ Processing I, 1993, chapter 3: the Schur complement of the information matrix).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,13 +18,13 @@ from scipy.linalg import lstsq
 from scipy.spatial import cKDTree
 
 from mvest.reporting.case.fields import CaseFields
+from mvest.reporting.case.findings import NUISANCE, UnknownRow
 from mvest.typing import FloatArray
 
 __all__ = ["Information", "columns_of", "information", "where_words"]
 
 ZONES = ("annular third", "belly", "third at the free edge")
 """Thirds of the way from the annulus to the free edge."""
-MODULUS, NUISANCE = "modulus", "nuisance"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,29 +50,29 @@ class Information:
     kept: float
 
 
-def columns_of(parameters: Sequence[Mapping[str, Any]], width: int) -> list[Mapping[str, Any]]:
+def columns_of(parameters: Sequence[UnknownRow], width: int) -> list[UnknownRow]:
     """The parameters to which ``width`` columns of a result belong; none if no choice fits."""
     for treatments in (
         ("estimated",),
         ("estimated", "considered"),
         ("estimated", "considered", "fixed"),
     ):
-        chosen = [p for p in parameters if p["treatment"] in treatments]
+        chosen = [p for p in parameters if p.treatment in treatments]
         if len(chosen) == width:
             return chosen
     return []
 
 
 def information(
-    fields: CaseFields, parameters: Sequence[Mapping[str, Any]], std_mm: float | None
+    fields: CaseFields, parameters: Sequence[UnknownRow], std_mm: float | None
 ) -> list[Information]:
     """Maps of the information on each modulus; empty where sensitivities are missing.
 
     Parameters
     ----------
     fields : CaseFields
-    parameters : sequence of mapping
-        Of the record, in the order of the columns of ``fields.sensitivity``.
+    parameters : sequence of UnknownRow
+        In the order of the columns of ``fields.sensitivity``.
     std_mm : float, optional
         Standard deviation of an observed coordinate; without it 1 mm is taken, and the nuisances
         count as unknown beforehand.
@@ -84,18 +84,18 @@ def information(
     seen = _seen(fields)
     S = np.where(seen[:, None, None], fields.sensitivity, 0.0).reshape(3 * n, -1)
     S = S / (1.0 if std_mm is None else std_mm)
-    nuisance = [k for k, p in enumerate(columns) if p["kind"] == NUISANCE]
+    nuisance = [k for k, p in enumerate(columns) if p.kind == NUISANCE]
     informations = []
     for k, parameter in enumerate(columns):
-        if parameter["kind"] != MODULUS or parameter.get("estimate") is None:
+        if not parameter.is_modulus or parameter.estimate is None:
             continue
-        own = S[:, k] * parameter["estimate"]
+        own = S[:, k] * parameter.estimate
         rest = _beyond(own, S[:, nuisance], [columns[i] for i in nuisance], std_mm)
         raw = float(own @ own)
         informations.append(
             Information(
-                str(parameter["name"]),
-                str(parameter["label"]),
+                parameter.name,
+                parameter.label,
                 np.where(seen, (own.reshape(n, 3) ** 2).sum(axis=1), np.nan),
                 np.where(seen, (rest.reshape(n, 3) ** 2).sum(axis=1), np.nan),
                 float(rest @ own) / raw if raw > 0 else 0.0,
@@ -107,13 +107,13 @@ def information(
 def _beyond(
     own: FloatArray,
     nuisance: FloatArray,
-    parameters: Sequence[Mapping[str, Any]],
+    parameters: Sequence[UnknownRow],
     std_mm: float | None,
 ) -> FloatArray:
     """Part of a column that no combination of the nuisances, as likely beforehand, gives."""
     if not parameters:
         return own
-    scale = np.array([p.get("prior_std") or 1.0 for p in parameters])
+    scale = np.array([p.prior_std or 1.0 for p in parameters])
     columns, target = nuisance * scale, own
     if std_mm is not None:
         columns = np.concatenate([columns, np.eye(len(scale))])

@@ -1,7 +1,7 @@
 """``report.html`` of one case: what was estimated, how far to trust it, and what it rests on.
 
 The page opens from disk and loads nothing: pictures and the script of the turnable valve are in
-it, and its content policy forbids every request. Text of the record is escaped by the template.
+it, and its content policy forbids every request. Text of the findings is escaped by the template.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mvest.reporting.case.figures import (
     innovation_map_figure,
     shapes_figure,
 )
+from mvest.reporting.case.findings import CaseFindings
 from mvest.reporting.case.image_step import frame_rows, image_error_words
 from mvest.reporting.case.information import Information, information, where_words
 from mvest.reporting.case.plots import (
@@ -48,39 +49,46 @@ FULL_WIDTH_INCHES = 8.6
 FLAT_SHARE = 0.25
 """A modulus of whose information less than this remains is said to hide behind the nuisances."""
 
-Record = Mapping[str, Any]
 
-
-def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
+def write_case_report(
+    folder: Path,
+    case: CaseFindings,
+    fields: Path,
+    line: str = "",
+    provenance: Mapping[str, Any] | None = None,
+) -> list[Path]:
     """Write the page of a case and its pictures (PNG and PDF); returns their paths.
 
     Parameters
     ----------
     folder : Path
         Made if it does not exist.
-    record : mapping
-        The result of the run as plain data. Whatever is missing or None is left out of the page,
-        with a sentence in its place.
+    case : CaseFindings
+        Whatever is missing is left out of the page, with a sentence in its place.
     fields : Path
         The ``.npz`` file of `mvest.reporting.case.fields.read_case_fields`.
+    line : str
+        Where the findings came from, for the foot of each picture.
+    provenance : mapping, optional
+        The same in full, for the end of the page.
 
     Raises
     ------
     InputError
-        If the fields cannot be read, do not fit the record, or a file cannot be written.
+        If the fields cannot be read, do not fit the findings, or a file cannot be written.
     """
     shapes = read_case_fields(fields)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    names = words.leaflet_names(record, int(shapes.region.max()) + 1)
-    informations = information(shapes, record.get("parameters") or [], _observation_std(record))
-    note = words.provenance_note(record)
+    names = words.leaflet_names(case, int(shapes.region.max()) + 1)
+    informations = information(shapes, case.unknowns, case.observation_std_mm)
+    note = words.provenance_note(case, line)
     written: list[Path] = []
     pictures: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
-    for name, make, caption in _figures(record, shapes, names, informations):
+    for name, make, caption in _figures(case, shapes, names, informations):
         try:
             figure, text = make(), caption()
         except InputError as error:
@@ -91,11 +99,10 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
         pictures[name] = embedded(paths[0], text) | {"percent": round(100 * share)}
         written += paths
-    step = record.get("image_step")
-    for name, shown in ((step or {}).get("pictures") or {}).items():
+    for name, shown in (case.image_step.pictures if case.image_step else {}).items():
         # Drawn with the volume at hand, and kept beside the page.
         try:
-            pictures[name] = embedded(folder / shown["file"], shown["caption"]) | {"percent": 100}
+            pictures[name] = embedded(folder / shown.file, shown.caption) | {"percent": 100}
         except InputError as error:
             missing[name] = f"Not shown: {error}."
     environment = Environment(
@@ -109,16 +116,25 @@ def write_case_report(folder: Path, record: Record, fields: Path) -> list[Path]:
         missing=missing,
         view=case_view(shapes, names),
         files=[path.name for path in written],
-        **_content(record, shapes, names, informations),
+        **_content(case, shapes, names, informations),
+        provenance=words.setting_rows(
+            {
+                **(provenance or {}),
+                **({"case files, SHA-256": case.about.sha256} if case.about.sha256 else {}),
+            }
+        ),
     )
     return [write_atomically(folder / REPORT, page), *written]
 
 
 def _figures(
-    record: Record, shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
+    case: CaseFindings,
+    shapes: CaseFields,
+    names: Sequence[str],
+    informations: Sequence[Information],
 ) -> list[tuple[str, Callable[[], Figure], Callable[[], str]]]:
     """Name, drawing and caption of each picture; either raises where something is missing."""
-    marked = " Simulated." if (record.get("case") or {}).get("simulated") else ""
+    marked = " Simulated." if case.about.simulated else ""
     texts = {
         "shapes": "The valve open and closed, from the atrium and from the side. Colours tell the "
         "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary tips. "
@@ -143,75 +159,55 @@ def _figures(
     return [
         ("shapes", lambda: shapes_figure(shapes, names), said("shapes")),
         ("figure3", lambda: case_figure(shapes, names), lambda: figure3_caption(shapes) + marked),
-        ("estimates", lambda: estimates_figure(record), said("estimates")),
+        ("estimates", lambda: estimates_figure(case), said("estimates")),
         (
             "identifiability",
             lambda: information_figure(shapes, informations),
             said("identifiability"),
         ),
-        ("iterations", lambda: iterations_figure(record), said("iterations")),
+        ("iterations", lambda: iterations_figure(case), said("iterations")),
         ("innovation", lambda: innovation_figure(shapes), said("innovation")),
         (
             "innovation_map",
             lambda: innovation_map_figure(shapes, names),
             said("innovation_map"),
         ),
-        (
-            "distances",
-            lambda: distances_figure(record.get("distances") or []),
-            said("distances"),
-        ),
-        ("narrow", lambda: narrow_figure(record.get("narrow") or []), said("narrow")),
+        ("distances", lambda: distances_figure(case.distances), said("distances")),
+        ("narrow", lambda: narrow_figure(case.narrow), said("narrow")),
     ]
 
 
 def _content(
-    record: Record, shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
+    case: CaseFindings,
+    shapes: CaseFields,
+    names: Sequence[str],
+    informations: Sequence[Information],
 ) -> dict[str, Any]:
-    case = record.get("case") or {}
-    narrow = record.get("narrow") or []
+    step = case.image_step
     return {
-        "title": str(record.get("title") or case.get("name") or "A valve"),
-        "badges": words.badges(record),
-        "answer": words.answer(record),
-        "status": record.get("status"),
-        "reason": record.get("reason"),
-        "gate": record.get("gate"),
-        "case": {
-            key: case.get(key)
-            for key in ("name", "description", "source", "licence", "simulated", "derived")
-        },
-        "moduli": words.moduli_rows(record),
-        "parameters": words.parameter_rows(record),
-        "has_without": bool((record.get("without_nuisances") or {}).get("parameters")),
-        "has_truth": bool(case.get("simulated"))
-        and any(m.get("truth") is not None for m in record.get("moduli") or []),
+        "title": case.title,
+        "badges": words.badges(case),
+        "answer": words.answer(case),
+        "status": case.status,
+        "reason": case.reason,
+        "gate": words.confirmation(case),
+        "case": case.about,
+        "moduli": words.moduli_rows(case),
+        "parameters": words.parameter_rows(case),
+        "has_without": case.without_nuisances is not None,
+        "has_truth": case.about.simulated and any(m.truth is not None for m in case.moduli),
         "where": _where(shapes, names, informations),
-        "identifiability": words.identifiability_words(record),
-        "shares": words.share_rows(record),
-        "innovation": words.innovation_words(record),
-        "whiteness": words.whiteness_rows(record),
-        "distances": words.distance_rows(record),
-        "held_out": words.distance_words(record),
-        "measurements": words.measurement_rows(record),
-        "image_step": _image_step(record),
-        "image_errors": image_error_words(record),
-        "narrow": words.narrow_words(narrow) if narrow else "",
-        "settings": words.setting_rows(record.get("settings") or {}),
-        "provenance": words.provenance_rows(record),
-    }
-
-
-def _image_step(record: Record) -> dict[str, Any] | None:
-    """Sentences, names of pictures and the table of the image step; None where there was none."""
-    step = record.get("image_step")
-    if step is None:
-        return None
-    return {
-        "sentences": list(step.get("sentences") or []),
-        "pictures": list(step.get("pictures") or {}),
-        "frames": frame_rows(step.get("frames") or []),
-        "files": list(step.get("files") or []),
+        "identifiability": words.identifiability_words(case),
+        "innovation": words.innovation_words(case.innovation),
+        "whiteness": words.whiteness_rows(case.whiteness),
+        "distances": words.distance_rows(case),
+        "held_out": words.distance_words(case),
+        "measurements": words.measurement_rows(case),
+        "image_step": step,
+        "image_frames": frame_rows(step.frames) if step else [],
+        "image_errors": image_error_words(case),
+        "narrow": words.narrow_words(case.narrow) if case.narrow else "",
+        "settings": words.setting_rows(case.settings),
     }
 
 
@@ -239,12 +235,7 @@ def _where(
 
 
 def _print_dollars(figure: Figure) -> None:
-    """Have text of the record printed as it stands: matplotlib sets dollars as mathematics."""
+    """Have text of the findings printed as it stands: matplotlib sets dollars as mathematics."""
     for text in figure.findobj(Text):
         if isinstance(text, Text) and "$" in text.get_text():
             text.set_parse_math(False)
-
-
-def _observation_std(record: Record) -> float | None:
-    value = (record.get("identifiability") or {}).get("observation_std_mm")
-    return None if value is None else float(value)

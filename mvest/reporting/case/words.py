@@ -1,6 +1,6 @@
-"""Sentences and tables of one case's page, computed from its record.
+"""Sentences and tables of one case's page, computed from its findings.
 
-What a record does not have becomes a sentence that says so; nothing is put in its place.
+What findings do not have becomes a sentence that says so; nothing is put in its place.
 """
 
 from __future__ import annotations
@@ -10,18 +10,26 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mvest.reporting.case.findings import (
+    CaseFindings,
+    ModulusRow,
+    Narrower,
+    UnknownRow,
+    WhitenessTest,
+)
 from mvest.reporting.case.information import columns_of
 from mvest.reporting.expectation import alike_words
+from mvest.reporting.findings import Innovation, Spread
 from mvest.reporting.markup import MISSING, number
 
 __all__ = [
     "answer",
     "badges",
+    "confirmation",
     "distance_rows",
     "distance_words",
     "identifiability_words",
     "innovation_words",
-    "interval",
     "leaflet_names",
     "measurement_rows",
     "moduli_rows",
@@ -29,13 +37,10 @@ __all__ = [
     "parameter_rows",
     "percent",
     "provenance_note",
-    "provenance_rows",
     "setting_rows",
-    "share_rows",
     "whiteness_rows",
 ]
 
-Record = Mapping[str, Any]
 Rows = list[dict[str, str]]
 
 MODULUS_NAMES = {
@@ -43,60 +48,53 @@ MODULUS_NAMES = {
     "E_perp": "stiffness across the fibres, E_perp",
     "G": "shear stiffness, G",
 }
-CONVERGED = "converged"
 MODULUS_UNIT = "MPa"
 HASH_DIGITS = 12
 NO_BREAK = "\N{NO-BREAK SPACE}"
-DISTANCES = ("generic", "registered", "personalised", "to_truth")
 WHICH = ("observed", "generic", "personalised")
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
 
 
-def leaflet_names(record: Record, regions: int) -> list[str]:
+def leaflet_names(case: CaseFindings, regions: int) -> list[str]:
     """Names of the leaflets in the order of their regions; numbers where they are not known."""
-    names = list(record.get("region_names") or [])
-    if not names:
-        names = list(dict.fromkeys(str(m["region"]) for m in record.get("moduli") or []))
-    if len(names) != regions:
-        return [f"leaflet {k + 1}" for k in range(regions)]
-    return [str(name) for name in names]
+    names = list(case.about.regions)
+    return names if len(names) == regions else [f"leaflet {k + 1}" for k in range(regions)]
 
 
-def interval(entry: Record, unit: str) -> str:
-    """``5.8 MPa (95 % interval 4.1 to 8.2)``, without what is missing."""
-    if entry.get("estimate") is None:
-        return "no estimate"
-    text = f"{number(entry['estimate'], 2)}{NO_BREAK}{unit}".rstrip()
-    if entry.get("low") is None or entry.get("high") is None:
-        return text
-    low, high = number(entry["low"], 2), number(entry["high"], 2)
-    return f"{text} (95{NO_BREAK}% interval {low} to {high})"
-
-
-def answer(record: Record) -> str:
+def answer(case: CaseFindings) -> str:
     """The result in one sentence."""
-    moduli = [m for m in record.get("moduli") or [] if m.get("estimate") is not None]
-    if not moduli:
-        reason = record.get("reason") or "the run gives no reason"
-        return f"No stiffness was estimated: {reason}."
-    fibre = [m for m in moduli if m["name"] == "E_f"] or moduli
-    parts = [f"{m['name']} {m['region']} {interval(m, MODULUS_UNIT)}" for m in fibre]
-    return "; ".join(parts) + "."
+    if not case.moduli:
+        return f"No stiffness was estimated: {case.reason or 'the run gives no reason'}."
+    fibre = [m for m in case.moduli if m.name == "E_f"] or case.moduli
+    return "; ".join(f"{m.name} {m.region} {_interval(m)}" for m in fibre) + "."
 
 
-def badges(record: Record) -> list[str]:
+def _interval(modulus: ModulusRow) -> str:
+    """``5.8 MPa (95 % interval 4.1 to 8.2)``."""
+    low, high = number(modulus.low, 2), number(modulus.high, 2)
+    return (
+        f"{number(modulus.estimate, 2)}{NO_BREAK}{MODULUS_UNIT} "
+        f"(95{NO_BREAK}% interval {low} to {high})"
+    )
+
+
+def badges(case: CaseFindings) -> list[str]:
     """Short warnings beside the title."""
-    case = record.get("case") or {}
-    labels = [str(text) for text in record.get("badges") or []]
-    if case.get("simulated"):
-        labels.append("SIMULATED")
-    stated = " ".join(str(case.get(key) or "") for key in ("name", "description", "source")).lower()
-    if "tricuspid" in stated and not any("TRICUSPID" in text.upper() for text in labels):
+    about = case.about
+    labels = ["SIMULATED"] if about.simulated else []
+    stated = " ".join((about.name, about.description, about.source)).lower()
+    if "tricuspid" in stated:
         labels.append("DONOR TRICUSPID" if "donor" in stated else "TRICUSPID")
-    status = record.get("status")
-    if status and status != CONVERGED:
-        labels.append(f"RUN {str(status).upper()}")
+    if not case.converged:
+        labels.append(f"RUN {case.status.upper()}")
     return [*labels, "NOT FOR DIAGNOSIS"]
+
+
+def confirmation(case: CaseFindings) -> str | None:
+    """Whether the closed state is also reached from the open valve; None if that was not tried."""
+    if case.confirmed_mm is None:
+        return None
+    return f"closed anew from the open valve it differs by at most {case.confirmed_mm:.2g} mm"
 
 
 def percent(share: float) -> str:
@@ -104,216 +102,187 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f}{NO_BREAK}%"
 
 
-def moduli_rows(record: Record) -> Rows:
+def moduli_rows(case: CaseFindings) -> Rows:
     """Each modulus with its interval, and the truth if it is known."""
-    moduli = record.get("moduli") or []
-    known = any(m.get("truth") is not None for m in moduli)
+    known = any(m.truth is not None for m in case.moduli)
     rows = []
-    for m in moduli:
+    for m in case.moduli:
         row = {
-            "leaflet": str(m["region"]),
-            "modulus": MODULUS_NAMES.get(str(m["name"]), str(m["name"])),
-            f"estimate [{MODULUS_UNIT}]": number(m.get("estimate")),
+            "leaflet": m.region,
+            "modulus": MODULUS_NAMES.get(m.name, m.name),
+            f"estimate [{MODULUS_UNIT}]": number(m.estimate),
             "95 % interval": _range(m),
         }
         if known:
-            row["truth"] = number(m.get("truth"))
+            row["truth"] = number(m.truth)
             row["truth within the interval"] = _holds(m)
         rows.append(row)
     return rows
 
 
-def parameter_rows(record: Record) -> Rows:
-    """Each parameter as it was believed beforehand and estimated, with and without nuisances."""
-    without = {
-        p["name"]: p for p in (record.get("without_nuisances") or {}).get("parameters") or []
-    }
-    parameters = record.get("parameters") or []
-    known = any(p.get("truth") is not None for p in parameters)
+def parameter_rows(case: CaseFindings) -> Rows:
+    """Each unknown as it was believed beforehand and estimated, with and without nuisances."""
+    alone = case.without_nuisances
+    without = {} if alone is None else {p.name: p for p in alone.parameters}
+    known = any(p.truth is not None for p in case.unknowns)
     rows = []
-    for p in parameters:
+    for p in case.unknowns:
         row = {
-            "parameter": str(p["label"]),
-            "unit": str(p.get("unit") or "") or MISSING,
-            "treated as": f"{p['kind']}, {p['treatment']}",
-            "beforehand": _with_std(p.get("prior_mean"), p.get("prior_std")),
-            "estimate": _with_std(p.get("estimate"), p.get("std")),
+            "parameter": p.label,
+            "unit": p.unit or MISSING,
+            "treated as": f"{p.kind}, {p.treatment}",
+            "beforehand": _with_std(p.prior_mean, p.prior_std),
+            "estimate": _with_std(p.estimate, p.std),
             "95 % interval": _range(p),
         }
         if without:
-            alone = without.get(p["name"]) or {}
-            row["nuisances taken as known"] = _with_std(alone.get("estimate"), alone.get("std"))
-            row["its 95 % interval"] = _range(alone)
+            other = without.get(p.name)
+            row["nuisances taken as known"] = (
+                MISSING if other is None else _with_std(other.estimate, other.std)
+            )
+            row["its 95 % interval"] = MISSING if other is None else _range(other)
         if known:
-            row["truth"] = number(p.get("truth"))
+            row["truth"] = number(p.truth)
         rows.append(row)
     return rows
 
 
-def _with_std(value: Any, std: Any) -> str:
+def _with_std(value: float | None, std: float | None) -> str:
     text = number(value)
-    return text if text == MISSING or std is None else f"{text} ± {number(std, 2)}"
+    return text if value is None or std is None else f"{text} ± {number(std, 2)}"
 
 
-def _range(entry: Record) -> str:
-    if entry.get("low") is None or entry.get("high") is None:
+def _range(entry: ModulusRow | UnknownRow) -> str:
+    if entry.low is None or entry.high is None:
         return MISSING
-    return f"{number(entry['low'])} to {number(entry['high'])}"
+    return f"{number(entry.low)} to {number(entry.high)}"
 
 
-def _holds(entry: Record) -> str:
-    if any(entry.get(key) is None for key in ("low", "high", "truth")):
+def _holds(modulus: ModulusRow) -> str:
+    if modulus.truth is None:
         return MISSING
-    return "yes" if entry["low"] <= entry["truth"] <= entry["high"] else "NO"
+    return "yes" if modulus.low <= modulus.truth <= modulus.high else "NO"
 
 
-def distance_rows(record: Record) -> Rows:
+def distance_rows(case: CaseFindings) -> Rows:
     """Mean ± SD and largest distance of each model in each frame."""
+    known = any(d.to_truth for d in case.distances)
     rows = []
-    distances = record.get("distances") or []
-    shown = [name for name in DISTANCES if any(d.get(name) for d in distances)]
-    titles = {"registered": "generic, moved rigidly", "to_truth": "personalised to the truth"}
-    for d in distances:
-        row = {"frame": str(d["frame"]), "shown to the filter": "yes" if d.get("seen") else "no"}
-        for name in shown:
-            row[f"{titles.get(name, name)} [mm]"] = _spread(d.get(name))
+    for d in case.distances:
+        row = {
+            "frame": d.frame,
+            "shown to the filter": "yes" if d.seen else "no",
+            "generic [mm]": _spread(d.generic),
+            "generic, moved rigidly [mm]": _spread(d.registered),
+            "personalised [mm]": _spread(d.personalised),
+        }
+        if known:
+            row["personalised to the truth [mm]"] = (
+                _spread(d.to_truth.personalised) if d.to_truth else MISSING
+            )
         rows.append(row)
     return rows
 
 
-def _spread(entry: Record | None) -> str:
-    if not entry:
-        return MISSING
-    text = f"{entry['mean']:.2f} ± {entry['std']:.2f}"
-    return text if entry.get("max") is None else f"{text}, largest {entry['max']:.2f}"
+def _spread(entry: Spread) -> str:
+    return f"{entry}, largest {entry.max:.2f}"
 
 
-def distance_words(record: Record) -> str:
+def distance_words(case: CaseFindings) -> str:
     """Whether personalising brought frames nearer that the filter was not shown."""
-    held_out = [
-        d
-        for d in record.get("distances") or []
-        if not d.get("seen") and d.get("generic") and d.get("personalised")
-    ]
-    if not held_out:
+    parts = []
+    for d in case.distances:
+        if d.seen:
+            continue
+        before, after = d.generic.mean, d.personalised.mean
+        verdict = "nearer than" if after < before else "NOT nearer than"
+        parts.append(
+            f"{d.frame}: the personalised valve is {after:.2f} mm away on average, {verdict} "
+            f"the generic one ({before:.2f} mm)"
+        )
+    if not parts:
         return (
             "No frame was held out, so nothing here says how the personalised valve predicts a "
             "closure that it was not fitted to."
         )
-    parts = []
-    for d in held_out:
-        before, after = d["generic"]["mean"], d["personalised"]["mean"]
-        verdict = "nearer than" if after < before else "NOT nearer than"
-        parts.append(
-            f"{d['frame']}: the personalised valve is {after:.2f} mm away on average, {verdict} "
-            f"the generic one ({before:.2f} mm)"
-        )
     return "In frames that the filter was not shown: " + "; ".join(parts) + "."
 
 
-def identifiability_words(record: Record) -> list[str]:
+def identifiability_words(case: CaseFindings) -> list[str]:
     """What the data alone could tell, in sentences."""
-    data = record.get("identifiability") or {}
-    moduli = {str(p["name"]): str(p["label"]) for p in record.get("parameters") or []}
+    data = case.identifiability
+    if data is None:
+        return []
+    labels = {p.name: p.label for p in case.unknowns}
     words = []
-    if data.get("condition_number") is not None:
+    if data.condition_number is not None:
         words.append(
-            f"Condition number of the information matrix: {number(data['condition_number'])} "
+            f"Condition number of the information matrix: {number(data.condition_number)} "
             "(1: all parameters are told apart equally well)."
         )
-    flat = [moduli.get(str(name), str(name)) for name in data.get("flat") or []]
-    if flat:
+    if data.flat:
         words.append(
-            "The data alone do not determine: " + ", ".join(flat) + ". What is said of them rests "
-            "on what was believed beforehand."
+            "The data alone do not determine: "
+            + ", ".join(labels.get(name, name) for name in data.flat)
+            + ". What is said of them rests on what was believed beforehand."
         )
-    words += [alike_words(group, moduli) for group in data.get("confounded") or []]
-    bound = data.get("cramer_rao_std")
-    columns = columns_of(record.get("parameters") or [], len(bound or []))
-    if bound and columns:
+    words += [alike_words(group, labels) for group in data.confounded]
+    columns = columns_of(case.unknowns, len(data.cramer_rao_std))
+    if columns:
         bounds = ", ".join(
-            f"{p['label']} {number(s, 2)} {p.get('unit') or ''}".rstrip()
-            for p, s in zip(columns, bound, strict=True)
+            f"{p.label} {number(s, 2)} {p.unit}".rstrip()
+            for p, s in zip(columns, data.cramer_rao_std, strict=True)
         )
         words.append(f"Smallest standard deviations that the data alone allow: {bounds}.")
     return words
 
 
-def share_rows(record: Record) -> Rows:
-    """From which nuisance the uncertainty of each parameter comes, in per cent."""
-    shares = (record.get("identifiability") or {}).get("shares") or []
-    labels = {str(p["name"]): str(p["label"]) for p in record.get("parameters") or []}
-    names = dict.fromkeys(name for row in shares for name in row.get("from") or {})
+def innovation_words(innovation: Innovation | None) -> list[str]:
+    """What the innovation says, in sentences."""
+    if innovation is None:
+        return []
+    size, nis, (low, high) = innovation.size, innovation.nis, innovation.nis_band
+    # About 1 if all is as assumed.
+    over_expected = number(math.sqrt(nis / size)) if size else MISSING
     return [
-        {"uncertainty of": labels.get(str(row["parameter"]), str(row["parameter"]))}
-        | {
-            f"from {labels.get(str(name), str(name))} [%]": MISSING
-            if (row.get("from") or {}).get(name) is None
-            else f"{100 * row['from'][name]:.0f}"
-            for name in names
-        }
-        for row in shares
+        f"Root mean square of the {_large(size)} innovations: {number(innovation.rms)} mm; over "
+        f"what is expected of each where model and noise are as assumed: {over_expected}.",
+        f"Normalised innovation squared {_large(nis)}, "
+        f"{'inside' if low <= nis <= high else 'OUTSIDE'} its 95 % band {_large(low)} to "
+        f"{_large(high)}.",
     ]
 
 
-def _over_expected(innovation: Mapping[str, Any]) -> str:
-    """Root mean square of the standardised innovation, about 1 if all is as assumed."""
-    size, nis = innovation.get("size"), innovation.get("nis")
-    return number(math.sqrt(nis / size)) if size and nis is not None else MISSING
-
-
-def innovation_words(record: Record) -> list[str]:
-    """What the innovation says, in sentences."""
-    innovation = record.get("innovation") or {}
-    words = []
-    if innovation.get("rms") is not None:
-        words.append(
-            f"Root mean square of the {_large(innovation.get('size'))} innovations: "
-            f"{number(innovation['rms'])} mm; over what is expected of each where model and noise "
-            f"are as assumed: {_over_expected(innovation)}."
-        )
-    band = innovation.get("nis_band")
-    if innovation.get("nis") is not None and band:
-        inside = band[0] <= innovation["nis"] <= band[1]
-        words.append(
-            f"Normalised innovation squared {_large(innovation['nis'])}, "
-            + ("inside" if inside else "OUTSIDE")
-            + f" its 95 % band {_large(band[0])} to {_large(band[1])}."
-        )
-    return words
-
-
-def whiteness_rows(record: Record) -> Rows:
+def whiteness_rows(tests: Sequence[WhitenessTest]) -> Rows:
     """The tests of the innovation."""
     return [
         {
-            "test": str(t["name"]),
-            "statistic": number(t.get("statistic")),
-            "p-value": number(t.get("p_value"), 2),
-            "verdict": str(t.get("verdict") or MISSING),
+            "test": test.name,
+            "statistic": number(test.statistic),
+            "p-value": number(test.p_value, 2),
+            "verdict": test.verdict,
         }
-        for t in (record.get("innovation") or {}).get("tests") or []
+        for test in tests
     ]
 
 
-def narrow_words(narrow: Sequence[Record]) -> str:
+def narrow_words(narrow: Sequence[Narrower]) -> str:
     """Which knowledge would narrow an interval most."""
-    best = min(narrow, key=lambda r: r["std_if_known"] / r["std_now"])
-    share = 1 - best["std_if_known"] / best["std_now"]
+    best = min(narrow, key=lambda r: r.std_if_known / r.std_now)
+    share = 1 - best.std_if_known / best.std_now
     if share < 0.01:
         return "Knowing any one of these exactly would narrow the interval by less than 1 %."
     return (
-        f"Most would be gained here: {best['what']}. The standard deviation would fall by "
-        f"{percent(share)}, from {number(best['std_now'])} to {number(best['std_if_known'])}."
+        f"Most would be gained here: {best.what}. The standard deviation would fall by "
+        f"{percent(share)}, from {number(best.std_now)} to {number(best.std_if_known)}."
     )
 
 
-def measurement_rows(record: Record) -> Rows:
+def measurement_rows(case: CaseFindings) -> Rows:
     """One row for each measurement, one column for each frame and shape."""
-    frames = record.get("measurements") or {}
     columns = [
         (frame, which, values[which])
-        for frame, values in frames.items()
+        for frame, values in case.measurements.items()
         for which in (*WHICH, *(w for w in values if w not in WHICH))
         if values.get(which)
     ]
@@ -325,22 +294,22 @@ def measurement_rows(record: Record) -> Rows:
     ]
 
 
-def _large(value: Any) -> str:
+def _large(value: float | None) -> str:
     """A number whose thousands are written out."""
-    whole = isinstance(value, int | float) and 1e4 <= abs(value) < 1e7
+    whole = value is not None and 1e4 <= abs(value) < 1e7
     return f"{value:.0f}" if whole else number(value)
 
 
 def _measurement_label(name: str) -> str:
     """``annulus_area_mm2`` as ``annulus area [mm²]``."""
-    words, _, unit = str(name).rpartition("_")
+    words, _, unit = name.rpartition("_")
     if unit not in UNITS or not words:
-        return str(name).replace("_", " ")
+        return name.replace("_", " ")
     text = re.sub(r"\bap\b", "AP", words.replace("_", " "))
     return f"{text} [{UNITS[unit]}]" if UNITS[unit] else text
 
 
-def setting_rows(settings: Any) -> Rows:
+def setting_rows(settings: Mapping[str, Any]) -> Rows:
     """Nested settings as rows of dotted names; lists stay in one cell."""
     return [{"setting": name, "value": text} for name, text in _walk(settings, "")]
 
@@ -355,31 +324,14 @@ def _walk(value: Any, name: str) -> Iterator[tuple[str, str]]:
         yield name, MISSING if value is None else str(value)
 
 
-def provenance_rows(record: Record) -> Rows:
-    """Where the result came from."""
-    rows = setting_rows(record.get("provenance") or {})
-    case = record.get("case") or {}
-    if case.get("sha256"):
-        rows.append({"setting": "case files, SHA-256", "value": str(case["sha256"])})
-    return rows
-
-
-def provenance_note(record: Record) -> str:
-    """Commit, version, configuration and mesh in one line, for the foot of each picture."""
-    source = record.get("provenance") or {}
-    git = source.get("git") or source.get("git_sha") or source.get("sha")
-    sha, dirty = (git.get("sha"), git.get("dirty")) if isinstance(git, Mapping) else (git, False)
-    parts = [str(record.get("title") or "a case")]
-    if (case := record.get("case") or {}).get("simulated"):
-        parts.append("simulated")
-    if case.get("sha256"):
-        parts.append(f"case {str(case['sha256'])[:HASH_DIGITS]}")
-    if version := (source.get("versions") or {}).get("mvest"):
-        parts.append(f"mvest {version}")
-    if sha:
-        parts.append(f"commit {str(sha)[:HASH_DIGITS]}{'+changes' if dirty else ''}")
-    for key in ("config_hash", "mesh_hash"):
-        if source.get(key):
-            parts.append(f"{key.removesuffix('_hash')} {str(source[key])[:HASH_DIGITS]}")
+def provenance_note(case: CaseFindings, line: str) -> str:
+    """The case, and where its findings came from, in one line for the foot of each picture."""
+    about = case.about
+    parts = [
+        case.title,
+        "simulated" if about.simulated else "",
+        f"case {about.sha256[:HASH_DIGITS]}" if about.sha256 else "",
+        line,
+    ]
     # matplotlib reads what stands between dollars as mathematics.
-    return ", ".join(parts).replace("$", r"\$")
+    return ", ".join(filter(None, parts)).replace("$", r"\$")

@@ -1,9 +1,10 @@
-"""An estimating process cannot open what its case hides, and is told nothing of it."""
+"""An estimating process cannot open what its case hides, and is given nothing of it."""
 
 import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 from experiments.common.cases import blind
 from experiments.common.cases.blind import ESTIMATE, SECRET, estimate_blindly
 from mvest.errors import InputError
+from tests.experiments.studies.made_up_patients import an_outcome
 from tests.places import ROOT
 
 WAYS = {
@@ -132,8 +134,8 @@ def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
         return SimpleNamespace(returncode=returncode, stderr=stderr)
 
     monkeypatch.setattr(blind.subprocess, "run", run)
-    record = estimate_blindly(values, "hash", tmp_path, Path("case"), Path("hidden"))
-    return heard[0], record
+    outcome = estimate_blindly(values, tmp_path, Path("case"), Path("hidden"))
+    return heard[0], outcome
 
 
 VALUES = {
@@ -150,15 +152,16 @@ VALUES = {
 }
 
 
-def test_the_process_is_told_nothing_of_the_patient(monkeypatch, tmp_path):
-    heard, record = asked(monkeypatch, tmp_path, VALUES, {"status": "converged"})
-    told = json.loads(heard.text)["values"]
-    assert not set(SECRET) & set(told)
+def test_the_process_is_given_nothing_of_the_patient(monkeypatch, tmp_path):
+    left = an_outcome(5.0, 2.5)
+    heard, outcome = asked(monkeypatch, tmp_path, VALUES, asdict(left))
+    given = json.loads(heard.text)["values"]
+    assert not set(SECRET) & set(given)
     for secret in ("4.321", "13.579", "24680"):
         assert secret not in heard.text.replace(str(tmp_path), "")
-    assert told["case"] == "case"
-    assert told["personal"] == VALUES["personal"]
-    assert record == {"status": "converged"}
+    assert given["case"] == "case"
+    assert given["personal"] == VALUES["personal"]
+    assert outcome == left
     assert not any("4.321" in value or "24680" in value for value in heard.env.values())
 
 
@@ -179,4 +182,4 @@ def test_the_real_process_says_what_is_wrong_with_a_case(tmp_path):
     (tmp_path / "case").mkdir()
     values = {"case": None, "personal": {}, "mechanics": {}}
     with pytest.raises(InputError, match=r"no case\.yaml in this folder"):
-        estimate_blindly(values, "hash", tmp_path, tmp_path / "case", tmp_path / "hidden")
+        estimate_blindly(values, tmp_path, tmp_path / "case", tmp_path / "hidden")

@@ -4,10 +4,10 @@ from experiments.common.cases.skill import Answered, skill_words
 def test_errors_stand_beside_the_generic_guess_and_runs_lost_count_as_misses():
     # Errors 10 %, 20 % and 50 %: median 20 %. Generic guesses off by 50 %, 50 %, 0 % and 100 %.
     asked = [
-        Answered(10.0, 11.0, 9.0, 13.0, 5.0),
-        Answered(10.0, 8.0, 7.0, 9.0, 15.0),
-        Answered(2.0, 3.0, 1.0, 5.0, 2.0),
-        Answered(1.0, None, None, None, 2.0),
+        Answered("anterior", 10.0, 11.0, 9.0, 13.0, 5.0),
+        Answered("anterior", 10.0, 8.0, 7.0, 9.0, 15.0),
+        Answered("anterior", 2.0, 3.0, 1.0, 5.0, 2.0),
+        Answered("anterior", 1.0, None, None, None, 2.0),
     ]
     assert skill_words(asked) == (
         "2 of 4 moduli lie inside their 95 % intervals; the median error is 20.0 %, that of the "
@@ -16,5 +16,5 @@ def test_errors_stand_beside_the_generic_guess_and_runs_lost_count_as_misses():
 
 
 def test_without_an_estimate_there_is_no_error_to_compare():
-    words = skill_words([Answered(1.0, None, None, None, 2.0)])
+    words = skill_words([Answered("anterior", 1.0, None, None, None, 2.0)])
     assert words == "0 of 1 moduli lie inside their 95 % intervals; 1 without an estimate."

@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.cases.own_case import read_configured, run_case, settings_of
-from experiments.common.cases.record import case_record, fields_of, of_all_unknowns
+from experiments.common.cases.findings import fields_of, outcome_of_case
+from experiments.common.cases.own_case import read_configured, settings_of
+from experiments.common.cases.report import write_case_run
+from experiments.common.cases.settings import PersonalSettings
 from experiments.common.config import hash_of
+from experiments.common.record import read_record, stamp, write_record
+from experiments.common.schema import build
+from experiments.common.study import Job
 from experiments.run import main
+from experiments.studies.case.settings import Settings
+from experiments.studies.case.study import STUDY, run_own_case
 from mvest.cases.writer import write_case
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.personalise import Treatment, personalise_case
-from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.common.test_config import composed, plain
 from tests.made_up_closure import made_up_case, use
@@ -40,6 +46,14 @@ def config(folder, tmp_path):
     return plain(composed(*OWN, f"case={folder}", f"paths.outputs={tmp_path}"))
 
 
+def personalising(values):
+    return settings_of(values, build(PersonalSettings, values["personal"]))
+
+
+def outcome_of(values, folder):
+    return run_own_case(Job(values, build(Settings, values), folder))
+
+
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """Run the application in an empty folder: exit status, standard output and error."""
@@ -56,24 +70,24 @@ def run(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def made(folder):
-    """A record with all that belongs to it, and what it was made from."""
+    """An outcome with all that belongs to it, and what it was made from."""
     with pytest.MonkeyPatch.context() as patch:
         use(patch)
         config = plain(composed(*OWN, f"case={folder}"))
-        found = personalise_case(read_configured(config), settings_of(config))
-        return case_record(config, found, "hash", 0.0), found
+        fit = personalise_case(read_configured(config["case"]), personalising(config))
+        return outcome_of_case(fit, {"personal": config["personal"]}), fit
 
 
 @pytest.fixture
 def unmeasured(monkeypatch):
     """Measuring a shape takes a second, and is tested elsewhere."""
     monkeypatch.setattr(
-        "experiments.common.cases.record.clinical_measurements", lambda *arguments: {}
+        "experiments.common.cases.findings.clinical_measurements", lambda *arguments: {}
     )
 
 
 def test_settings_are_those_of_the_configuration(config):
-    settings = settings_of(config)
+    settings = personalising(config)
     about = {unknown.name: unknown for unknown in settings.unknowns}
     assert list(about)[:2] == ["E_f.anterior", "E_f.posterior"]
     assert (about["E_f.anterior"].mean, about["E_f.anterior"].std) == (6.23, 3.1)
@@ -90,7 +104,7 @@ def test_settings_are_those_of_the_configuration(config):
         )
     )  # fmt: skip
     given["personal"]["paper"] = {"P0": 1.0, "Q": 0.1, "R": 0.25, "max_iterations": 3}
-    settings = settings_of(given)
+    settings = personalising(given)
     treated = {u.name: u.treatment for u in settings.unknowns}
     assert treated["E_f.posterior"] is Treatment.ESTIMATED
     assert treated["turn.x"] is Treatment.CONSIDERED
@@ -99,65 +113,86 @@ def test_settings_are_those_of_the_configuration(config):
     assert settings.paper.R == 0.25
 
 
-def test_a_record_is_plain_and_knows_no_truth(made, tmp_path):
-    record, found = made
-    write_json(tmp_path / "record.json", record)
-    back = json.loads((tmp_path / "record.json").read_text())
-    assert back["status"] == "converged"
-    assert back["row"] == "made_up"
-    assert back["case"]["simulated"] is True
-    assert len(back["case"]["sha256"]) == 64
-    assert back["truth"] is None
-    assert back["relative_error"] is None
-    for row in (*back["unknowns"], *back["moduli"], *back["without_nuisances"]["parameters"]):
-        assert row["truth"] is None
-        assert "inside" not in row
-    assert all(row["to_truth"] is None for row in back["distances"])
-    # The record of every study is of the moduli; unknowns tell all.
-    assert back["parameters"] == ["E_f.anterior", "E_f.posterior"]
-    assert back["estimate"] == found.result.estimate[:2].tolist()
-    assert back["std"] == found.result.std[:2].tolist()
-    assert back["initial"] == [6.23, 2.09]
-    assert [len(row) for row in back["iterates"]] == [2] * len(back["iterates"])
-    assert len(back["identifiability"]["cramer_rao_std"]) == 2
-    assert [row["name"] for row in back["unknowns"]] == list(found.names)
-    assert [len(row) for row in back["of_all_unknowns"]["iterates"]] == [11] * len(back["iterates"])
-    whole = of_all_unknowns(back)
-    assert whole["parameters"] == back["unknowns"]
-    assert len(whole["iterates"][0]) == 11
+def test_a_record_is_plain_and_knows_no_truth(made, config, tmp_path):
+    outcome, fit = made
+    path = tmp_path / "record.json"
+    write_record(path, stamp(config, "hash", outcome, 0.0))
+    back = read_record(path, STUDY.findings)
+    assert back.findings == outcome.findings
+    assert back.status == "converged"
+    assert back.row == "made_up"
+    # What the case is and not what the configuration of other studies says.
+    assert (back.model.filter, back.model.noise_mm) == ("iterated", 0.3)
+    case, (run,) = back.findings.case, back.findings.repeats
+    assert case.about.simulated is True
+    assert len(case.about.sha256) == 64
+    assert run.relative_error is None
+    for row in (*case.unknowns, *case.moduli, *case.without_nuisances.parameters):
+        assert row.truth is None
+    assert all(row.inside is None for row in case.unknowns)
+    assert all(row.to_truth is None for row in case.distances)
+    # Runs are compared by their moduli; the findings of the case are of all unknowns.
+    assert back.parameters == ("E_f.anterior", "E_f.posterior")
+    assert run.estimate == tuple(fit.result.estimate[:2].tolist())
+    assert run.std == tuple(fit.result.std[:2].tolist())
+    assert [row.prior_mean for row in case.unknowns[:2]] == [6.23, 2.09]
+    assert [len(row) for row in run.iterates] == [2] * len(case.iterates)
+    assert len(run.bound) == 2
+    assert [row.name for row in case.unknowns] == list(fit.names)
+    assert [len(row) for row in case.iterates] == [11] * len(run.iterates)
+    assert len(case.identifiability.cramer_rao_std) == 11
+
+
+def test_a_record_of_an_older_layout_is_one_clear_line(made, config, tmp_path):
+    path = tmp_path / "result.json"
+    write_record(path, stamp(config, "hash", made[0], 0.0))
+    data = json.loads(path.read_text())
+    data["findings"] = {"unknowns": [], "estimate": [6.0, 2.0]}
+    path.write_text(json.dumps(data))
+    with pytest.raises(
+        InputError, match=r"result\.json is no record of a run: findings\."
+    ) as raised:
+        read_record(path, STUDY.findings)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_case_of_other_leaflets_names_its_own_parameters(made, config):
+    outcome, _ = made
+    record = stamp({**config, "parameters": ["E_f.somewhere"]}, "hash", outcome, 0.0)
+    assert record.parameters == ("E_f.anterior", "E_f.posterior")
 
 
 def test_moduli_follow_by_their_ratios(made, config):
-    record, _ = made
-    rows = {(row["region"], row["name"]): row for row in record["moduli"]}
-    unknowns = {row["name"]: row for row in record["unknowns"]}
+    case = made[0].findings.case
+    rows = {(row.region, row.name): row for row in case.moduli}
+    unknowns = {row.name: row for row in case.unknowns}
     assert len(rows) == 6
     # E_f over E_perp is 2.35/6.23 of the anterior and 1.89/2.09 of the posterior leaflet's inverse.
     ratios = {region: tissue["ratio"] for region, tissue in config["mechanics"]["tissue"].items()}
     for region, ratio in ratios.items():
         own = unknowns[f"E_f.{region}"]
         for key in ("estimate", "std", "low", "high"):
-            assert rows[region, "E_f"][key] == pytest.approx(own[key])
-            assert rows[region, "E_perp"][key] == pytest.approx(own[key] / ratio)
-            share = rows[region, "G"][key] / own[key]
-            assert share == pytest.approx(rows[region, "G"]["estimate"] / own["estimate"])
-        assert own["low"] < own["estimate"] < own["high"]
+            value = getattr(own, key)
+            assert getattr(rows[region, "E_f"], key) == pytest.approx(value)
+            assert getattr(rows[region, "E_perp"], key) == pytest.approx(value / ratio)
+            share = getattr(rows[region, "G"], key) / value
+            assert share == pytest.approx(rows[region, "G"].estimate / own.estimate)
+        assert own.low < own.estimate < own.high
 
 
 def test_intervals_of_what_is_positive_are_those_of_its_logarithm(made):
-    record, found = made
-    for k, row in enumerate(record["unknowns"]):
-        std = found.result.filtered.transformed.std[k]
-        if row["name"].startswith(("shift", "turn")):
-            assert row["high"] - row["estimate"] == pytest.approx(1.959964 * std)
+    outcome, fit = made
+    for k, row in enumerate(outcome.findings.case.unknowns):
+        std = fit.result.filtered.transformed.std[k]
+        if row.name.startswith(("shift", "turn")):
+            assert row.high - row.estimate == pytest.approx(1.959964 * std)
         else:
-            assert np.log(row["high"] / row["estimate"]) == pytest.approx(1.959964 * std)
-            assert row["low"] * row["high"] == pytest.approx(row["estimate"] ** 2)
+            assert np.log(row.high / row.estimate) == pytest.approx(1.959964 * std)
+            assert row.low * row.high == pytest.approx(row.estimate**2)
 
 
 def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(made):
-    record, _ = made
-    measured = record["measurements"]
+    measured = made[0].findings.case.measurements
     assert {frame: list(which) for frame, which in measured.items()} == {
         "open": ["observed"],
         "closed": ["observed", "generic", "personalised"],
@@ -169,27 +204,34 @@ def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(made):
     assert measured["open"]["observed"]["orifice_mm2"] > 100
 
 
-def test_what_would_narrow_is_told_of_each_modulus(made):
-    record, found = made
-    rows = [row for row in record["narrow"] if row["what"].endswith("pressure known")]
-    assert [row["parameter"] for row in rows] == ["E_f.anterior", "E_f.posterior"]
-    assert rows[0]["what"] == "E_f anterior, pressure known"
+def test_what_would_narrow_is_said_of_each_modulus(made):
+    outcome, fit = made
+    narrow = outcome.findings.case.narrow
+    rows = [row for row in narrow if row.what.endswith("pressure known")]
+    assert [row.parameter for row in rows] == ["E_f.anterior", "E_f.posterior"]
+    assert rows[0].what == "E_f anterior, pressure known"
     for k, row in enumerate(rows):
-        assert row["std_if_known"] == found.narrower["pressure known"][k]
-        assert row["std_now"] == found.narrower["now"][k] > row["std_if_known"]
-    assert not [row for row in record["narrow"] if row["what"].endswith("now")]
+        assert row.std_if_known == fit.narrower["pressure known"][k]
+        assert row.std_now == fit.narrower["now"][k] > row.std_if_known
+    assert not [row for row in narrow if row.what.endswith("now")]
 
 
-def test_a_failed_estimation_is_a_record_too(config, monkeypatch, tmp_path, unmeasured):
+def test_a_failed_estimation_has_a_record_too(config, monkeypatch, tmp_path, unmeasured):
     use(monkeypatch, fails_above=4.0)
-    found = personalise_case(read_configured(config), settings_of(config))
-    record = case_record(config, found, "hash", 0.0)
-    write_json(tmp_path / "record.json", record)
-    assert record["status"] == "failed"
-    assert record["estimate"] is None
-    assert record["moduli"] == record["distances"] == record["narrow"] == []
-    assert all(row["estimate"] is row["low"] is None for row in record["unknowns"])
-    assert record["without_nuisances"]["status"] == "failed"
+    (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
+    outcome = outcome_of(config, tmp_path)
+    record = stamp(config, "hash", outcome, 0.0)
+    write_record(tmp_path / "record.json", record)
+    findings = read_record(tmp_path / "record.json", STUDY.findings).findings
+    assert outcome.status == "failed"
+    assert findings.repeats[0].estimate is None
+    case = findings.case
+    assert case.moduli == case.distances == case.narrow == ()
+    assert all(row.estimate is row.low is None for row in case.unknowns)
+    assert not case.without_nuisances.converged
+    # Nothing of an earlier run is left where nothing is estimated, and nothing is drawn of it.
+    assert not (tmp_path / "fields.npz").exists()
+    assert write_case_run(tmp_path, record) == [tmp_path / "unknowns.csv"]
 
 
 @pytest.mark.parametrize("overrides", [(), ("personal=considered",)])
@@ -199,10 +241,9 @@ def test_files_of_a_case_are_written_and_read(config, monkeypatch, tmp_path, unm
         composed(*OWN, *overrides, f"case={config['case']}", f"paths.outputs={tmp_path}")
     )
     (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
-    record, files = run_case(config, "hash", tmp_path, 0.0)
-    assert record["status"] == "converged"
-    assert files == [tmp_path / "fields.npz"]
-    fields = read_case_fields(files[0])
+    outcome = outcome_of(config, tmp_path)
+    assert outcome.status == "converged"
+    fields = read_case_fields(tmp_path / "fields.npz")
     assert fields.frames == ("closed", "late")
     assert fields.seen.tolist() == [True, False]
     assert fields.truth is None
@@ -210,18 +251,8 @@ def test_files_of_a_case_are_written_and_read(config, monkeypatch, tmp_path, unm
     distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
     np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)
     assert np.mean(distance[0]) == pytest.approx(
-        record["distances"][0]["personalised"]["mean"], abs=1e-4
+        outcome.findings.case.distances[0].personalised.mean, abs=1e-4
     )
-
-
-def test_nothing_of_an_earlier_run_is_left_where_nothing_is_found(
-    config, monkeypatch, tmp_path, unmeasured
-):
-    use(monkeypatch, fails_above=4.0)
-    (tmp_path / "fields.npz").write_bytes(b"of an earlier run")
-    _, files = run_case(config, "hash", tmp_path, 0.0)
-    assert files == []
-    assert not (tmp_path / "fields.npz").exists()
 
 
 def test_fields_without_correspondence_have_points(config, monkeypatch, tmp_path):
@@ -232,8 +263,7 @@ def test_fields_without_correspondence_have_points(config, monkeypatch, tmp_path
         for name, about in config["personal"]["unknowns"].items()
         if name.startswith(("E_f", "shift"))
     }
-    found = personalise_case(case, settings_of(config))
-    np.savez(tmp_path / "fields.npz", **fields_of(found))
+    np.savez(tmp_path / "fields.npz", **fields_of(personalise_case(case, personalising(config))))
     fields = read_case_fields(tmp_path / "fields.npz")
     assert fields.observed is None
     assert fields.distance_fitted is None
@@ -269,7 +299,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
         ConfigurationError,
         match=r"shift\.x\.treatment = 'guessed', expected one of estimated, considered, fixed",
     ):
-        settings_of(config)
+        personalising(config)
 
 
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):

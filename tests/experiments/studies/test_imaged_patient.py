@@ -1,13 +1,17 @@
 """Virtual patients in volumes: what is put together of both estimations, and what is kept."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
-from experiments.common.record import record_from
+from experiments.common.study import Job
+from experiments.common.virtual_patients import PatientSettings
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
+from experiments.studies.imaged_patient.findings import Findings, KnownGeometry, Row
 from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
 from experiments.studies.imaged_patient.tables import (
     volume_table,
@@ -15,38 +19,29 @@ from experiments.studies.imaged_patient.tables import (
     write_volume_tables,
 )
 from mvest.errors import InputError
-from tests.reporting.records import record as a_record
-from tests.reporting.records import stored
-
-
-def estimated(anterior, posterior, status="converged"):
-    rows = [
-        {"name": f"E_f.{region}", "estimate": value, "low": 0.8 * value, "high": 1.2 * value}
-        for region, value in (("anterior", anterior), ("posterior", posterior))
-    ]
-    return {"status": status, "unknowns": [*rows, {"name": "pressure_scale", "estimate": 1.1}]}
-
+from tests.experiments.studies.made_up import made_up
+from tests.experiments.studies.made_up_patients import an_outcome
 
 TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
 
 
 def test_rows_put_volume_and_known_geometry_side_by_side():
-    rows = volume_rows("one", estimated(5.0, 2.5), estimated(5.8, 2.1), TRUTH)
-    assert [(row["modulus"], row["truth"]) for row in rows] == [
+    rows = volume_rows("one", an_outcome(5.0, 2.5), an_outcome(5.8, 2.1), TRUTH)
+    assert [(row.modulus, row.truth) for row in rows] == [
         ("anterior", 6.0),
         ("posterior", 2.0),
     ]
-    assert rows[0] == {
-        "patient": "one", "modulus": "anterior", "truth": 6.0, "estimate": 5.0, "low": 4.0,
-        "high": 6.0, "known_geometry": 5.8,
-    }  # fmt: skip
+    assert rows[0] == Row(
+        patient="one", modulus="anterior", truth=6.0, generic=1.0, estimate=5.0, low=4.0, high=6.0,
+        known_geometry=5.8,
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("found", [None, estimated(5.0, 2.5, "failed")])
+@pytest.mark.parametrize("found", ["lost", an_outcome(5.0, 2.5, "failed")])
 def test_a_volume_without_an_estimate_keeps_its_rows(found):
-    rows = volume_rows("one", found, estimated(5.8, 2.1), TRUTH)
-    assert [row["estimate"] for row in rows] == [None, None]
-    assert [row["known_geometry"] for row in rows] == [5.8, 2.1]
+    rows = volume_rows("one", found, an_outcome(5.8, 2.1), TRUTH)
+    assert [row.estimate for row in rows] == [None, None]
+    assert [row.known_geometry for row in rows] == [5.8, 2.1]
 
 
 def test_what_is_hidden_lies_together(tmp_path):
@@ -58,19 +53,19 @@ def test_what_is_hidden_lies_together(tmp_path):
 
 def test_the_table_is_that_of_all_patients(tmp_path):
     def kept(name: str, rows) -> None:
-        made = {**a_record(), "table": "volume", "rows": rows}
-        record = record_from(stored(made, "imaged_patient"), dict, name)
+        findings = Findings(rows=rows, unknowns=(), known_geometry=KnownGeometry(False, "lost"))
+        record = made_up(findings, study="imaged_patient", table="volume")
         publish(STUDY, tmp_path, f"volumes-{name}", record, tmp_path / "no such folder")
 
-    for name, found in (("a", estimated(5.0, 2.5)), ("b", None)):
-        kept(name, volume_rows(name, found, estimated(5.8, 2.1), TRUTH))
+    for name, found in (("a", an_outcome(5.0, 2.5)), ("b", "lost")):
+        kept(name, volume_rows(name, found, an_outcome(5.8, 2.1), TRUTH))
     assert {path.stem for path in (tmp_path / "records" / "volume").iterdir()} == {
         "volumes-a", "volumes-b"
     }  # fmt: skip
     table = pd.read_csv(tmp_path / "volume.csv", comment="#")
     assert list(table["patient"]) == ["a", "a", "b", "b"]
     # Run again, a patient takes its own place.
-    kept("a", volume_rows("a", estimated(5.5, 2.2), estimated(5.8, 2.1), TRUTH))
+    kept("a", volume_rows("a", an_outcome(5.5, 2.2), an_outcome(5.8, 2.1), TRUTH))
     table = pd.read_csv(tmp_path / "volume.csv", comment="#")
     assert list(table["estimate [MPa]"][:2]) == [5.5, 2.2]
     assert table["estimate [MPa]"][2:].isna().all()
@@ -85,35 +80,38 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
     hidden = {"stated": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
     (place.truth / "hidden.json").write_text(json.dumps(hidden))
 
-    def blindly(config, config_hash, folder, case, sealed):
+    def blindly(values, folder, case, sealed):
         if case == place.known:
             raise InputError("the estimation left no result: MemoryError")
-        return estimated(5.0, 2.5) | {"reason": "converged", "provenance": {}}
+        return an_outcome(5.0, 2.5)
 
-    monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda config: place)
+    monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
     monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
-    config = {"imaged": {}, "patient": {"name": "one"}, "row": "one", "seed": 1}
-    record, _ = imaged_patient.run_imaged_patient(config, "hash", tmp_path, 0.0)
+    one = PatientSettings(name="one", description="")
+    settings = SimpleNamespace(patient=one, echo=None)
+    outcome = imaged_patient.run_imaged_patient(Job({"imaged": {}, "seed": 1}, settings, tmp_path))
 
-    assert record["status"] == "converged"
-    assert [row["estimate"] for row in record["rows"]] == [5.0, 2.5]
-    assert [row["known_geometry"] for row in record["rows"]] == [None, None]
-    assert "MemoryError" in record["known_geometry"]["reason"]
+    assert outcome.status == "converged"
+    findings = outcome.findings
+    assert [row.estimate for row in findings.rows] == [5.0, 2.5]
+    assert [row.known_geometry for row in findings.rows] == [None, None]
+    assert "MemoryError" in findings.known_geometry.reason
+    assert findings.repeats[0].estimate == (5.0, 2.5)
+    assert findings.repeats[0].seed == 1
 
 
 MODULI = [
-    {
-        "patient": "normal_small", "modulus": "E_f.anterior", "truth": 5.0, "estimate": 6.0,
-        "low": 4.5, "high": 7.5, "known_geometry": 5.2,
-    },
-    {
-        "patient": "normal_small", "modulus": "E_f.posterior", "truth": 2.0, "estimate": 1.5,
-        "low": 1.2, "high": 1.8, "known_geometry": 2.1,
-    },
-    {
-        "patient": "prolapse", "modulus": "E_f.anterior", "truth": 4.0, "estimate": None,
-        "low": None, "high": None, "known_geometry": 4.0,
-    },
+    Row(
+        patient="normal_small", modulus="E_f.anterior", truth=5.0, generic=6.23, estimate=6.0,
+        low=4.5, high=7.5, known_geometry=5.2,
+    ),
+    Row(
+        patient="normal_small", modulus="E_f.posterior", truth=2.0, generic=2.09, estimate=1.5,
+        low=1.2, high=1.8, known_geometry=2.1,
+    ),
+    Row(
+        patient="prolapse", modulus="E_f.anterior", truth=4.0, generic=6.23, known_geometry=4.0
+    ),
 ]  # fmt: skip
 
 
@@ -133,7 +131,7 @@ def test_errors_of_moduli_add_up():
 
 
 def test_the_table_of_moduli_is_readable(tmp_path):
-    written = write_volume_tables(tmp_path, a_record() | {"rows": MODULI})
+    written = write_volume_tables(tmp_path, MODULI, "volumes: mvest 0.1.0")
     assert [path.name for path in written] == ["volume.csv", "volume.md", "volume.tex"]
     text = written[1].read_text(encoding="utf-8")
     rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
@@ -149,8 +147,7 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     ("rows", "message"),
     [
         ([], "no rows"),
-        ([MODULI[0] | {"truth": 0.0}], "truth 0.0 MPa"),
-        ([{"patient": "a"}], "row 0 has no modulus"),
+        ([replace(MODULI[0], truth=0.0)], "truth 0.0 MPa"),
     ],
 )
 def test_moduli_that_are_none_are_refused(rows, message):

@@ -2,21 +2,29 @@
 
 import json
 import shutil
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.cases.blind import SECRET
-from experiments.common.cases.own_case import run_case
+from experiments.common.cases.blind import SECRET, read_estimate
+from experiments.common.cases.own_case import read_configured, run_case
+from experiments.common.cases.settings import PersonalSettings
+from experiments.common.record import stamp, write_record
+from experiments.common.schema import build
+from experiments.common.study import Job
+from experiments.common.virtual_patients import PatientSettings
 from experiments.studies.patient import study as patient
-from experiments.studies.patient.study import expect_patient, make_patient, reveal, run_patient
+from experiments.studies.patient.settings import Settings
+from experiments.studies.patient.study import STUDY, expect_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.experiments.common.test_config import composed, plain
+from tests.experiments.studies.made_up_patients import an_outcome
 from tests.made_up_closure import TRUE, made_up_case, use
 
 
@@ -33,6 +41,18 @@ def config_of(folder, *overrides):
             f"paths.outputs={folder}", *overrides,
         )
     )  # fmt: skip
+
+
+def settings_in(values):
+    return build(PatientSettings, values["patient"])
+
+
+def make_patient(values):
+    return patient.make_patient(values, settings_in(values))
+
+
+def run(values, folder):
+    return run_patient(Job(values, build(Settings, values), folder))
 
 
 def made_up_patient(name, description, template, values, simulation, mechanics, rng):
@@ -61,17 +81,17 @@ def in_process(monkeypatch):
     """Let the estimating process be this one, and the closure a formula."""
     use(monkeypatch)
     monkeypatch.setattr(
-        "experiments.common.cases.record.clinical_measurements", lambda *arguments: {}
+        "experiments.common.cases.findings.clinical_measurements", lambda *arguments: {}
     )
     seen = []
 
-    def blindly(values, config_hash, folder, case, sealed):
-        told = {k: v for k, v in values.items() if k not in SECRET}
-        told |= {"case": str(case), "seed": None, "parameters": [], "row": None}
-        record, _ = run_case(told, config_hash, folder, 0.0)
-        write_json(folder / "estimate.json", record)
+    def blindly(values, folder, case, sealed):
+        given = {k: v for k, v in values.items() if k not in SECRET}
+        personal = build(PersonalSettings, given["personal"])
+        outcome = run_case(given, personal, read_configured(str(case)), folder)
+        write_json(folder / "estimate.json", asdict(outcome))
         seen.append((folder, sealed))
-        return json.loads((folder / "estimate.json").read_text())
+        return read_estimate(folder)
 
     monkeypatch.setattr(patient, "estimate_blindly", blindly)
     return seen
@@ -150,7 +170,7 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
 
 def test_a_study_of_patients_needs_one():
     with pytest.raises(ConfigurationError, match="patient is not given"):
-        make_patient({"patient": None})
+        patient.make_patient({}, None)
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(
@@ -161,30 +181,35 @@ def test_nothing_is_revealed_before_the_estimation_has_ended(
     files = {}
     true_reveal = patient.reveal
 
-    def watch(record, place, fields):
+    def watch(estimated, *rest):
         files.update({p.name: p.read_bytes() for p in out.iterdir()})
-        assert all(row["truth"] is None for row in record["unknowns"])
-        return true_reveal(record, place, fields)
+        assert all(row.truth is None for row in estimated.findings.case.unknowns)
+        return true_reveal(estimated, *rest)
 
     monkeypatch.setattr(patient, "reveal", watch)
-    record, _ = run_patient(config_of(tmp_path), "hash", out, 0.0)
+    values = config_of(tmp_path)
+    outcome = run(values, out)
     assert set(files) == {"estimate.json", "fields.npz"}
-    told = json.loads(files["estimate.json"])
-    assert told["truth"] is None
-    assert told["relative_error"] is None
-    assert "made_from" not in told
+    hidden = json.loads(files["estimate.json"])
+    assert hidden["findings"]["repeats"][0]["relative_error"] is None
+    assert hidden["findings"]["repeats"][0]["seed"] is None
+    assert hidden["findings"]["revealed"] is None
     for value in (6.28, 2.61, *TRUE.values()):
-        assert value not in leaves(told)
+        assert value not in leaves(hidden)
     # What was estimated did not change when the truth came.
-    for key in ("estimate", "std", "iterates", "narrow", "objective"):
-        assert record[key] == told[key]
-    assert record["provenance"]["seed"] == 1
-    assert record["paper_patient"] == {"moduli": [6.28, 2.61], "distance_mm": [1.5, 1.47]}
+    revealed = json.loads(json.dumps(asdict(outcome)))["findings"]
+    for key in ("estimate", "std", "iterates"):
+        assert revealed["repeats"][0][key] == hidden["findings"]["repeats"][0][key]
+    for key in ("narrow", "objective"):
+        assert revealed["case"][key] == hidden["findings"]["case"][key]
+    assert stamp(values, "hash", outcome, 0.0).provenance.seed == 1
+    assert outcome.findings.revealed.paper_moduli == (6.28, 2.61)
+    assert outcome.findings.revealed.paper_distance_mm == (1.5, 1.47)
 
 
 def leaves(value):
     if isinstance(value, dict):
-        # The priors and the settings of the mechanics are told to everyone.
+        # The priors and the settings of the mechanics are given to everyone.
         return {v for k, item in value.items() if k != "settings" for v in leaves(item)}
     if isinstance(value, list):
         return {v for item in value for v in leaves(item)}
@@ -194,38 +219,37 @@ def leaves(value):
 def test_what_is_revealed_is_right(tmp_path, simulated, in_process):
     out = tmp_path / "job"
     out.mkdir()
-    record, _ = run_patient(config_of(tmp_path), "hash", out, 0.0)
-    write_json(tmp_path / "record.json", record)
-    assert record["status"] == "converged"
-    for row in record["unknowns"]:
-        assert row["truth"] == TRUE[row["name"]]
-        assert row["inside"] is (row["low"] <= row["truth"] <= row["high"])
-    for key in ("without_nuisances", "as_in_the_paper"):
-        rows = record[key]["parameters"]
-        assert [row["truth"] for row in rows] == [5.1, 2.6]
-        assert all(isinstance(row["inside"], bool) for row in rows)
+    values = config_of(tmp_path)
+    outcome = run(values, out)
+    write_record(tmp_path / "record.json", stamp(values, "hash", outcome, 0.0))
+    assert outcome.status == "converged"
+    case, (estimate,) = outcome.findings.case, outcome.findings.repeats
+    for row in case.unknowns:
+        assert row.truth == TRUE[row.name]
+        assert row.inside is (row.low <= row.truth <= row.high)
+    for other in (case.without_nuisances, case.as_in_the_paper):
+        assert [row.truth for row in other.parameters] == [5.1, 2.6]
+        assert all(isinstance(row.inside, bool) for row in other.parameters)
     # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
-    assert not all(row["inside"] for row in record["without_nuisances"]["parameters"])
-    assert record["truth"] == [5.1, 2.6]
+    assert not all(row.inside for row in case.without_nuisances.parameters)
     np.testing.assert_allclose(
-        record["relative_error"], np.array(record["estimate"]) / [5.1, 2.6] - 1
+        estimate.relative_error, np.array(estimate.estimate) / [5.1, 2.6] - 1
     )
-    moduli = {(row["region"], row["name"]): row for row in record["moduli"]}
+    assert estimate.seed == 1
+    moduli = {(row.region, row.name): row for row in case.moduli}
     for region, true in (("anterior", 5.1), ("posterior", 2.6)):
         own = moduli[region, "E_f"]
-        assert own["truth"] == pytest.approx(true)
+        assert own.truth == pytest.approx(true)
         for name in ("E_perp", "G"):
             row = moduli[region, name]
-            assert row["truth"] / own["truth"] == pytest.approx(row["estimate"] / own["estimate"])
-            assert row["relative_error"] == pytest.approx(own["relative_error"])
-        assert own["relative_error"] == pytest.approx(own["estimate"] / true - 1)
+            assert row.truth / own.truth == pytest.approx(row.estimate / own.estimate)
     fields = read_case_fields(out / "fields.npz")
     truth = made_up_case().frames
-    for k, row in enumerate(record["distances"]):
+    for k, row in enumerate(case.distances):
         gap = np.linalg.norm(fields.fitted[k] - fields.truth[k], axis=1)
-        assert row["to_truth"]["personalised"]["mean"] == pytest.approx(gap.mean(), abs=1e-4)
-        assert row["to_truth"]["personalised"]["max"] == pytest.approx(gap.max(), abs=1e-4)
-        assert row["to_truth"]["generic"]["mean"] > row["to_truth"]["personalised"]["mean"]
+        assert row.to_truth.personalised.mean == pytest.approx(gap.mean(), abs=1e-4)
+        assert row.to_truth.personalised.max == pytest.approx(gap.max(), abs=1e-4)
+        assert row.to_truth.generic.mean > row.to_truth.personalised.mean
         # The truth is where it would have been seen without errors, of this frame and no other.
         same = np.linalg.norm(truth[k + 1].vertices - truth[2 - k].vertices, axis=1)
         assert same.max() > 0.5
@@ -234,36 +258,39 @@ def test_what_is_revealed_is_right(tmp_path, simulated, in_process):
 
 
 def test_revealing_leaves_what_it_was_given(tmp_path, simulated, in_process):
-    place = make_patient(config_of(tmp_path))
+    values = config_of(tmp_path)
+    place = make_patient(values)
     out = tmp_path / "job"
     out.mkdir()
-    record = patient.estimate_blindly(config_of(tmp_path), "hash", out, place.case, place.hidden)
-    before = json.dumps(record)
-    revealed = reveal(record, place, out / "fields.npz")
-    assert json.dumps(record) == before
-    assert revealed["truth"] == [5.1, 2.6]
+    estimated = patient.estimate_blindly(values, out, place.case, place.hidden)
+    before = json.dumps(asdict(estimated))
+    revealed = reveal(estimated, place, out / "fields.npz", settings_in(values), 1)
+    assert json.dumps(asdict(estimated)) == before
+    assert [row.truth for row in revealed.findings.case.unknowns[:2]] == [5.1, 2.6]
 
 
 def test_a_failed_estimation_is_revealed_too(tmp_path, simulated, in_process, monkeypatch):
     use(monkeypatch, fails_above=4.0)
     out = tmp_path / "job"
     out.mkdir()
-    record, files = run_patient(config_of(tmp_path, "figures=true"), "hash", out, 0.0)
-    write_json(tmp_path / "record.json", record)
-    assert record["status"] == "failed"
-    assert files == []
-    assert [row["truth"] for row in record["unknowns"]] == [
-        TRUE[row["name"]] for row in record["unknowns"]
-    ]
-    assert all(row["inside"] is None for row in record["unknowns"])
-    assert record["relative_error"] is None
+    values = config_of(tmp_path, "figures=true")
+    outcome = run(values, out)
+    record = stamp(values, "hash", outcome, 0.0)
+    write_record(tmp_path / "record.json", record)
+    assert outcome.status == "failed"
+    assert STUDY.write_run(out, record) == [out / "unknowns.csv"]
+    rows = outcome.findings.case.unknowns
+    assert [row.truth for row in rows] == [TRUE[row.name] for row in rows]
+    assert all(row.inside is None for row in rows)
+    assert outcome.findings.repeats[0].relative_error is None
 
 
 def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
-    place = make_patient(config_of(tmp_path))
+    values = config_of(tmp_path)
+    place = make_patient(values)
     (place.hidden / "positions.npz").write_bytes(b"nothing")
     with pytest.raises(InputError, match="does not hold what a patient hides"):
-        reveal({}, place, tmp_path / "fields.npz")
+        reveal(an_outcome(5.0, 2.0), place, tmp_path / "fields.npz", settings_in(values), 1)
 
 
 SMALLEST = (
@@ -287,20 +314,24 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
     config = config_of(tmp_path, *SMALLEST)
     config["personal"]["paper"] = None
     place = make_patient(config)
-    records = []
+    found = []
     for name in ("one", "two"):
         out = tmp_path / name
         out.mkdir()
-        records.append(patient.estimate_blindly(config, "hash", out, place.case, place.hidden))
+        found.append(patient.estimate_blindly(config, out, place.case, place.hidden))
         if name == "one":
-            revealed = reveal(records[0], place, out / "fields.npz")
+            revealed = reveal(found[0], place, out / "fields.npz", settings_in(config), 1)
             shutil.rmtree(place.hidden)
-    for key in ("estimate", "std", "iterates", "objective", "distances", "measurements"):
-        assert records[0][key] == records[1][key]
-    assert revealed["truth"] == [6.28, 2.61]
+    one, two = (replace(outcome.findings.repeats[0], seconds=0.0) for outcome in found)
+    assert one == two
+    one, two = (outcome.findings.case for outcome in found)
+    assert (one.objective, one.distances, one.measurements) == (
+        two.objective, two.distances, two.measurements
+    )  # fmt: skip
+    assert [row.truth for row in revealed.findings.case.unknowns[:2]] == [6.28, 2.61]
 
 
-def test_a_check_tells_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
+def test_a_check_speaks_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):
     use(monkeypatch)
     said = expect_patient(config_of(tmp_path))
     assert len(simulated) == 1

@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
-from experiments.common.cases.report import case_text, write_case_tables
-from experiments.common.record import record_from
+from experiments.common.cases.report import case_text, write_case_run
 from experiments.results.keep import publish
 from experiments.studies.patient import tables as patient_tables
 from experiments.studies.patient.population import (
@@ -31,112 +31,23 @@ from experiments.studies.patient.tables import (
 )
 from mvest.errors import InputError
 from mvest.reporting.case.fields import read_case_fields
+from tests.experiments.studies.made_up_patients import (
+    TRUTH,
+    alone,
+    distances,
+    lost_patient,
+    moduli,
+    patient,
+    unknown,
+)
 from tests.reporting.case.made_up_case import arrays
-from tests.reporting.records import record as a_record
-from tests.reporting.records import stored
 
-TRUTH = {"E_f.anterior": 6.0, "E_f.posterior": 2.0, "pressure_scale": 1.05, "shift.x": 0.4}
 PLACE, DRAWN = Path("records") / "patients", Path("records") / "population"
-UNIT = {"E_f": "MPa", "shift": "mm"}
-
-
-def row(name, estimate, half):
-    """An unknown with the interval estimate ± half."""
-    truth = TRUTH[name]
-    low, high = (None, None) if estimate is None else (estimate - half, estimate + half)
-    return {
-        "name": name,
-        "label": name.replace(".", " "),
-        "unit": UNIT.get(name.partition(".")[0], ""),
-        "treatment": "estimated",
-        "prior_mean": 1.0,
-        "prior_std": 1.0,
-        "estimate": estimate,
-        "std": None if estimate is None else half / 1.96,
-        "low": low,
-        "high": high,
-        "truth": truth,
-        "inside": None if estimate is None else low <= truth <= high,
-    }
-
-
-def moduli(anterior, posterior, half=0.5):
-    return [row("E_f.anterior", anterior, half), row("E_f.posterior", posterior, half)]
-
-
-def spread(mean):
-    return {"mean": mean, "std": 0.1, "max": 3 * mean}
-
-
-def distance(frame, seen, generic, registered, personalised):
-    means = {"generic": generic, "registered": registered, "personalised": personalised}
-    return {
-        "frame": frame,
-        "seen": seen,
-        **{which: spread(mean) for which, mean in means.items()},
-        "to_truth": {which: spread(mean / 2) for which, mean in means.items()},
-    }
-
-
-def made_up(name="normal_small", **changes):
-    """Inside for both moduli; without nuisances for one, by the paper's filter for none."""
-    return {
-        "schema": 1,
-        "experiment": "patients",
-        "case": {"name": name},
-        "table": "patients",
-        "status": "converged",
-        "reason": "converged",
-        "unknowns": [
-            *moduli(5.8, 2.1), row("pressure_scale", 1.02, 0.05), row("shift.x", 0.1, 0.2)
-        ],
-        "without_nuisances": {
-            "status": "converged", "reason": "converged", "parameters": moduli(5.7, 3.1)
-        },
-        "as_in_the_paper": {
-            "status": "failed", "reason": "no rounds left", "parameters": moduli(9.0, 4.0)
-        },
-        "distances": [
-            distance("closed", True, 2.0, 1.5, 0.5), distance("late", False, 1.0, 0.4, 0.8)
-        ],
-        "narrow": [
-            {"what": "E_f anterior, pressure known", "std_now": 0.4, "std_if_known": 0.3},
-            {"what": "E_f posterior, pressure known", "std_now": 0.4, "std_if_known": 0.1},
-            {"what": "E_f anterior, registration known", "std_now": 0.4, "std_if_known": 0.38},
-        ],
-        "settings": {},
-        "measurements": {},
-        "paper_patient": {"moduli": [6.28, 2.61], "distance_mm": [1.5, 1.47]},
-        "provenance": {
-            "git": {"sha": "0123456789abcdef" * 2 + "01234567", "dirty": False},
-            "versions": {"mvest": "0.1.0"},
-            "config_hash": "cd" * 32,
-            "mesh_hash": "ab" * 32,
-            "seed": 1,
-            "finished": "2025-01-31T12:00:00Z",
-        },
-        **changes,
-    }  # fmt: skip
-
-
-def failed(name="prolapse"):
-    """Nothing was found, by no filter."""
-    nothing = moduli(None, None)
-    return made_up(
-        name,
-        status="failed",
-        reason="the model failed",
-        unknowns=[*nothing, row("pressure_scale", None, 0), row("shift.x", None, 0)],
-        without_nuisances={"status": "failed", "reason": "the model failed", "parameters": nothing},
-        as_in_the_paper={"status": "failed", "reason": "the model failed", "parameters": nothing},
-        distances=[],
-        narrow=[],
-    )
 
 
 def by_name(records) -> dict:
     """As the tables take them: in their order."""
-    return in_order({record["case"]["name"]: record for record in records})
+    return in_order({record.findings.case.about.name: record for record in records})
 
 
 def published(results, name, record, fields):
@@ -144,8 +55,7 @@ def published(results, name, record, fields):
     folder = results / "run"
     folder.mkdir(exist_ok=True)
     shutil.copy(fields, folder / "fields.npz")
-    made = record_from(stored({**a_record(), **record}, "patient"), dict, name)
-    return publish(STUDY, results, name, made, folder)
+    return publish(STUDY, results, name, record, folder)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +68,7 @@ def fields_file(tmp_path_factory):
 
 
 def test_table2_lays_estimates_beside_the_truth():
-    (anterior, posterior) = table2([made_up()]).to_dict("records")
+    (anterior, posterior) = table2([patient()]).to_dict("records")
     assert anterior["patient"] == "normal_small"
     assert (anterior["modulus"], posterior["modulus"]) == ("E_f.anterior", "E_f.posterior")
     assert anterior["hidden truth [MPa]"] == 6.0
@@ -176,7 +86,7 @@ def test_table2_lays_estimates_beside_the_truth():
 
 
 def test_table3_says_how_much_closer_and_where_the_truth_is():
-    closed, late = table3([made_up()]).to_dict("records")
+    closed, late = table3([patient()]).to_dict("records")
     # 2.0 mm to 0.5 mm is three quarters; 1.0 mm to 0.8 mm a fifth.
     assert closed["closer [%]"] == pytest.approx(75.0)
     assert late["closer [%]"] == pytest.approx(20.0)
@@ -189,10 +99,13 @@ def test_table3_says_how_much_closer_and_where_the_truth_is():
 
 
 def test_the_words_count_what_the_tables_hold(tmp_path):
-    other = made_up("normal_large")
-    other["unknowns"][1] = row("E_f.posterior", 4.0, 0.5)
-    other["distances"][0] = distance("closed", True, 1.0, 0.9, 1.2)
-    write_patient_tables(tmp_path, by_name([made_up(), other]), {})
+    usual = patient().findings.case
+    other = patient(
+        "normal_large",
+        unknowns=(*moduli(5.8, 4.0), *usual.unknowns[2:]),
+        distances=(distances("closed", True, 1.0, 0.9, 1.2), usual.distances[1]),
+    )
+    write_patient_tables(tmp_path, by_name([patient(), other]), {})
     second = (tmp_path / "table2.md").read_text()
     assert "contains the truth for 3 of 4 moduli" in second
     assert "without nuisances for 2 of 4" in second
@@ -213,12 +126,14 @@ def test_the_words_count_what_the_tables_hold(tmp_path):
 
 def test_patients_come_in_their_order_and_others_by_name(tmp_path):
     names = ["zebra", "prolapse", "aardvark", "normal_small", "fibroelastic"]
-    assert list(by_name(made_up(name) for name in names)) == [
+    assert list(by_name(patient(name) for name in names)) == [
         "normal_small", "prolapse", "fibroelastic", "aardvark", "zebra"
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("records", [[failed()], [made_up(), failed()]], ids=["alone", "beside"])
+@pytest.mark.parametrize(
+    "records", [[lost_patient()], [patient(), lost_patient()]], ids=["alone", "beside"]
+)
 def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
     write_patient_tables(tmp_path, by_name(records), {})
     text = (tmp_path / "table2.md").read_text()
@@ -234,12 +149,11 @@ def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
 
 def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
     write_patient_tables(
-        tmp_path, by_name([made_up(without_nuisances=None, as_in_the_paper=None)]), {}
+        tmp_path, by_name([patient(without_nuisances=None, as_in_the_paper=None)]), {}
     )
     text = (tmp_path / "table2.md").read_text()
     assert "without nuisances for" not in text
-    mixed = made_up("prolapse")
-    mixed["as_in_the_paper"]["parameters"] = moduli(None, None)
+    mixed = patient("prolapse", as_in_the_paper=alone(moduli(None, None), "no rounds left"))
     write_patient_tables(tmp_path, by_name([mixed]), {})
     text = (tmp_path / "table2.md").read_text()
     assert "without nuisances for 1 of 2" in text
@@ -247,28 +161,30 @@ def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
 
 
 def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file):
-    written = published(tmp_path, "patients-normal-small", made_up(), fields_file)
+    written = published(tmp_path, "patients-normal-small", patient(), fields_file)
     assert {path.name for path in written} == {
         f"{table}.{kind}" for table in ("table2", "table3") for kind in ("csv", "md", "tex")
     } | {"figure3.png", "figure3.pdf"}
     kept = json.loads((tmp_path / PLACE / "patients-normal-small.json").read_text())
-    assert kept["findings"]["unknowns"] == made_up()["unknowns"]
+    assert kept["findings"]["case"]["unknowns"] == [
+        asdict(row) for row in patient().findings.case.unknowns
+    ]
     with np.load(tmp_path / PLACE / "patients-normal-small.npz") as stored:
         assert set(stored.files) <= set(KEPT_ARRAYS)
         assert "sensitivity" not in stored.files
         assert "truth" not in stored.files
     first = {path: path.read_bytes() for path in written}
-    again = published(tmp_path, "patients-normal-small", made_up(), fields_file)
+    again = published(tmp_path, "patients-normal-small", patient(), fields_file)
     assert {path: path.read_bytes() for path in again} == first
-    published(tmp_path, "patients-prolapse", made_up("prolapse"), fields_file)
+    published(tmp_path, "patients-prolapse", patient("prolapse"), fields_file)
     table = pd.read_csv(tmp_path / "table2.csv", comment="#")
     assert list(table["patient"].unique()) == ["normal_small", "prolapse"]
 
 
 def test_a_table_reads_back_as_it_was(tmp_path):
-    write_patient_tables(tmp_path, by_name([made_up(), made_up("prolapse")]), {})
+    write_patient_tables(tmp_path, by_name([patient(), patient("prolapse")]), {})
     back = pd.read_csv(tmp_path / "table3.csv", comment="#")
-    pd.testing.assert_frame_equal(back, table3([made_up(), made_up("prolapse")]))
+    pd.testing.assert_frame_equal(back, table3([patient(), patient("prolapse")]))
     assert (tmp_path / "table3.csv").read_text().startswith("# ")
 
 
@@ -309,9 +225,9 @@ def test_figure3_needs_distances(fields_file):
 def population(n=20, misses=2):
     found = []
     for k in range(n):
-        record = made_up(f"drawn_{k}", table="population", as_in_the_paper=None)
-        record["unknowns"][0] = row("E_f.anterior", 7.0 if k < misses else 6.1 + 0.01 * k, 0.5)
-        found.append(record)
+        anterior = unknown("E_f.anterior", 7.0 if k < misses else 6.1 + 0.01 * k, 0.5)
+        rows = (anterior, *patient().findings.case.unknowns[1:])
+        found.append(patient(f"drawn_{k}", "population", unknowns=rows, as_in_the_paper=None))
     return found
 
 
@@ -356,7 +272,7 @@ def test_the_population_counts_how_often_intervals_hold(tmp_path):
 
 
 def test_failures_of_the_population_are_counted_and_not_drawn(tmp_path):
-    lost = [failed("drawn_98") | {"table": "population"}]
+    lost = [lost_patient("drawn_98", "population")]
     write_population_tables(tmp_path, [*population(4, 1), *lost])
     text = (tmp_path / "population.md").read_text()
     assert "4 of 5" in text
@@ -381,25 +297,24 @@ def test_only_the_tables_parts_of_a_drawn_patient_are_kept(tmp_path, fields_file
     record = population(1, 0)[0]
     published(tmp_path, "population-drawn-0", record, fields_file)
     kept = json.loads((tmp_path / DRAWN / "population-drawn-0.json").read_text())
-    assert not {"settings", "measurements"} & set(kept["findings"])
+    assert record.findings.case.settings
+    assert kept["findings"]["case"]["settings"] == kept["findings"]["case"]["measurements"] == {}
     assert [path.suffix for path in (tmp_path / DRAWN).iterdir()] == [".json"]
 
 
-def test_a_finished_case_is_told():
-    text = case_text(made_up())
+def test_a_finished_case_says_what_was_estimated():
+    text = case_text(patient())
     assert text.startswith("normal_small: converged")
     assert "5.8 (5.3 to 6.3) MPa  (hidden truth 6)" in text
     assert "frame late (not shown to the filter): 1.00 mm generic, 0.40 registered, 0.80" in text
-    own = made_up()
-    for unknown in own["unknowns"]:
-        unknown["truth"] = None
-        unknown.pop("inside")
+    unknowns = patient().findings.case.unknowns
+    own = patient(unknowns=tuple(replace(row, truth=None) for row in unknowns))
     assert "truth" not in case_text(own)
-    assert case_text(failed()).startswith("prolapse: the model failed")
+    assert case_text(lost_patient()).startswith("prolapse: the model failed")
 
 
 def test_unknowns_of_a_case_as_a_table(tmp_path):
-    (path,) = write_case_tables(tmp_path, made_up())
+    (path,) = write_case_run(tmp_path, patient())
     table = pd.read_csv(path)
     assert list(table["name"]) == list(TRUTH)
     assert table["estimate"].tolist() == [5.8, 2.1, 1.02, 0.1]

@@ -5,6 +5,7 @@ The detectors are stood for by the valve that is in the volume; they have tests 
 
 import json
 import sys
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -183,24 +184,23 @@ def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reas
     assert "accuracy was never measured" in err
 
 
-def test_the_case_is_personalised_and_its_record_tells_of_the_images(run, monkeypatch):
+def test_the_case_is_personalised_and_its_record_says_of_the_images(run, monkeypatch):
     asked = []
 
-    def personalised(config, config_hash, folder, started, about=None):
-        asked.append((config["case"], about))
+    def personalised(values, personal, case, folder, image_step):
+        asked.append((case, image_step))
         raise InputError("not tried here")
 
     monkeypatch.setattr("experiments.common.cases.volume.run_case", personalised)
     status, _, err = run("figures=false", "tracking.enabled=false")
     assert status == 2
     assert "not tried here" in err
-    ((case, about),) = asked
-    assert read_case(case).name == "my_tee"
-    step = about["image_step"]
-    assert step["pictures"]["montage"]["file"] == "montage.png"
-    assert len(step["frames"]) == len(step["confidence"]) == 4
-    assert (step["open_frame"], step["volume"]["shape"]) == (0, [4, 20, 20, 20])
-    assert json.dumps(step, allow_nan=False)
+    ((case, step),) = asked
+    assert case.name == "my_tee"
+    assert step.pictures["montage"].file == "montage.png"
+    assert len(step.frames) == len(step.confidence) == 4
+    assert (step.open_frame, step.volume.shape) == (0, (4, 20, 20, 20))
+    assert json.dumps(asdict(step), allow_nan=False)
 
 
 def test_what_is_missing_is_said_before_the_volume_is_searched(run):

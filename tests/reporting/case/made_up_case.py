@@ -5,12 +5,23 @@ higher the pressure, and whose edge sinks with longer chordae. Distances, sensit
 innovations are those of this formula, so that they fit each other; they say nothing about valves.
 """
 
-import copy
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from mvest.reporting.case.findings import (
+    About,
+    CaseFindings,
+    FrameDistances,
+    ModuliAlone,
+    ModulusRow,
+    Narrower,
+    ToTruth,
+    UnknownRow,
+    WhitenessTest,
+)
+from mvest.reporting.findings import Alike, Identified, Innovation, Spread
 from mvest.valve.anatomy.template import Template
 
 COLUMNS, ROWS = 40, 12
@@ -81,48 +92,53 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
     }
 
 
-def _parameter(
+def _unknown(
     name: str, label: str, unit: str, treatment: str, prior: tuple[float, float], std: float
-) -> dict[str, Any]:
+) -> UnknownRow:
     estimate = FITTED[name] if treatment == "estimated" else prior[0]
-    return {
-        "name": name,
-        "label": label,
-        "unit": unit,
-        "kind": "modulus" if name.startswith("E_") else "nuisance",
-        "treatment": treatment,
-        "prior_mean": prior[0],
-        "prior_std": prior[1],
-        "estimate": estimate,
-        "std": std,
-        "low": estimate - 1.96 * std,
-        "high": estimate + 1.96 * std,
-        "truth": TRUTH[name],
-    }
+    return UnknownRow(
+        name=name,
+        label=label,
+        unit=unit,
+        kind="modulus" if name.startswith("E_") else "nuisance",
+        treatment=treatment,
+        prior_mean=prior[0],
+        prior_std=prior[1],
+        estimate=estimate,
+        std=std,
+        low=estimate - 1.96 * std,
+        high=estimate + 1.96 * std,
+        truth=TRUTH[name],
+    )
 
 
-PARAMETERS = [
-    _parameter("E_f.anterior", "E_f anterior", "MPa", "estimated", (4.0, 2.0), 0.8),
-    _parameter("E_f.posterior", "E_f posterior", "MPa", "estimated", (3.0, 1.5), 0.3),
-    _parameter("chord_slack", "slack of the chordae", "", "estimated", (0.0, 0.02), 0.008),
-    _parameter("pressure", "pressure", "mmHg", "considered", (100.0, 5.0), 5.0),
-]
+UNKNOWNS = (
+    _unknown("E_f.anterior", "E_f anterior", "MPa", "estimated", (4.0, 2.0), 0.8),
+    _unknown("E_f.posterior", "E_f posterior", "MPa", "estimated", (3.0, 1.5), 0.3),
+    _unknown("chord_slack", "slack of the chordae", "", "estimated", (0.0, 0.02), 0.008),
+    _unknown("pressure", "pressure", "mmHg", "considered", (100.0, 5.0), 5.0),
+)
 
 
-def _spread(distance: np.ndarray) -> dict[str, float]:
-    known = distance[np.isfinite(distance)]
-    return {"mean": float(known.mean()), "std": float(known.std()), "max": float(known.max())}
+def _alone(unknown: UnknownRow) -> UnknownRow:
+    """The same as estimated with the nuisances taken as known."""
+    estimate, half = unknown.estimate - 0.3, 0.4 * 1.96 * unknown.std
+    return replace(
+        unknown, estimate=estimate, std=0.4 * unknown.std, low=estimate - half, high=estimate + half
+    )
 
 
-def _record(fields: dict[str, np.ndarray]) -> dict[str, Any]:
-    parameters = copy.deepcopy(PARAMETERS)
-    alone = copy.deepcopy(parameters[:2])
-    for p in alone:
-        half = 0.4 * (p["high"] - p["low"]) / 2
-        p |= {"estimate": p["estimate"] - 0.3, "std": 0.4 * p["std"]}
-        p |= {"low": p["estimate"] - half, "high": p["estimate"] + half}
-    registered = np.linalg.norm(fields["registered"] - fields["observed"], axis=2)
-    to_truth = np.linalg.norm(fields["fitted"] - fields["truth"], axis=2)
+def _distances(fields: dict[str, np.ndarray], k: int, frame: str) -> FrameDistances:
+    def off(shape: str, what: str) -> Spread:
+        return Spread.of(np.linalg.norm(fields[shape][k] - fields[what][k], axis=1))
+
+    models = ("generic", "registered", "fitted")
+    first, second, third = (off(name, "observed") for name in models)
+    truth = ToTruth(*(off(name, "truth") for name in models))
+    return FrameDistances(frame, bool(fields["seen"][k]), first, second, third, truth)
+
+
+def _case(fields: dict[str, np.ndarray]) -> CaseFindings:
     shape = {
         "ap_diameter_mm": 26.4,
         "commissural_diameter_mm": 35.7,
@@ -131,88 +147,54 @@ def _record(fields: dict[str, np.ndarray]) -> dict[str, Any]:
         "tenting_volume_mm3": 2210.0,
         "coaptation_length_mm": None,
     }
-    return {
-        "title": "A made-up valve",
-        "case": {
-            "name": "made_up",
-            "description": "A valve by a formula, for tests of the report.",
-            "source": "tests",
-            "licence": "MIT",
-            "simulated": True,
-            "derived": ["Thickness of the leaflets: taken from the literature."],
-            "sha256": "ef" * 32,
-        },
-        "status": "converged",
-        "reason": "the change of every parameter is below the tolerance",
-        "region_names": ["anterior", "posterior"],
-        "parameters": parameters,
-        "moduli": [
-            {"region": region, "name": "E_f"}
-            | {key: parameters[k][key] for key in ("estimate", "low", "high", "truth")}
-            for k, region in enumerate(("anterior", "posterior"))
-        ],
-        "without_nuisances": {"parameters": alone},
-        "distances": [
-            {
-                "frame": frame,
-                "seen": bool(fields["seen"][k]),
-                "generic": _spread(fields["distance_generic"][k]),
-                "registered": _spread(registered[k]),
-                "personalised": _spread(fields["distance_fitted"][k]),
-                "to_truth": _spread(to_truth[k]),
-            }
-            for k, frame in enumerate(("closed", "late"))
-        ],
-        "iterates": [[4.0, 3.0, 0.0], [5.2, 2.4, 0.02], [5.7, 2.2, 0.025], [5.8, 2.2, 0.026]],
-        "iterate_std": [[2.0, 1.5, 0.02], [1.0, 0.4, 0.01], [0.8, 0.3, 0.008], [0.8, 0.3, 0.008]],
-        "objective": [920.0, 340.0, 301.0, 300.2],
-        "innovation": {
-            "size": 1428,
-            "rms": 1.02,
-            "nis": 1485.0,
-            "nis_band": [1325.0, 1535.0],
-            "tests": [
-                {"name": "Kolmogorov–Smirnov", "statistic": 0.03, "p_value": 0.21, "verdict": "ok"},
-                {"name": "runs", "statistic": -0.4, "p_value": 0.69, "verdict": "ok"},
-            ],
-        },
-        "identifiability": {
-            "cramer_rao_std": [0.9, 0.32, 0.009],
-            "condition_number": 48.0,
-            "flat": [],
-            "confounded": [
-                {
-                    "parameters": ["E_f.anterior", "chord_slack"],
-                    "changes": [0.58, -0.0031],
-                    "relative": [0.1, -0.031],
-                    "correlation": 0.9578,
-                }
-            ],
-            "shares": [
-                {
-                    "parameter": "E_f.anterior",
-                    "from": {"chord_slack": 0.42, "pressure": 0.2, "noise": 0.38},
-                },
-                {
-                    "parameter": "E_f.posterior",
-                    "from": {"chord_slack": 0.1, "pressure": 0.6, "noise": 0.3},
-                },
-            ],
-            "observation_std_mm": NOISE_MM,
-        },
-        "narrow": [
-            {
-                "what": "E_f anterior, if the pressure were known",
-                "std_now": 0.8,
-                "std_if_known": 0.71,
-            },
-            {
-                "what": "E_f anterior, if the chordae were known",
-                "std_now": 0.8,
-                "std_if_known": 0.5,
-            },
-        ],
-        "measurements": {
+    return CaseFindings(
+        about=About(
+            "made_up",
+            "A valve by a formula, for tests of the report.",
+            "tests",
+            "MIT",
+            True,
+            ("Thickness of the leaflets: taken from the literature.",),
+            "ef" * 32,
+            ("anterior", "posterior"),
+        ),
+        converged=True,
+        reason="the change of every parameter is below the tolerance",
+        unknowns=UNKNOWNS,
+        moduli=tuple(
+            ModulusRow(
+                region=region,
+                name="E_f",
+                estimate=unknown.estimate,
+                std=unknown.std,
+                low=unknown.low,
+                high=unknown.high,
+                truth=unknown.truth,
+            )
+            for region, unknown in zip(("anterior", "posterior"), UNKNOWNS, strict=False)
+        ),
+        without_nuisances=ModuliAlone(True, "converged", "", 4, tuple(map(_alone, UNKNOWNS[:2]))),
+        distances=tuple(_distances(fields, k, frame) for k, frame in enumerate(("closed", "late"))),
+        iterates=((4.0, 3.0, 0.0), (5.2, 2.4, 0.02), (5.7, 2.2, 0.025), (5.8, 2.2, 0.026)),
+        iterate_std=((2.0, 1.5, 0.02), (1.0, 0.4, 0.01), (0.8, 0.3, 0.008), (0.8, 0.3, 0.008)),
+        objective=(920.0, 340.0, 301.0, 300.2),
+        innovation=Innovation(1428, 1.02, 3.1, 1485.0, (1325.0, 1535.0)),
+        whiteness=(
+            WhitenessTest("Kolmogorov–Smirnov", 0.03, 0.21, "ok"),
+            WhitenessTest("runs", -0.4, 0.69, "ok"),
+        ),
+        identifiability=Identified(
+            (0.9, 0.32, 0.009),
+            48.0,
+            (),
+            (Alike(("E_f.anterior", "chord_slack"), (0.58, -0.0031), (0.1, -0.031), 0.9578),),
+        ),
+        observation_std_mm=NOISE_MM,
+        narrow=(
+            Narrower("E_f anterior, if the pressure were known", "E_f.anterior", 0.8, 0.71),
+            Narrower("E_f anterior, if the chordae were known", "E_f.anterior", 0.8, 0.5),
+        ),
+        measurements={
             "open": {"observed": shape | {"annulus_area_mm2": 801.0}},
             "closed": {
                 "observed": shape,
@@ -220,23 +202,24 @@ def _record(fields: dict[str, np.ndarray]) -> dict[str, Any]:
                 "personalised": shape | {"tenting_volume_mm3": 2190.0},
             },
         },
-        "gate": "closed anew from the open valve it differs by at most 0.089 mm",
-        "settings": {"filter": {"name": "iterated", "tolerance": 1e-4}, "seeds": [1, 2]},
-        "provenance": {
-            "git": {"sha": "0123456789abcdef" * 2 + "01234567", "dirty": False},
-            "versions": {"mvest": "0.1.0"},
-            "config_hash": "cd" * 32,
-            "mesh_hash": "ab" * 32,
-            "seconds": 61.2,
-            "memory_mb": 812.0,
-            "finished": "2025-01-31T12:00:00+00:00",
-        },
-    }
+        confirmed_mm=0.089,
+        settings={"filter": {"name": "iterated", "tolerance": 1e-4}, "seeds": [1, 2]},
+    )
 
 
-def made_up_case(folder: Path) -> tuple[dict[str, Any], Path]:
-    """Write ``fields.npz`` into a folder; returns the record that goes with it, and its path."""
+LINE = "own_valve: mvest 0.1.0, commit 0123456789ab, configuration cdcdcdcdcdcd"
+PROVENANCE = {
+    "git": {"sha": "0123456789abcdef" * 2 + "01234567", "dirty": False},
+    "versions": {"mvest": "0.1.0"},
+    "config_hash": "cd" * 32,
+    "mesh_hash": "ab" * 32,
+    "finished": "2025-01-31T12:00:00+00:00",
+}
+
+
+def made_up_case(folder: Path) -> tuple[CaseFindings, Path]:
+    """Write ``fields.npz`` into a folder; returns the findings that go with it, and its path."""
     fields = arrays(np.random.default_rng(1))
     path = folder / "fields.npz"
     np.savez(path, **fields)
-    return _record(fields), path
+    return _case(fields), path

@@ -17,6 +17,7 @@ from mvest.reporting.case.figures import (
     innovation_map_figure,
     shapes_figure,
 )
+from mvest.reporting.case.findings import UnknownRow
 from mvest.reporting.case.information import columns_of, information, where_words
 from mvest.reporting.case.plots import (
     distances_figure,
@@ -187,16 +188,18 @@ def test_one_outlier_does_not_hide_the_rest() -> None:
 # --- information --------------------------------------------------------------------------------
 
 
-def parameters(count: int) -> list[dict]:
+def parameters(count: int) -> list[UnknownRow]:
     return [
-        {
-            "name": f"p{k}",
-            "label": f"p{k}",
-            "kind": "modulus" if k == 0 else "nuisance",
-            "treatment": "estimated",
-            "estimate": 2.0,
-            "prior_std": 0.5,
-        }
+        UnknownRow(
+            name=f"p{k}",
+            label=f"p{k}",
+            unit="",
+            kind="modulus" if k == 0 else "nuisance",
+            treatment="estimated",
+            prior_mean=2.0,
+            prior_std=0.5,
+            estimate=2.0,
+        )
         for k in range(count)
     ]
 
@@ -233,7 +236,7 @@ def test_a_nuisance_that_moves_everything_alike_leaves_nothing(fields) -> None:
 
 
 def test_a_modulus_is_found_where_it_acts(case, fields) -> None:
-    found = information(fields, case[0]["parameters"], NOISE_MM)
+    found = information(fields, case[0].unknowns, NOISE_MM)
     assert [one.name for one in found] == ["E_f.anterior", "E_f.posterior"]
     for one, leaflet in zip(found, NAMES, strict=True):
         place, share = where_words(fields, one.raw, NAMES)[0]
@@ -243,14 +246,14 @@ def test_a_modulus_is_found_where_it_acts(case, fields) -> None:
 
 
 def test_columns_belong_to_the_parameters_that_fit(case) -> None:
-    all_of_them = case[0]["parameters"]
-    assert [p["name"] for p in columns_of(all_of_them, 3)] == [p["name"] for p in all_of_them[:3]]
+    all_of_them = case[0].unknowns
+    assert columns_of(all_of_them, 3) == list(all_of_them[:3])
     assert len(columns_of(all_of_them, 4)) == 4
     assert columns_of(all_of_them, 2) == []
 
 
 def test_both_maps_of_a_modulus_have_one_scale(case, fields) -> None:
-    found = information(fields, case[0]["parameters"], NOISE_MM)
+    found = information(fields, case[0].unknowns, NOISE_MM)
     figure = information_figure(fields, found)
     bars = [axes for axes in figure.axes if axes.get_xlabel() == "information per point"]
     assert [axes.get_xlim()[1] for axes in bars] == pytest.approx(
@@ -288,7 +291,7 @@ def test_panels_of_a_view_have_one_scale_in_mm(fields) -> None:
         assert all(axes.get_aspect() == 1.0 for axes in row)
 
 
-def test_intervals_are_where_the_record_has_them(case) -> None:
+def test_intervals_are_where_the_findings_have_them(case) -> None:
     axes = estimates_figure(case[0]).axes[0]
     lines = [line for line in axes.lines if len(line.get_xdata()) == 2]
     ends = {tuple(np.round(line.get_xdata(), 3)) for line in lines}
@@ -308,7 +311,7 @@ def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
 
 def test_iterations_that_fit_no_parameters_are_refused(case) -> None:
     with pytest.raises(InputError, match="fit no choice"):
-        iterations_figure(case[0] | {"iterates": [[1.0, 2.0]]})
+        iterations_figure(replace(case[0], iterates=((1.0, 2.0),)))
     titles = [axes.get_title() for axes in iterations_figure(case[0]).axes]
     assert len(titles) == 3
 
@@ -328,11 +331,11 @@ def test_the_map_of_the_innovation_is_its_rms(fields) -> None:
 
 
 def test_bars_of_distances_are_in_the_order_of_the_legend(case) -> None:
-    figure = distances_figure(case[0]["distances"])
+    figure = distances_figure(case[0].distances)
     axes = figure.axes[0]
     heights = [[bar.get_height() for bar in group] for group in axes.containers if len(group) == 2]
     expected = [
-        [d[name]["mean"] for d in case[0]["distances"]]
+        [getattr(d, name).mean for d in case[0].distances]
         for name in ("generic", "registered", "personalised")
     ]
     assert heights[:3] == expected
@@ -341,7 +344,7 @@ def test_bars_of_distances_are_in_the_order_of_the_legend(case) -> None:
 
 
 def test_what_narrows_most_is_on_top(case) -> None:
-    axes = narrow_figure(case[0]["narrow"]).axes[0]
+    axes = narrow_figure(case[0].narrow).axes[0]
     widths = [bar.get_width() for bar in axes.patches]
     # 0.71 and 0.5 over 0.8, in per cent; bars are counted from below.
     assert widths == pytest.approx([88.75, 62.5])

@@ -1,6 +1,7 @@
-"""The page of one case. Records and fields are made up; see `tests.reporting.case.made_up_case`."""
+"""The page of one case. What it shows is made up; see `tests.reporting.case.made_up_case`."""
 
 import re
+from dataclasses import fields, is_dataclass, replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.reporting.case import words
+from mvest.reporting.case.findings import About, CaseFindings
 from mvest.reporting.case.report import write_case_report
-from tests.reporting.case.made_up_case import made_up_case
+from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case
 
 SECTIONS = (
     "case", "valve-shapes", "figure3", "estimates", "identifiability", "iterations", "innovation",
@@ -67,7 +69,7 @@ def case(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def written(case, tmp_path_factory):
-    return write_case_report(tmp_path_factory.mktemp("report") / "new", *case)
+    return write_case_report(tmp_path_factory.mktemp("report") / "new", *case, LINE, PROVENANCE)
 
 
 @pytest.fixture(scope="module")
@@ -144,24 +146,30 @@ def test_the_scene_shows_one_state_at_a_time(html) -> None:
 
 @pytest.fixture(scope="module")
 def hostile_page(case, tmp_path_factory):
-    """A record in which every name and sentence is a script."""
-    record, fields = case
+    """Findings in which every name and sentence is a script."""
+    findings, path = case
 
     def poisoned(value, key=""):
+        if is_dataclass(value):
+            names = [field.name for field in fields(value)]
+            return replace(value, **{k: poisoned(getattr(value, k), k) for k in names})
         if isinstance(value, dict):
             return {k: poisoned(v, k) for k, v in value.items()}
-        if isinstance(value, list):
-            return [poisoned(v, key) for v in value]
+        if isinstance(value, tuple | list):
+            return type(value)(poisoned(v, key) for v in value)
         # What the page decides by, and not what it prints.
         if not isinstance(value, str) or key in ("kind", "treatment"):
             return value
         return value + HOSTILE + "$\\frac$"
 
-    poisonous = poisoned(record)
-    poisonous["settings"] = {HOSTILE: HOSTILE}
-    poisonous["measurements"] = {HOSTILE: {HOSTILE: {HOSTILE: 1.0}}}
+    poisonous = replace(
+        poisoned(findings),
+        settings={HOSTILE: HOSTILE},
+        measurements={HOSTILE: {HOSTILE: {HOSTILE: 1.0}}},
+    )
     folder = tmp_path_factory.mktemp("hostile")
-    return quickly(folder, poisonous, fields)[0].read_text(encoding="utf-8")
+    written = quickly(folder, poisonous, path, poisoned(LINE), poisoned(PROVENANCE))
+    return written[0].read_text(encoding="utf-8")
 
 
 def test_text_of_the_record_is_escaped(hostile_page, html) -> None:
@@ -178,13 +186,13 @@ def test_the_closing_anew_answers_whether_there_is_another_closed_state(html) ->
 
 @pytest.fixture(scope="module")
 def bare_page(case, tmp_path_factory):
-    """Of an almost empty record, and fields of a run that gave up before it predicted anything."""
+    """Of almost empty findings, and fields of a run that gave up before it predicted anything."""
     folder = tmp_path_factory.mktemp("bare")
     with np.load(case[1]) as stored:
         kept = ("triangles", "region", "rest", "annulus", "frames", "seen")
         np.savez(folder / "fields.npz", **{name: stored[name] for name in kept})
-    record = {"title": "Nothing yet", "status": "failed", "reason": "no equilibrium", "gate": None}
-    pages = [quickly(folder / name, record, folder / "fields.npz") for name in ("page", "again")]
+    bare = CaseFindings(about=About("Nothing yet"), converged=False, reason="no equilibrium")
+    pages = [quickly(folder / name, bare, folder / "fields.npz") for name in ("page", "again")]
     assert pages[0][0].read_bytes() == pages[1][0].read_bytes()
     return pages[0]
 
@@ -218,22 +226,23 @@ def test_what_is_missing_is_said(bare_page) -> None:
 @pytest.fixture(scope="module")
 def partial_page(case, tmp_path_factory):
     """What a run may leave out is None, and the closed frame was seen as points."""
-    record, fields = case
-    with np.load(fields) as stored:
+    findings, path = case
+    with np.load(path) as stored:
         arrays = dict(stored)
     arrays["observed_points_closed"] = arrays.pop("observed")[0, 4:]
     folder = tmp_path_factory.mktemp("partial")
     np.savez(folder / "fields.npz", **arrays)
-    record = record | {
-        "without_nuisances": None,
-        "identifiability": None,
-        "innovation": None,
-        "gate": None,
-        "moduli": [m | {"truth": None} for m in record["moduli"]],
-        "parameters": [p | {"truth": None} for p in record["parameters"]],
-        "distances": [d | {"registered": None, "to_truth": None} for d in record["distances"]],
-    }
-    return quickly(folder, record, folder / "fields.npz")[0].read_text(encoding="utf-8")
+    partial = replace(
+        findings,
+        without_nuisances=None,
+        identifiability=None,
+        innovation=None,
+        confirmed_mm=None,
+        moduli=tuple(replace(m, truth=None) for m in findings.moduli),
+        unknowns=tuple(replace(p, truth=None) for p in findings.unknowns),
+        distances=tuple(replace(d, to_truth=None) for d in findings.distances),
+    )
+    return quickly(folder, partial, folder / "fields.npz")[0].read_text(encoding="utf-8")
 
 
 def test_nulls_are_left_out(partial_page) -> None:
@@ -252,9 +261,8 @@ def test_a_frame_that_does_not_correspond_is_shown_as_points(partial_page) -> No
 
 
 def test_an_unusable_place_or_file_is_one_clear_error(case, tmp_path) -> None:
-    record, _ = case
     with pytest.raises(InputError, match="no fields of a case"):
-        write_case_report(tmp_path, record, tmp_path / "none.npz")
+        write_case_report(tmp_path, case[0], tmp_path / "none.npz")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
         write_case_report(tmp_path / "file" / "page", *case)
@@ -264,42 +272,40 @@ def test_an_unusable_place_or_file_is_one_clear_error(case, tmp_path) -> None:
 
 
 def test_a_donor_tricuspid_valve_is_named_as_one(case) -> None:
-    record, _ = case
-    donor = record | {
-        "case": record["case"] | {"simulated": False, "source": "a donor's tricuspid valve"}
-    }
+    findings, _ = case
+    about = replace(findings.about, simulated=False, source="a donor's tricuspid valve")
+    donor = replace(findings, about=about)
     assert words.badges(donor) == ["DONOR TRICUSPID", "NOT FOR DIAGNOSIS"]
-    assert words.badges(record) == ["SIMULATED", "NOT FOR DIAGNOSIS"]
+    assert words.badges(findings) == ["SIMULATED", "NOT FOR DIAGNOSIS"]
 
 
 def test_a_run_that_did_not_converge_says_so_at_the_top(case) -> None:
     # Its last iterate still stands in the answer.
-    assert "RUN FAILED" in words.badges(case[0] | {"status": "failed"})
+    assert "RUN FAILED" in words.badges(replace(case[0], converged=False))
     assert "RUN CONVERGED" not in words.badges(case[0])
 
 
 def test_a_truth_outside_its_interval_is_not_hidden(case) -> None:
-    record, _ = case
-    outside = [m | {"truth": m["high"] + 0.1} for m in record["moduli"]]
-    rows = words.moduli_rows(record | {"moduli": outside})
+    findings, _ = case
+    outside = tuple(replace(m, truth=m.high + 0.1) for m in findings.moduli)
+    rows = words.moduli_rows(replace(findings, moduli=outside))
     assert [row["truth within the interval"] for row in rows] == ["NO", "NO"]
 
 
 def test_a_worse_prediction_of_a_held_out_frame_is_not_hidden(case) -> None:
-    record, _ = case
-    worse = [
-        d | {"generic": d["personalised"], "personalised": d["generic"]}
-        for d in record["distances"]
-    ]
-    assert "NOT nearer" not in words.distance_words(record)
-    assert "NOT nearer" in words.distance_words(record | {"distances": worse})
+    findings, _ = case
+    worse = tuple(
+        replace(d, generic=d.personalised, personalised=d.generic) for d in findings.distances
+    )
+    assert "NOT nearer" not in words.distance_words(findings)
+    assert "NOT nearer" in words.distance_words(replace(findings, distances=worse))
 
 
 def test_the_best_knowledge_is_named(case) -> None:
     # 0.8 to 0.5 is less by 37.5 %.
-    told = words.narrow_words(case[0]["narrow"])
-    assert "if the chordae were known" in told
-    assert "by 38\N{NO-BREAK SPACE}%, from 0.8 to 0.5" in told
+    said = words.narrow_words(case[0].narrow)
+    assert "if the chordae were known" in said
+    assert "by 38\N{NO-BREAK SPACE}%, from 0.8 to 0.5" in said
 
 
 def test_units_of_measurements_are_read_from_their_names(case) -> None:

@@ -1,0 +1,401 @@
+"""Findings of a personalised case, and of a simulated one whose truth was revealed."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy import sparse
+
+from experiments.common.estimate_record import identified_of, innovation_of, seed_run
+from experiments.common.estimates import Data, SeedRun
+from experiments.common.record import Mesh, Model, Outcome
+from mvest.cases.case import Role, ValveCase
+from mvest.estimation.information.consistency import moran, zero_mean
+from mvest.personalise.result import Personalised
+from mvest.problem.estimate import StudyResult
+from mvest.reporting.case.findings import (
+    MODULUS,
+    NUISANCE,
+    About,
+    CaseFindings,
+    FrameDistances,
+    ImageErrors,
+    ImageStep,
+    ModuliAlone,
+    ModulusRow,
+    Narrower,
+    UnknownRow,
+    WhitenessTest,
+)
+from mvest.reporting.findings import Spread, Vector, spread
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.measure.clinical import clinical_measurements
+
+__all__ = ["Findings", "Revealed", "fields_of", "outcome_of_case"]
+
+T = TypeVar("T")
+
+LABELS = {
+    "pressure_scale": "pressure (factor)",
+    "chord_stiffness": "chordal stiffness (factor)",
+    "chord_rest_length": "chordal rest length (factor)",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Revealed:
+    """What is said of a virtual patient after its estimation.
+
+    Anatomies were drawn until one closed. Of the paper's patient there are moduli ``(2,)`` MPa and
+    the distances ``(2,)`` mm, generic and personalised; empty if it has none.
+    """
+
+    anatomies_drawn: int
+    paper_moduli: Vector
+    paper_distance_mm: Vector
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What a run computed of a case.
+
+    Attributes
+    ----------
+    case : CaseFindings
+    repeats : (SeedRun,)
+        The moduli among its unknowns, by which runs are compared.
+    data : Data
+    revealed : Revealed or None
+        Of a virtual patient; the truth stands in the others.
+    memory_mb : float
+        The peak of the process.
+    parts_s : mapping
+        Wall-clock time of each part.
+    """
+
+    case: CaseFindings
+    repeats: tuple[SeedRun]
+    data: Data
+    revealed: Revealed | None = None
+    memory_mb: float
+    parts_s: Mapping[str, float]
+
+
+def outcome_of_case(
+    fit: Personalised, settings: Mapping[str, Any], image_step: ImageStep | None = None
+) -> Outcome[Findings]:
+    """What follows from a personalised case, what it hides excluded.
+
+    Parameters
+    ----------
+    fit : Personalised
+    settings : mapping
+        Shown in the report.
+    image_step : ImageStep, optional
+        Where the case came from a volume.
+    """
+    case, result, grid = fit.case, fit.result, fit.settings.mesh
+    run = seed_run(None, result)
+    moduli = [k for k, name in enumerate(fit.names) if name.startswith("E_f.")]
+    return Outcome(
+        findings=Findings(
+            case=_case_findings(fit, run, settings, image_step),
+            repeats=(_of_moduli(run, moduli),),
+            data=Data(case.source, case.sha256),
+            memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+            parts_s=dict(fit.seconds),
+        ),
+        status=run.status,
+        reason=run.reason,
+        detail=run.detail,
+        row=case.name,
+        parameters=tuple(fit.names[k] for k in moduli),
+        model=Model(
+            fit.mesh.element_type,
+            (grid.columns, grid.rows, 1),
+            grid.source,
+            "iterated",
+            case.uncertainty.typical_mm,
+        ),
+        mesh=Mesh(fit.mesh.sha256, len(fit.mesh.nodes), len(fit.mesh.elements)),
+        forward_solves=run.forward_solves or 0,
+    )
+
+
+def _of_moduli(run: SeedRun, kept: list[int]) -> SeedRun:
+    """The part of an estimate that is of some of its parameters."""
+
+    def part(values: tuple[T, ...]) -> tuple[T, ...]:
+        return tuple(values[k] for k in kept)
+
+    return replace(
+        run,
+        estimate=run.estimate and part(run.estimate),
+        std=run.std and part(run.std),
+        bound=run.bound and part(run.bound),
+        iterates=run.iterates and tuple(map(part, run.iterates)),
+        iterate_std=run.iterate_std and tuple(map(part, run.iterate_std)),
+    )
+
+
+def _case_findings(
+    fit: Personalised, run: SeedRun, settings: Mapping[str, Any], image_step: ImageStep | None
+) -> CaseFindings:
+    result = fit.result
+    unknowns = _unknowns(fit, result, fit.names)
+    objective = () if result.filtered is None else result.filtered.objective.tolist()
+    return CaseFindings(
+        about=_about(fit.case),
+        converged=run.converged,
+        reason=run.reason,
+        unknowns=unknowns,
+        moduli=_moduli(result, unknowns),
+        without_nuisances=_alone(fit, fit.moduli_only),
+        as_in_the_paper=_alone(fit, fit.paper),
+        distances=tuple(
+            FrameDistances(
+                d.frame,
+                d.seen,
+                Spread.of(d.generic),
+                Spread.of(d.registered),
+                Spread.of(d.personalised),
+            )
+            for d in fit.distances
+        ),
+        iterates=run.iterates or (),
+        iterate_std=run.iterate_std or (),
+        objective=tuple(v if np.isfinite(v) else None for v in objective),
+        innovation=innovation_of(result.filtered),
+        whiteness=_whiteness(fit),
+        identifiability=identified_of(result),
+        observation_std_mm=fit.case.uncertainty.typical_mm,
+        narrow=_narrow(fit),
+        image_errors=_image_errors(fit),
+        measurements=_measurements(fit),
+        confirmed_mm=fit.confirmed_mm,
+        settings=settings,
+        image_step=image_step,
+    )
+
+
+def fields_of(fit: Personalised) -> dict[str, Any]:
+    """The arrays of the report, mm."""
+    case, surface = fit.case, fit.case.surface
+    frames = [d.frame for d in fit.distances]
+    by_name = {frame.name: frame for frame in case.frames}
+    seen = [by_name[name] for name in frames]
+    reference = case.frame(Role.REFERENCE)
+    arrays: dict[str, Any] = {
+        "triangles": surface.triangles.astype(np.int32),
+        "region": surface.region.astype(np.int8),
+        "rest": surface.vertices.astype(np.float32),
+        "annulus": case.annulus.astype(np.int32),
+        "free_edge": case.free_edge.astype(np.int32),
+        "frames": np.array(frames),
+        "seen": np.array([d.seen for d in fit.distances]),
+        "tips": np.stack(
+            [reference.papillary_tips, *(frame.papillary_tips for frame in seen)]
+        ).astype(np.float32),
+        "chord_tip": case.chordae.tip.astype(np.int32),
+        "chord_insertion": np.array(
+            [
+                int(np.argmin(np.linalg.norm(surface.vertices - point, axis=1)))
+                for point in case.chordae.insertion
+            ],
+            dtype=np.int32,
+        ),
+    }
+    for name, positions in (
+        ("generic", fit.generic),
+        ("registered", fit.registered),
+        ("fitted", fit.fitted),
+    ):
+        arrays[name] = np.stack([positions[frame] for frame in frames]).astype(np.float32)
+    if all(frame.corresponds for frame in seen):
+        arrays["observed"] = np.stack([frame.vertices for frame in seen]).astype(np.float32)
+        if fit.settings.correspondence:
+            arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
+            arrays["distance_registered"] = np.stack([d.registered for d in fit.distances])
+            arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
+    else:
+        for frame in seen:
+            arrays[f"observed_points_{frame.name}"] = frame.vertices.astype(np.float32)
+    filtered = fit.result.filtered
+    if filtered is not None and filtered.prediction is not None:
+        sensitivity = filtered.prediction.jacobian
+        if sensitivity.size == surface.vertices.size * len(fit.names):
+            arrays["sensitivity"] = sensitivity.reshape(-1, 3, len(fit.names)).astype(np.float32)
+            if filtered.innovation is not None:
+                arrays["innovation"] = filtered.innovation.standardised.reshape(-1, 3)
+    return arrays
+
+
+def _about(case: ValveCase) -> About:
+    return About(
+        case.name,
+        case.description,
+        case.source,
+        case.licence,
+        case.simulated,
+        tuple(case.derived),
+        case.sha256,
+        tuple(case.surface.region_names),
+    )
+
+
+def _unknowns(
+    fit: Personalised, result: StudyResult, names: tuple[str, ...]
+) -> tuple[UnknownRow, ...]:
+    """What is known of each unknown before and after; intervals of 95 %."""
+    about = {unknown.name: unknown for unknown in fit.settings.unknowns}
+    rows = tuple(
+        UnknownRow(
+            name=name,
+            label=_label(name),
+            unit=_unit(name),
+            kind=MODULUS if about[name].is_modulus else NUISANCE,
+            treatment=about[name].treatment.value,
+            prior_mean=about[name].mean,
+            prior_std=about[name].std,
+        )
+        for name in names
+    )
+    if result.estimate is None or result.std is None or result.filtered is None:
+        return rows
+    values = (result.estimate, result.std, *result.filtered.interval(0.95))
+    return tuple(
+        replace(row, estimate=estimate, std=std, low=low, high=high)
+        for row, estimate, std, low, high in zip(
+            rows, *(value.tolist() for value in values), strict=True
+        )
+    )
+
+
+def _moduli(result: StudyResult, unknowns: tuple[UnknownRow, ...]) -> tuple[ModulusRow, ...]:
+    """All moduli that follow from the estimated ones through the fixed ratios."""
+    by_name = {row.name: row for row in unknowns}
+    rows = []
+    for modulus in result.moduli:
+        row = by_name[f"E_f.{modulus.region}"]
+        assert row.estimate is not None
+        assert row.low is not None
+        assert row.high is not None
+        share = modulus.estimate / row.estimate
+        rows.append(
+            ModulusRow(
+                region=modulus.region,
+                name=modulus.name,
+                estimate=modulus.estimate,
+                std=modulus.std,
+                low=share * row.low,
+                high=share * row.high,
+            )
+        )
+    return tuple(rows)
+
+
+def _alone(fit: Personalised, result: StudyResult | None) -> ModuliAlone | None:
+    """An estimation of the moduli alone."""
+    if result is None:
+        return None
+    return ModuliAlone(
+        result.converged,
+        result.reason,
+        result.detail,
+        0 if result.filtered is None else result.filtered.forward_solves,
+        _unknowns(fit, result, result.parameters),
+        spread(result.distance),
+    )
+
+
+def _whiteness(fit: Personalised) -> tuple[WhitenessTest, ...]:
+    """Tests of the standardised innovation of the closed frame."""
+    filtered, surface = fit.result.filtered, fit.case.surface
+    if filtered is None or filtered.innovation is None:
+        return ()
+    standardised = filtered.innovation.standardised
+    tests = [("mean zero", zero_mean(standardised))]
+    if standardised.size == surface.vertices.size:
+        adjacency = _adjacency(len(surface.vertices), surface.triangles)
+        by_axis = standardised.reshape(-1, 3)
+        tests += [
+            (f"neighbours alike, {axis}", moran(by_axis[:, k], adjacency))
+            for k, axis in enumerate("xyz")
+        ]
+    white = {True: "as white noise", False: "not as white noise"}
+    return tuple(
+        WhitenessTest(name, test.statistic, test.p_value, white[bool(test.p_value > 0.05)])
+        for name, test in tests
+    )
+
+
+def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:
+    """Which of n vertices share an edge."""
+    a, b = surface_edges(triangles).T
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+
+
+def _narrow(fit: Personalised) -> tuple[Narrower, ...]:
+    """How wide the interval of each modulus would be if something more were known."""
+    moduli = [name for name in fit.names if name.startswith("E_f.")]
+    return tuple(
+        Narrower(f"{_label(name)}, {what}", name, float(fit.narrower["now"][k]), float(values[k]))
+        for what, values in fit.narrower.items()
+        if what != "now"
+        for k, name in enumerate(moduli)
+    )
+
+
+def _image_errors(fit: Personalised) -> ImageErrors | None:
+    """What errors of the frames that the model was built from do to the estimate."""
+    if fit.geometry is None:
+        return None
+    moduli = [name for name in fit.names if name.startswith("E_f.")]
+    share = fit.image_share
+    return ImageErrors(
+        fit.geometry.asked,
+        tuple(fit.geometry.failures),
+        None if share is None else dict(zip(moduli, map(float, share), strict=True)),
+    )
+
+
+def _measurements(fit: Personalised) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Frame -> what is measured -> measurements."""
+    case, surface = fit.case, fit.case.surface
+    thickness = float(surface.thickness.mean())
+    reach = fit.settings.mechanics.contact.activation_distance * thickness
+    measured = {}
+    for frame in case.frames:
+        shapes: dict[str, FloatArray] = {}
+        if frame.corresponds:
+            shapes["observed"] = frame.vertices
+        for which, positions in (("generic", fit.generic), ("personalised", fit.fitted)):
+            if frame.name in positions:
+                shapes[which] = positions[frame.name]
+        measured[frame.name] = {
+            which: clinical_measurements(
+                points, surface, points[case.annulus], frame.papillary_tips, reach
+            )
+            for which, points in shapes.items()
+        }
+    return measured
+
+
+def _label(name: str) -> str:
+    kind, _, part = name.partition(".")
+    if kind == "E_f":
+        return f"E_f {part}"
+    if kind in ("shift", "turn"):
+        return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
+    return LABELS.get(name, name)
+
+
+def _unit(name: str) -> str:
+    kind = name.partition(".")[0]
+    return {"E_f": "MPa", "shift": "mm", "turn": "degrees"}.get(kind, "")

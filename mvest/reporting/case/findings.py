@@ -1,0 +1,245 @@
+"""What a run computed of one case: the values that its page, tables and figures show.
+
+Lengths are in mm, moduli in MPa, intervals hold 95 %; ``p`` counts the unknowns that are estimated
+or considered. What a run did not compute is None or empty, so that a page can say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from mvest.reporting.findings import Identified, Innovation, Spread, Vector
+
+__all__ = ["About", "CaseFindings", "FrameDistances", "ImageErrors", "ImageStep", "ModuliAlone",
+           "ModulusRow", "Narrower", "Picture", "ToTruth", "UnknownRow", "VolumeAbout",
+           "WhitenessTest"]  # fmt: skip
+
+MODULUS, NUISANCE = "modulus", "nuisance"
+"""Kinds of an unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a case says of itself; ``derived`` are sentences on what was not given."""
+
+    name: str
+    description: str = ""
+    source: str = ""
+    licence: str = ""
+    simulated: bool = False
+    derived: tuple[str, ...] = ()
+    sha256: str = ""
+    regions: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnknownRow:
+    """What is known of an unknown before and after the estimation, in its unit.
+
+    Its kind is ``modulus`` or ``nuisance``; it was ``estimated``, ``considered`` or ``fixed``.
+    The truth is known of simulated valves.
+    """
+
+    name: str
+    label: str
+    unit: str
+    kind: str
+    treatment: str
+    prior_mean: float
+    prior_std: float
+    estimate: float | None = None
+    std: float | None = None
+    low: float | None = None
+    high: float | None = None
+    truth: float | None = None
+
+    @property
+    def is_modulus(self) -> bool:
+        """Whether it is a modulus of a leaflet."""
+        return self.kind == MODULUS
+
+    @property
+    def inside(self) -> bool | None:
+        """Whether the interval contains the truth; None where one of them is not known."""
+        if self.low is None or self.high is None or self.truth is None:
+            return None
+        return self.low <= self.truth <= self.high
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModulusRow:
+    """A modulus of a leaflet, estimated or following from one that is."""
+
+    region: str
+    name: str
+    estimate: float
+    std: float
+    low: float
+    high: float
+    truth: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ModuliAlone:
+    """An estimation of the moduli with everything else taken as known."""
+
+    converged: bool
+    reason: str
+    detail: str
+    forward_solves: int
+    parameters: tuple[UnknownRow, ...]
+    distance_mm: Spread | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ToTruth:
+    """Distances of the models from where a simulated valve truly was."""
+
+    generic: Spread
+    registered: Spread
+    personalised: Spread
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDistances:
+    """Distances of the models from a frame as it was observed, which the filter saw or not.
+
+    Models as in `mvest.personalise.result.FrameDistance`.
+    """
+
+    frame: str
+    seen: bool
+    generic: Spread
+    registered: Spread
+    personalised: Spread
+    to_truth: ToTruth | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WhitenessTest:
+    """A test of the standardised innovation."""
+
+    name: str
+    statistic: float
+    p_value: float
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
+class Narrower:
+    """What knowing something more would do to the SD of the logarithm of a modulus."""
+
+    what: str
+    parameter: str
+    std_now: float
+    std_if_known: float
+
+
+@dataclass(frozen=True, slots=True)
+class ImageErrors:
+    """What errors of the frames that the model was built from do to the estimate.
+
+    Of each modulus the share of the variance of its logarithm; None where they did not enter.
+    """
+
+    samples: int
+    failures: tuple[str, ...] = ()
+    share_of_variance: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture that lies beside the page."""
+
+    file: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class VolumeAbout:
+    """A volume over time: frames and voxels ``(4,)``, spacing ``(3,)``."""
+
+    source: str
+    sha256: str
+    modality: str
+    shape: tuple[int, ...]
+    spacing_mm: Vector
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageStep:
+    """How a case came from the ``f`` frames of a volume.
+
+    Of each frame there are measures by name and the confidence ``(f,)``; of an observed coordinate
+    the error's SD, and over which length it is alike.
+    """
+
+    pictures: Mapping[str, Picture]
+    sentences: tuple[str, ...]
+    frames: tuple[Mapping[str, Any], ...]
+    files: tuple[str, ...]
+    model: Mapping[str, Any]
+    volume: VolumeAbout
+    open_frame: int
+    closed_frame: int
+    confidence: Vector
+    std_mm: float
+    correlation_length_mm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CaseFindings:
+    """All that a run computed of a case.
+
+    Attributes
+    ----------
+    reason : str
+        Why the estimation ended.
+    moduli : tuple of ModulusRow
+        All that follow from the estimated ones through fixed ratios.
+    iterates, iterate_std : (i, p)
+    objective : (i,)
+        None where a prediction failed.
+    observation_std_mm : float or None
+        Of an observed coordinate.
+    measurements : mapping
+        Frame -> ``observed``, ``generic`` or ``personalised`` -> measurement -> value.
+    confirmed_mm : float or None
+        Largest distance of the fitted closed valve from the one closed anew.
+    """
+
+    about: About
+    converged: bool
+    reason: str
+    unknowns: tuple[UnknownRow, ...] = ()
+    moduli: tuple[ModulusRow, ...] = ()
+    without_nuisances: ModuliAlone | None = None
+    as_in_the_paper: ModuliAlone | None = None
+    distances: tuple[FrameDistances, ...] = ()
+    iterates: tuple[Vector, ...] = ()
+    iterate_std: tuple[Vector, ...] = ()
+    objective: tuple[float | None, ...] = ()
+    innovation: Innovation | None = None
+    whiteness: tuple[WhitenessTest, ...] = ()
+    identifiability: Identified | None = None
+    observation_std_mm: float | None = None
+    narrow: tuple[Narrower, ...] = ()
+    image_errors: ImageErrors | None = None
+    measurements: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(
+        default_factory=dict
+    )
+    confirmed_mm: float | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    image_step: ImageStep | None = None
+
+    @property
+    def title(self) -> str:
+        """What a page of it is called."""
+        return self.about.description or self.about.name
+
+    @property
+    def status(self) -> str:
+        """``converged`` or ``failed``."""
+        return "converged" if self.converged else "failed"
