@@ -19,24 +19,10 @@ __all__ = ["Findings", "Fit"]
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """One estimate of p parameters.
+    """One estimate of p parameters from open and closed frame, or from the whole cycle.
 
-    Attributes
-    ----------
-    frames : str
-        What it is from: "open and closed" or "whole cycle".
-    seed : int
-        Of the noise, from 0 on.
-    status : {"converged", "failed"}
-    reason : str
-    estimate : (p,)
-        In units of the parameters.
-    error, std : (p,)
-    correlation : (p, p)
-    nees : float
-        Normalised squared error.
-    runs : int
-        Of the model.
+    The seed is of the noise, from 0 on; the estimate is in units of the parameters, ``correlation
+    (p, p)`` and the normalised squared error ``nees`` are in the filter's coordinates.
     """
 
     frames: str
@@ -73,24 +59,10 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for p parameters.
+    """What follows for p parameters: truth and start in their units, ``times`` in s.
 
-    Attributes
-    ----------
-    truth, start : (p,)
-        In units of the parameters.
-    prior_std : (p,)
-    noise_mm : float
-        Standard deviation of a coordinate.
-    times : tuple of float
-        s, of the frames.
-    vertices : int
-    results : tuple of Fit
-        From open and closed frame, from the whole cycle, and that with further seeds.
-    bounds : tuple of Bound
-        Of the first two.
-    measures : mapping
-        What runs are compared by.
+    Results are from open and closed frame, from the whole cycle, and that with further seeds;
+    bounds are of the first two. Runs are compared by ``measures``.
     """
 
     truth: Vector

@@ -10,22 +10,13 @@ from experiments.common.whole_cycle import Bound
 
 __all__ = ["Along", "Band", "Curve", "Drift", "Findings", "Frame", "Steps"]
 
-Rows = Rows
-
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame by itself.
+    """One frame by itself, with its mean displacement from the open one.
 
-    Attributes
-    ----------
-    time : float
-        s.
-    pressure_mmHg, displacement_mm : float
-        The latter is the mean from the open frame.
-    std_alone : (p,)
-        Smallest possible of each parameter if the others were known; None if the frame says
-        nothing of it.
+    ``std_alone (p,)`` is the smallest possible of each parameter if the others were known, None if
+    the frame says nothing of it.
     """
 
     time: float
@@ -36,14 +27,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """The pressure over the cycle.
-
-    Attributes
-    ----------
-    time : (n,)
-        s.
-    pressure_mmHg : (n,)
-    """
+    """The pressure ``(n,)`` over the times ``(n,)`` s of a cycle."""
 
     time: Vector
     pressure_mmHg: Vector
@@ -51,14 +35,9 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Along:
-    """How the frames follow the parameters along a path with one time step.
+    """Change of all frames from one place of a path of parameters to the next, one time step.
 
-    Attributes
-    ----------
-    rms_mm : tuple of float
-        Change of all frames from one place of the path to the next.
-    reason : str
-        Why the path could not be followed to its end; empty if it could.
+    The reason says why the path could not be followed to its end; empty if it could.
     """
 
     rms_mm: Vector
@@ -67,21 +46,11 @@ class Along:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """What depends on the time step.
+    """What depends on the time step: ``dt (s,)`` s, each half of the one before.
 
-    Attributes
-    ----------
-    dt : (s,)
-        s, each half of the one before.
-    rms_mm : (s - 1,)
-        Change of all frames from one time step to the next.
-    order : (s - 2,)
-        Binary logarithm of the ratio of two such changes.
-    path : (n, p)
-        Parameters along which frames are looked at.
-    along : (s,)
-    runs : int
-        Of the model.
+    ``rms_mm (s - 1,)`` is the change of all frames from one to the next, ``order (s - 2,)`` the
+    binary logarithm of the ratio of two such changes, ``path (n, p)`` the parameters along which
+    frames are looked at, and ``runs`` are of the model.
     """
 
     dt: Vector
@@ -96,14 +65,8 @@ class Steps:
 class Band:
     """Estimates of q parameters over b beats, by their logarithms.
 
-    Attributes
-    ----------
-    mean, low, high : (b, q)
-        Median and bounds of 95 %.
-    rms_error, mean_std : (q,)
-        Of the logarithm, over the beats.
-    coverage : (q,)
-        Share of the beats in which the truth lies within the band.
+    Median and bounds of 95 % are ``(b, q)``; errors, deviations and the share of the beats in which
+    the truth lies within the band ``(q,)``.
     """
 
     mean: Rows
@@ -116,20 +79,10 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """A modulus that drifts from beat to beat.
+    """A modulus that drifts from beat to beat, from the beats so far (filter) and from all.
 
-    Attributes
-    ----------
-    runs : int
-        Of the model.
-    parameters : (q,)
-    times : tuple of float
-        s, of the frames of each beat.
-    truth : (b, q)
-    assumed_std : float
-        Of the change of a logarithm from one beat to the next.
-    filter, smoother : Band
-        From the beats so far, and from all.
+    ``times`` in s are those of the frames of each beat, ``truth (b, q)``, and ``assumed_std`` is of
+    the change of a logarithm from one beat to the next.
     """
 
     runs: int
@@ -143,23 +96,9 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for p parameters.
+    """What follows for parameters ``(p,)`` from ever more frames, and from parts of the cycle.
 
-    Attributes
-    ----------
-    truth : (p,)
-    noise_mm : float
-        Standard deviation of a coordinate.
-    vertices : int
-    frames : tuple of Frame
-    curve : Curve
-    sets, phases : tuple of Bound
-        Of ever more frames, and of the parts of the cycle.
-    steps : Steps
-    drift : Drift or str
-        Why it was not followed, if it was not.
-    measures : mapping
-        What runs are compared by.
+    ``drift`` says why it was not followed, if it was not; runs are compared by ``measures``.
     """
 
     truth: Vector

@@ -5,30 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from experiments.common.estimates import Data, EstimatedModulus, Identified, Innovation, Spread
 from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
 
-__all__ = [
-    "Distances",
-    "Findings",
-    "Row",
-    "Summary",
-]
+__all__ = ["Distances", "Findings", "Row"]
 
 
 @dataclass(frozen=True, slots=True)
 class Distances:
     """Distances from the recording, in mm.
 
-    Attributes
-    ----------
-    mean, median, rms, max : float
-        Of the vertices from where they were recorded.
-    surface : float
-        Mean of the whole closed surface from the recorded one, both ways, whatever its points are.
-    leaflets : mapping
-        Leaflet -> mean of its vertices.
+    Of the vertices from where they were recorded, by leaflet too; ``surface`` is the mean of the
+    whole closed surface from the recorded one, both ways, whatever its points are.
     """
 
     mean: float
@@ -41,20 +32,9 @@ class Distances:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One closure: with generic moduli, or fitted from one start.
+    """One closure: with generic moduli, or fitted from a start ``(p,)``.
 
-    Attributes
-    ----------
-    closure : str
-    status : {"converged", "failed"}
-    reason : str
-    start : (p,)
-    estimate, std : (p,) or None
-    distance_mm : Distances or None
-    iterations, forward_solves : int
-    equilibria : int
-        Closed states that it went through.
-    seconds : float
+    ``equilibria`` are the closed states that it went through.
     """
 
     closure: str
@@ -71,58 +51,13 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Summary:
-    """What the run is for, in numbers; None where a closure is missing.
-
-    Attributes
-    ----------
-    starts : int
-    largest_difference_between_starts : float or None
-        Of a modulus, relative.
-    recorded_motion_mm : float
-        Mean, from the open to the recorded closed frame.
-    generic_mean_mm, fitted_mean_mm, generic_surface_mm, fitted_surface_mm : float or None
-    closer_percent : float or None
-        By how much the mean distance of the fitted closure is less than that of the generic one.
-    closer_than_generic : bool or None
-    """
-
-    starts: int
-    largest_difference_between_starts: float | None
-    recorded_motion_mm: float
-    generic_mean_mm: float | None
-    fitted_mean_mm: float | None
-    closer_percent: float | None
-    generic_surface_mm: float | None
-    fitted_surface_mm: float | None
-    closer_than_generic: bool | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
     """What follows for p moduli; the estimate is that from the first start.
 
-    Attributes
-    ----------
-    estimate, std : (p,) or None
-    iterates, iterate_std : (i, p) or None
-    moduli : tuple of EstimatedModulus
-    distance_mm : Spread or None
-        Of the vertices of the first fit from the recording.
-    innovation : Innovation or None
-        In standard deviations.
-    identifiability : Identified or None
-    iterations : int
-    seconds : float
-        Of all closures.
-    memory_mb : float
-        Largest, of the process.
-    claim : str
-        What is shown, and what is not.
-    data : Data
-    regions : tuple of str
-    rows : tuple of Row
-    summary : Summary
+    ``distance_mm`` is of the vertices of the first fit from the recording, the innovation in
+    standard deviations, seconds of all closures, and memory the largest of the process. The claim
+    says what is shown, and what is not. Rows are the generic closure and the fit from each start,
+    and the recorded motion is the mean from the open to the recorded closed frame.
     """
 
     estimate: Vector | None
@@ -140,4 +75,12 @@ class Findings:
     data: Data
     regions: tuple[str, ...]
     rows: tuple[Row, ...]
-    summary: Summary
+    recorded_motion_mm: float
+
+    @property
+    def starts_differ(self) -> float | None:
+        """Largest relative difference of a modulus between starts; None where a fit is missing."""
+        estimates = [row.estimate for row in self.rows[1:] if row.estimate is not None]
+        if not len(estimates) == len(self.rows) - 1 > 1:
+            return None
+        return float(np.max(np.ptp(np.array(estimates), axis=0) / np.mean(estimates, axis=0)))

@@ -140,13 +140,12 @@ def _whole(distance: Distances | None) -> dict[str, float]:
 
 def donor_answer(record: Record[Findings]) -> str:
     """How near a recorded valve the model comes."""
-    summary = record.findings.summary
-    generic, fitted = summary.generic_mean_mm, summary.fitted_mean_mm
+    generic, fitted = (row.distance_mm for row in record.findings.rows[:2])
     if generic is None or fitted is None:
         return "A recorded donor tricuspid valve: no closed state of the model."
     return (
-        f"A recorded donor tricuspid valve: the fitted model closes {fitted:.2f} mm from the "
-        f"recording on average, the generic one {generic:.2f} mm."
+        f"A recorded donor tricuspid valve: the fitted model closes {fitted.mean:.2f} mm from the "
+        f"recording on average, the generic one {generic.mean:.2f} mm."
     )
 
 
@@ -181,27 +180,26 @@ def donor_words(record: Record[Findings]) -> str:
             row.reason.split(":")[0],
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    summary = found.summary
-    spread = summary.largest_difference_between_starts
+    spread = found.starts_differ
+    first, fitted = (row.distance_mm for row in found.rows[:2])
     lines += ["", found.claim, "", f"Data: {found.data.citation}."]
     facts = [
         f"Mean motion of the leaflets between the open and the recorded closed frame: "
-        f"{summary.recorded_motion_mm:.2f} mm."
+        f"{found.recorded_motion_mm:.2f} mm."
     ]
     if spread is not None:
         facts.append(
-            f"Largest relative difference between the moduli from the {summary.starts} starts: "
-            f"{100 * spread:.2g} %."
+            f"Largest relative difference between the moduli from the {len(found.rows) - 1} "
+            f"starts: {100 * spread:.2g} %."
         )
-    if summary.closer_than_generic is not None:
-        verdict = "nearer to" if summary.closer_than_generic else "NOT nearer to"
+    if first is not None and fitted is not None:
+        closer = 100 * (first.mean - fitted.mean) / first.mean
+        verdict = "nearer to" if fitted.mean < first.mean else "NOT nearer to"
         facts.append(
             f"The fitted closure is {verdict} the recording than the generic one: mean distance "
-            f"{summary.generic_mean_mm:.2f} → {summary.fitted_mean_mm:.2f} mm "
-            f"({summary.closer_percent:.0f} % less) of the vertices from where they were "
-            f"recorded, {summary.generic_surface_mm:.2f} → "
-            f"{summary.fitted_surface_mm:.2f} mm of the whole surface from the recorded one, "
-            "both ways."
+            f"{first.mean:.2f} → {fitted.mean:.2f} mm ({closer:.0f} % less) of the vertices from "
+            f"where they were recorded, {first.surface:.2f} → {fitted.surface:.2f} mm of the whole "
+            "surface from the recorded one, both ways."
         )
     facts.append(f"{found.seconds:.0f} s and {found.memory_mb:.0f} MB.")
     if found.identifiability is not None:

@@ -34,7 +34,6 @@ from experiments.studies.donor.findings import (
     Distances,
     Findings,
     Row,
-    Summary,
 )
 from experiments.studies.donor.report import donor_answer, donor_words, write_donor
 from experiments.studies.donor.settings import DonorSettings, Settings
@@ -216,6 +215,7 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         )
     recording = donor_file(job.values["paths"]["donor"]).read_bytes()
     run = seed_run(job.values["seed"], first)
+    motion = np.linalg.norm(study.observation.positions[-1] - study.coarse.surface.vertices, axis=1)
     findings = Findings(
         estimate=run.estimate,
         std=run.std,
@@ -232,7 +232,7 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         data=Data(CITATION, hashlib.sha256(recording).hexdigest()),
         regions=tuple(study.recording.surface.region_names),
         rows=rows,
-        summary=_summary(study, generic, fitted),
+        recorded_motion_mm=float(motion.mean()),
     )
     failed = next((row for row in rows if row.status != "converged"), None)
     return Outcome(
@@ -355,31 +355,6 @@ def _fit_row(
         forward_solves=0 if filtered is None else filtered.forward_solves,
         equilibria=equilibria,
         seconds=result.seconds,
-    )
-
-
-def _summary(study: DonorStudy, generic_row: Row, fitted_rows: list[Row]) -> Summary:
-    """What the run is for, in numbers."""
-    estimates = [row.estimate for row in fitted_rows if row.estimate is not None]
-    spread = None
-    if len(estimates) == len(fitted_rows) > 1:
-        spread = float(np.max(np.ptp(np.array(estimates), axis=0) / np.mean(estimates, axis=0)))
-    generic, fitted = generic_row.distance_mm, fitted_rows[0].distance_mm
-    motion = np.linalg.norm(study.observation.positions[-1] - study.coarse.surface.vertices, axis=1)
-    return Summary(
-        starts=len(fitted_rows),
-        largest_difference_between_starts=spread,
-        recorded_motion_mm=float(motion.mean()),
-        generic_mean_mm=None if generic is None else generic.mean,
-        fitted_mean_mm=None if fitted is None else fitted.mean,
-        closer_percent=None
-        if generic is None or fitted is None
-        else 100.0 * (generic.mean - fitted.mean) / generic.mean,
-        generic_surface_mm=None if generic is None else generic.surface,
-        fitted_surface_mm=None if fitted is None else fitted.surface,
-        closer_than_generic=None
-        if generic is None or fitted is None
-        else fitted.mean < generic.mean,
     )
 
 

@@ -13,17 +13,9 @@ __all__ = ["Findings", "Limits", "Row"]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One variation.
+    """One variation: distance of the closed surface from the reference's.
 
-    Attributes
-    ----------
-    case : str
-    mean_mm, max_mm : float or None
-        Distance of the closed surface from the reference's, less what the exact derivative predicts
-        where moduli differ; None if the closure failed.
-    passed : bool
-    seconds : float
-    reason : str
+    Where moduli differ, less what the exact derivative predicts; None if the closure failed.
     """
 
     case: str
@@ -42,14 +34,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Up to which distances and difference of slopes the gate is passed.
-
-    Attributes
-    ----------
-    mean_mm, max_mm : float
-    slope : float
-        Relative.
-    """
+    """Up to which distances and relative difference of slopes the gate is passed."""
 
     mean_mm: float
     max_mm: float
@@ -58,17 +43,10 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """Whether the closed state is one.
+    """Whether the closed state is one: the reference, and every variation that was run.
 
-    Attributes
-    ----------
-    passed : bool
-    rows : tuple of Row
-        The reference, and every variation of it that was run.
-    slopes : mapping
-        Relative step of the moduli -> relative difference between the exact derivative and central
-        differences.
-    limits : Limits
+    Slopes are, by the relative step of the moduli, the relative difference between the exact
+    derivative and central differences.
     """
 
     passed: bool

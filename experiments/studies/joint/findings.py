@@ -18,21 +18,9 @@ __all__ = ["Findings", "Fit", "Frame", "MeshError", "OtherMesh", "Pass", "measur
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """One estimate of p parameters.
+    """One estimate in units of the parameters ``(p,)``, with its normalised squared error.
 
-    Attributes
-    ----------
-    status : {"converged", "failed"}
-    reason : str
-    estimate : (p,)
-        In units of the parameters.
-    error, std : (p,)
-    nees : float
-        Normalised squared error.
-    iterations, runs : int
-        Of the filter; of the model.
-    residual_mm : float or None
-        Root mean square.
+    Iterations are of the filter, runs of the model, and the residual is a root mean square.
     """
 
     status: Status
@@ -64,12 +52,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Where the filter is at the end of a pass over all frames.
-
-    Attributes
-    ----------
-    error, std : (p,)
-    """
+    """Where the filter is at the end of a pass over all frames, ``(p,)``."""
 
     error: Vector
     std: Vector
@@ -77,17 +60,10 @@ class Pass:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Where the filter is after a frame of its first pass.
+    """Where the filter is after a frame of its first pass, ``(p,)``.
 
-    Attributes
-    ----------
-    error, std : (p,)
-    nis : float
-        Normalised innovation squared of the frame, at the end.
-    nis_band : (2,)
-        Where 95 % of such values lie.
-    gain_nats : float
-        Information that the frame brought.
+    ``nis`` is the normalised innovation squared of the frame, at the end; 95 % of such values lie
+    in ``nis_band``. ``gain_nats`` is the information that the frame brought.
     """
 
     error: Vector
@@ -99,15 +75,9 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class OtherMesh:
-    """The estimate of a truth that comes from another mesh.
+    """The estimate of a truth from another mesh with these cells, around and along.
 
-    Attributes
-    ----------
-    fit : Fit
-    cells : (2,)
-        Of the truth, around and along.
-    distance_mm : float
-        Mean, between frames of the two meshes at the same parameters.
+    ``distance_mm`` is the mean between frames of the two meshes at the same parameters.
     """
 
     fit: Fit
@@ -117,19 +87,10 @@ class OtherMesh:
 
 @dataclass(frozen=True, slots=True)
 class MeshError:
-    """How far the estimator's own mesh may have moved that estimate.
+    """How far ``(p,)`` the estimator's own mesh may have moved that estimate.
 
-    Attributes
-    ----------
-    shift : (p,)
-    std : (p,)
-        Of the estimate, with that shift.
-    nees : float
-        Normalised squared error with it.
-    distance_mm : float
-        Mean, between frames of the estimator's mesh and of the third.
-    cells : (2,)
-        Of the third mesh.
+    Standard deviations ``(p,)`` and normalised squared error are with that shift; the distance is
+    the mean between frames of the estimator's mesh and of the third, which has these cells.
     """
 
     shift: Vector
@@ -141,34 +102,14 @@ class MeshError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for p parameters.
+    """What follows for p parameters: without noise, with it for each seed, and on another mesh.
 
-    Attributes
-    ----------
-    truth, start : (p,)
-        In units of the parameters.
-    times : (f,)
-        s, of the frames.
-    noise_mm, assumed_mm : float
-        Standard deviation of a coordinate; that assumed of coordinates without noise.
-    vertices : int
-    bounds : (2,)
-        Of open and closed frame, and of the whole cycle.
-    exact : Fit
-        Without noise.
-    exact_frames, first : (f,)
-        Of the first pass over frames without noise, and with that of the first seed.
-    seeds : tuple of Fit
-        With noise, one for each seed from the record's on.
-    passes : tuple of Pass
-        Those that follow `first`.
-    rms_over_bound : (p,)
-        Root mean square error over the seeds in parts of the bound of the whole cycle.
-    finer : OtherMesh
-    mesh_error : MeshError or str
-        Why it is not known, if it is not.
-    measures : mapping
-        What runs are compared by.
+    Truth and start ``(p,)`` are in units of the parameters, ``times (f,)`` in s. ``assumed_mm`` is
+    the standard deviation that is assumed of coordinates without noise. Bounds are of open and
+    closed frame and of the whole cycle; ``rms_over_bound (p,)`` is the root mean square error over
+    the seeds in parts of the latter. ``exact_frames`` and ``first (f,)`` are of the first pass over
+    frames without noise and with that of the first seed, ``passes`` those that follow. The mesh's
+    error may be unknown, for a reason. Runs are compared by ``measures``.
     """
 
     truth: Vector

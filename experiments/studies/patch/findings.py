@@ -14,13 +14,9 @@ __all__ = ["Compared", "Findings", "Fit", "Places"]
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where n points of the leaflet are when it is unrolled, and their triangles.
+    """Where n points of the leaflet are when it is unrolled, and their triangles ``(m, 3)``.
 
-    Attributes
-    ----------
-    along_mm, down_mm : (n,)
-        Along the annulus from the patch's centre, and down from it.
-    triangles : (m, 3)
+    Along the annulus from the patch's centre, and down from it.
     """
 
     along_mm: Vector
@@ -30,30 +26,12 @@ class Places:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compared:
-    """The estimated modulus beside the true one; standard deviations are of the noise.
+    """The estimated modulus ``(n,)`` MPa beside the true one; deviations of the logarithm.
 
-    Attributes
-    ----------
-    truth, modulus : (n,) MPa
-    log_std : (n,)
-        Standard deviation of the logarithm of the modulus.
-    at_centre, true_at_centre : float
-        MPa, at the point nearest to the patch's centre.
-    log_std_at_centre : float
-    peak : float
-        MPa, the highest modulus.
-    peak_log_std, peak_distance_mm : float
-        The latter is from the patch's centre.
-    outside : float
-        MPa, geometric mean outside the patch.
-    rms_log_error : float
-        Of the logarithm, over the leaflet.
-    within_two_std : float
-        Share of the leaflet.
-    shift_rms : float or None
-        Of the logarithm, by the estimator's mesh; None if that is not known.
-    within_two_with_shift : float or None
-        Share of the leaflet within two standard deviations and shifts.
+    Standard deviations are of the noise. At the point nearest to the patch's centre, where the
+    modulus is highest and how far that is from the centre, and its geometric mean outside the
+    patch. ``rms_log_error`` is over the leaflet, of which ``within_two_std`` is a share. The shift
+    by the estimator's mesh is None if it is not known.
     """
 
     truth: Vector
@@ -74,23 +52,10 @@ class Compared:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The estimate of one valve.
+    """The estimate ``(p,)`` of one valve; ``std (p,)`` is in the filter's coordinates.
 
-    Attributes
-    ----------
-    status : {"converged", "failed"}
-    reason : str
-    estimate : (p,)
-        In units of the parameters.
-    std : (p,)
-        In the filter's coordinates.
-    runs : int
-        Of the model.
-    residual_mm : float or None
-        Root mean square.
-    compared : Compared
-    shift_unknown : str
-        Why it is not known how far the mesh shifts the estimate; empty if it is.
+    Runs are of the model, the residual is a root mean square, and ``shift_unknown`` says why it is
+    not known how far the mesh shifts the estimate; empty if it is.
     """
 
     status: Status
@@ -105,31 +70,11 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What follows for a valve with a patch, and of one without it.
+    """What follows for a valve with a patch, and, if asked for, of one without it, by label.
 
-    Attributes
-    ----------
-    truth : tuple of float
-        MPa, the modulus of each leaflet outside the patch.
-    patch : StiffPatch
-    field : ModulusField
-        What the estimator knows of it beforehand.
-    share : float
-        Of the field's variance that its modes have.
-    noise_mm : float
-        Standard deviation of a coordinate.
-    times : tuple of float
-        s, of the frames.
-    vertices : int
-    cells_of_truth : (2,)
-        Around and along.
-    prior_std : (p,)
-        In the filter's coordinates.
-    map : Places
-    results : mapping
-        "patch" and, if asked for, "no patch".
-    measures : mapping
-        What runs are compared by.
+    Truth in MPa is the modulus of each leaflet outside the patch, ``field`` what the estimator
+    knows of it beforehand, whose modes have a ``share`` of its variance; ``prior_std (p,)`` is in
+    the filter's coordinates, times are of the frames in s. Runs are compared by ``measures``.
     """
 
     truth: Vector

@@ -13,8 +13,10 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments.common.config import register
+from experiments.common.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
+from experiments.studies.donor.findings import Findings
 from experiments.studies.donor.settings import DonorSettings
 from experiments.studies.donor.study import build_donor
 from mvest.valve.io.donor.arrays import CITATION, DATA_VARIABLE
@@ -115,9 +117,10 @@ def test_made_up_valve_end_to_end(run, tmp_path: Path) -> None:
     for row in found["rows"][1:]:
         assert row["estimate"] == pytest.approx(TRUTH, rel=0.1)
         assert row["distance_mm"]["mean"] < 0.5 * found["rows"][0]["distance_mm"]["mean"]
-    summary = found["summary"]
-    assert summary["closer_than_generic"] is True
-    assert summary["largest_difference_between_starts"] < 5e-3
+    read = read_record(tmp_path / "here" / "result.json", Findings).findings
+    assert 0 < read.starts_differ < 5e-3
+    words = (tmp_path / "here" / "donor.md").read_text()
+    assert "The fitted closure is nearer to the recording than the generic one" in words
     assert CITATION in found["data"]["citation"]
     names = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"donor.csv", "donor.md", "donor.png", "result.json", "fields.npz"} <= names
