@@ -90,11 +90,13 @@ class PardisoSolver:
 
     The condition of a thin shell's tangent is about 1e13 (its layer is squeezed 1e9 times less
     easily than it bends). A factor of single precision says nothing about it: where GMRES does not
-    get to the end with one, this and all further matrices are factorised in double precision. With
-    that the preconditioned residual does not fall below 1e-5, however good the solution x is: it is
-    all round-off. What GMRES leaves is therefore judged by its backward error: x solves a system
-    that is as near to the given one as ``ROUND_OFF``, and nothing better can be had. Where it is
-    not, SuperLU solves with the whole matrix, and `name` says for how many matrices it did.
+    get to the end with one, this and all further matrices are factorised in double precision, and
+    where that is not enough, as with flat tetrahedra, with all their blocks, since without the
+    smallest ones such a matrix is not even positive definite at rest. With that the preconditioned
+    residual does not fall below 1e-5, however good the solution x is: it is all round-off. What
+    GMRES leaves is therefore judged by its backward error: x solves a system that is as near to the
+    given one as ``ROUND_OFF``, and nothing better can be had. Where it is not, SuperLU solves with
+    the whole matrix, and `name` says for how many matrices it did.
     """
 
     def __init__(self) -> None:
@@ -105,7 +107,7 @@ class PardisoSolver:
         self._factor: _Blocks | None = None
         self._matrix: sparse.bsr_matrix | None = None
         self._whole: SuperLUSolver | None = None
-        self._single = True
+        self._single, self._all = True, False
         self._substituted = 0
 
     @property
@@ -134,6 +136,8 @@ class PardisoSolver:
     def _renew(self, upper: _Upper, matrix: sparse.bsr_matrix) -> None:
         """Factorise, in the precision that is due."""
         needed = _significant(matrix.data, upper.rows, upper.columns, upper.here, upper.diagonal)
+        if self._all:
+            needed[:] = True
         renew = (
             self._factor is None
             or self._kept is None
@@ -188,8 +192,8 @@ class PardisoSolver:
             )
             if good.all():
                 return solution
-            if self._single and self._upper is not None:
-                self._single = False
+            if not self._all and self._upper is not None:
+                self._single, self._all = False, not self._single
                 try:
                     self._renew(self._upper, matrix)
                 except RuntimeError:

@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from mvest.errors import InputError
-from mvest.mechanics import BiotLaw, Loads, System, TransverselyIsotropic, box
+from mvest.mechanics import BiotLaw, Loads, System, TransverselyIsotropic, box, outer_faces
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import LinearSolver, SuperLUSolver, linear_solver
 from mvest.valve.mesh.solid_mesh import SolidMesh
@@ -123,14 +123,14 @@ def test_all_solvers_agree(tangent):
         np.testing.assert_allclose(other, results[0], atol=1e-9 * np.abs(results[0]).max())
 
 
-@pytest.fixture(scope="module")
-def thin():
+@pytest.fixture(scope="module", params=["hex18", "tet10"])
+def thin(request):
     """Tangent of a clamped sheet 2000 times as long as thick, and a load across it."""
-    nodes, elements = box("hex18", (40, 2, 1), (60.0, 2.0, 0.03))
+    nodes, elements = box(request.param, (40, 2, 1), (60.0, 2.0, 0.03))
     fibre = np.broadcast_to([1.0, 0.0, 0.0], nodes.shape)
-    mesh = SolidMesh(
-        nodes, elements, "hex18", np.zeros(80, int), ("sheet",), fibre, np.zeros((0, 9), int)
-    )
+    region = np.zeros(len(elements), dtype=int)
+    faces = outer_faces(elements, request.param)[:0]
+    mesh = SolidMesh(nodes, elements, request.param, region, ("sheet",), fibre, faces)
     solid = Solid(mesh, BiotLaw.of((TransverselyIsotropic.isotropic(2e7, 0.0),)))
     system = System(solid, fixed_nodes=np.flatnonzero(nodes[:, 0] == 0))
     blocks = system.evaluate(
