@@ -4,6 +4,10 @@ Everything that adds stiffness does so as dense node-pair blocks: a group couple
 nodes with a list of column nodes, and its tangent is ``(rows, columns, 3, 3)``. The pattern is kept
 at node level (block rows of 3x3), so positions are looked up once and the scatter is a plain
 indexed addition.
+
+All that has an energy (tissue, chordae, contact) has a symmetric tangent, of which the blocks of
+the upper triangle are kept. What follower pressure adds to the symmetric part is skew and lies
+along the rim of the loaded surface: some more blocks.
 """
 
 from __future__ import annotations
@@ -20,77 +24,161 @@ from scipy import sparse
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
+    "BlockMatrix",
     "SparsityPattern",
     "add_forces",
     "adjacency",
-    "coupling",
+    "elements_of_nodes",
     "scatter_blocks",
     "scatter_matrices",
 ]
 
+Positions = NDArray[np.int32]
+
 
 @dataclass(frozen=True, eq=False)
 class SparsityPattern:
-    """Sparsity pattern of a matrix with 3x3 blocks.
+    """Where the blocks of a matrix lie: those of the upper triangle by rows, then the skew ones.
 
     Attributes
     ----------
-    n : int
-        Number of nodes.
-    keys : ndarray
-        Sorted ``row * n + column`` of all blocks; the position of a block is its rank.
+    pointer : ndarray
+        ``(n + 1,)`` where the rows of the upper triangle start, each with its diagonal block.
+    columns : ndarray
+        ``(u,)`` sorted in each row.
+    skew : ndarray
+        ``(s, 2)`` rows and columns of the blocks of the skew part, no row behind its column; in
+        this order.
     """
 
-    n: int
-    keys: IntArray
+    pointer: Positions
+    columns: Positions
+    skew: IntArray
 
     @classmethod
-    def of(cls, coupled: sparse.csr_matrix) -> SparsityPattern:
-        """Pattern of the entries stored in ``coupled (n, n)``."""
-        coupled.sort_indices()
-        n = coupled.shape[0]
-        rows = np.repeat(np.arange(n, dtype=np.int64), np.diff(coupled.indptr))
-        return cls(n, rows * n + coupled.indices)
+    def of(cls, coupled: sparse.csr_matrix, skew: IntArray) -> SparsityPattern:
+        """Pattern of the entries stored in ``coupled (n, n)``, symmetric and with its diagonal.
 
-    def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
-        """Positions ``(g, r, c)`` of the blocks coupling ``rows (g, r)`` and ``columns (g, c)``.
-
-        All of them must be in the pattern.
+        Parameters
+        ----------
+        coupled : sparse matrix
+        skew : ndarray
+            ``(s, 2)`` pairs of nodes that may be coupled unsymmetrically, in any order.
         """
-        return _positions(self.pointer, self.columns, rows, columns)
+        upper = sparse.triu(coupled, format="csr")
+        upper.sort_indices()
+        pairs = np.unique(np.sort(skew.reshape(-1, 2), axis=1), axis=0)
+        return cls(upper.indptr.astype(np.int32), upper.indices.astype(np.int32), pairs)
+
+    def with_coupling(
+        self, elements: IntArray, pairs: IntArray, around: tuple[IntArray, IntArray]
+    ) -> SparsityPattern:
+        """The pattern where all nodes of some pairs of elements are coupled as well.
+
+        Parameters
+        ----------
+        elements : ndarray
+            ``(e, k)``.
+        pairs : ndarray
+            ``(g, 2)`` elements that are coupled.
+        around : tuple of ndarray
+            The elements of each node, see `elements_of_nodes`.
+        """
+        if len(pairs) == 0:
+            return self
+        columns = np.empty(len(self.columns) + len(pairs) * elements.shape[1] ** 2, dtype=np.int32)
+        pointer = _coupled(self.pointer, self.columns, elements, pairs, *around, columns)
+        return SparsityPattern(pointer, columns[: pointer[-1]].copy(), self.skew)
 
     @property
-    def diagonal(self) -> IntArray:
-        """Positions ``(n,)`` of the diagonal blocks."""
-        return np.searchsorted(self.keys, np.arange(self.n, dtype=np.int64) * (self.n + 1))
-
-    def zeros(self) -> FloatArray:
-        """Block data ``(n_blocks, 3, 3)``."""
-        return np.zeros((len(self.keys), 3, 3))
+    def n(self) -> int:
+        """Number of nodes."""
+        return len(self.pointer) - 1
 
     @cached_property
     def rows(self) -> IntArray:
-        """Row ``(n_blocks,)`` of each block."""
-        return self.keys // self.n
+        """Row ``(u + s,)`` of each block."""
+        upper = np.repeat(np.arange(self.n, dtype=np.int64), np.diff(self.pointer))
+        return np.concatenate([upper, self.skew[:, 0]])
 
     @cached_property
-    def columns(self) -> NDArray[np.int32]:
-        """Column ``(n_blocks,)`` of each block."""
-        return (self.keys % self.n).astype(np.int32)
+    def all_columns(self) -> IntArray:
+        """Column ``(u + s,)`` of each block."""
+        return np.concatenate([self.columns, self.skew[:, 1]])
 
-    @cached_property
-    def pointer(self) -> NDArray[np.int32]:
-        """Where each row starts ``(n + 1,)``."""
-        return np.searchsorted(self.rows, np.arange(self.n + 1)).astype(np.int32)
+    def within(self, nodes: IntArray) -> Positions:
+        """Positions ``(g, k, k)`` of the blocks that couple the nodes ``(g, k)`` of each group.
 
-    def matrix(self, blocks: FloatArray) -> sparse.bsr_matrix:
-        """The matrix ``(3n, 3n)`` with the given block data, which it refers to.
-
-        All matrices of one pattern have the very same array of indices.
+        -1 for those of the lower triangle. All must be in the pattern.
         """
-        matrix = sparse.bsr_matrix((3 * self.n, 3 * self.n), blocksize=(3, 3))
-        matrix.data, matrix.indices, matrix.indptr = blocks, self.columns, self.pointer
-        return matrix
+        return _within(self.pointer, self.columns, nodes)
+
+    def between(self, first: IntArray, second: IntArray) -> Positions:
+        """Positions ``(g, k, k)`` of the blocks that couple nodes ``(g, k)`` with others.
+
+        Those of the lower triangle are where their mirror images are. A node coupled with itself
+        has position p as ``-1 - p``: there the block and its mirror image are the same.
+        """
+        return _between(self.pointer, self.columns, first, second)
+
+    def within_skew(self, nodes: IntArray) -> Positions:
+        """Positions ``(g, k, k)`` in the skew part, -1 where it has no block."""
+        n = self.n
+        keys = self.skew[:, 0] * n + self.skew[:, 1]
+        wanted = nodes[:, :, None] * n + nodes[:, None, :]
+        at = np.searchsorted(keys, wanted)
+        there = np.isin(wanted, keys)
+        return np.where(there, len(self.columns) + at, -1).astype(np.int32)
+
+    def zeros(self) -> FloatArray:
+        """Block data ``(u + s, 3, 3)``."""
+        return np.zeros((len(self.columns) + len(self.skew), 3, 3))
+
+    def matrix(self, blocks: FloatArray) -> BlockMatrix:
+        """The matrix ``(3n, 3n)`` with the given block data, which it refers to."""
+        return BlockMatrix(self, blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockMatrix:
+    """A symmetric matrix of 3x3 blocks with a small skew part.
+
+    Attributes
+    ----------
+    pattern : SparsityPattern
+    blocks : ndarray
+        ``(u + s, 3, 3)``; a block of the skew part is that of its row and column, and its negative
+        transpose is that of column and row.
+    """
+
+    pattern: SparsityPattern
+    blocks: FloatArray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return (3 * self.pattern.n, 3 * self.pattern.n)
+
+    def __matmul__(self, x: FloatArray) -> FloatArray:
+        """The matrix times a vector ``(3n,)`` or some ``(3n, p)``."""
+        if x.ndim == 2:
+            return np.stack([self @ column for column in x.T], axis=1)
+        pattern, x = self.pattern, np.ascontiguousarray(x)
+        return _product(pattern.pointer, pattern.columns, pattern.skew, self.blocks, x)
+
+    def tobsr(self) -> sparse.bsr_matrix:
+        """The same with all its blocks."""
+        rows, columns = self.pattern.rows, self.pattern.all_columns
+        off = rows != columns
+        sign = np.where(np.arange(len(rows)) < len(self.pattern.columns), 1.0, -1.0)[off]
+        mirrored = sign[:, None, None] * self.blocks[off].transpose(0, 2, 1)
+        every = np.concatenate([self.blocks, mirrored])
+        at = (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]]))
+        entry = np.arange(3)
+        i = (3 * at[0][:, None, None] + entry[:, None]) + 0 * entry
+        j = (3 * at[1][:, None, None] + entry) + 0 * entry[:, None]
+        matrix = sparse.coo_matrix((every.ravel(), (i.ravel(), j.ravel())), shape=self.shape)
+        return matrix.tobsr((3, 3))
 
 
 def adjacency(n: int, groups: Sequence[IntArray]) -> sparse.csr_matrix:
@@ -110,22 +198,10 @@ def adjacency(n: int, groups: Sequence[IntArray]) -> sparse.csr_matrix:
     return total.tocsr()
 
 
-def coupling(n: int, nodes: IntArray, pairs: IntArray) -> sparse.csr_matrix:
-    """Matrix ``(n, n)`` with an entry for all nodes of groups that are coupled, both ways round.
-
-    Parameters
-    ----------
-    n : int
-        Number of nodes.
-    nodes : ndarray
-        ``(g, k)`` nodes of each group.
-    pairs : ndarray
-        ``(p, 2)`` which groups are coupled.
-    """
-    incidence = _incidence(n, nodes)
-    one = np.ones(len(pairs), dtype=np.int32)
-    both = sparse.csr_matrix((one, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes),) * 2)
-    return (incidence.T @ ((both + both.T) @ incidence)).tocsr()
+def elements_of_nodes(n: int, elements: IntArray) -> tuple[IntArray, IntArray]:
+    """Where the elements of each of n nodes start ``(n + 1,)``, and the elements."""
+    around = _incidence(n, elements).tocsc()
+    return around.indptr.astype(np.int64), around.indices.astype(np.int64)
 
 
 def _incidence(n: int, nodes: IntArray) -> sparse.csr_matrix:
@@ -136,23 +212,121 @@ def _incidence(n: int, nodes: IntArray) -> sparse.csr_matrix:
 
 
 @nb.njit(cache=True)
-def _positions(
-    pointer: NDArray[np.int32], indices: NDArray[np.int32], rows: IntArray, columns: IntArray
-) -> IntArray:
-    """Positions of entries of a matrix with sorted rows, by bisection within each row."""
-    out = np.empty((rows.shape[0], rows.shape[1], columns.shape[1]), dtype=np.int64)
-    for g in range(rows.shape[0]):
-        for a in range(rows.shape[1]):
-            start, end = pointer[rows[g, a]], pointer[rows[g, a] + 1]
-            for b in range(columns.shape[1]):
-                low, high, wanted = start, end, columns[g, b]
-                while high - low > 1:
-                    middle = (low + high) // 2
-                    if indices[middle] <= wanted:
-                        low = middle
-                    else:
-                        high = middle
-                out[g, a, b] = low
+def _coupled(
+    pointer: Positions,
+    columns: Positions,
+    elements: IntArray,
+    pairs: IntArray,
+    start: IntArray,
+    around: IntArray,
+    out: Positions,
+) -> Positions:
+    """Write the columns of each row with the nodes of coupled elements; where the rows start."""
+    n = len(pointer) - 1
+    first = np.zeros(len(elements) + 1, dtype=np.int64)
+    for g in range(len(pairs)):
+        for side in range(2):
+            first[pairs[g, side] + 1] += 1
+    first = np.cumsum(first)
+    filled, partners = first.copy(), np.empty(2 * len(pairs), dtype=np.int64)
+    for g in range(len(pairs)):
+        for side in range(2):
+            e = pairs[g, side]
+            partners[filled[e]] = pairs[g, 1 - side]
+            filled[e] += 1
+    seen = np.full(n, -1, dtype=np.int32)
+    ends = np.zeros(n + 1, dtype=np.int32)
+    count = 0
+    for row in range(n):
+        begin = count
+        for k in range(pointer[row], pointer[row + 1]):
+            seen[columns[k]] = row
+            out[count] = columns[k]
+            count += 1
+        known = count
+        for k in range(start[row], start[row + 1]):
+            for p in range(first[around[k]], first[around[k] + 1]):
+                for node in elements[partners[p]]:
+                    if node > row and seen[node] != row:
+                        seen[node] = row
+                        out[count] = node
+                        count += 1
+        if count > known:
+            out[begin:count].sort()
+        ends[row + 1] = count
+    return ends
+
+
+@nb.njit(cache=True)
+def _find(pointer: Positions, columns: Positions, row: int, column: int) -> int:
+    """Position of an entry of a matrix with sorted rows, by bisection."""
+    low, high = pointer[row], pointer[row + 1]
+    while high - low > 1:
+        middle = (low + high) // 2
+        if columns[middle] <= column:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@nb.njit(cache=True)
+def _within(pointer: Positions, columns: Positions, nodes: IntArray) -> Positions:
+    g, k = nodes.shape
+    out = np.full((g, k, k), -1, dtype=np.int32)
+    for e in range(g):
+        for a in range(k):
+            for b in range(k):
+                if nodes[e, a] <= nodes[e, b]:
+                    out[e, a, b] = _find(pointer, columns, nodes[e, a], nodes[e, b])
+    return out
+
+
+@nb.njit(cache=True)
+def _between(
+    pointer: Positions, columns: Positions, first: IntArray, second: IntArray
+) -> Positions:
+    out = np.empty((len(first), first.shape[1], second.shape[1]), dtype=np.int32)
+    for g in range(len(first)):
+        for a in range(first.shape[1]):
+            for b in range(second.shape[1]):
+                i, j = first[g, a], second[g, b]
+                at = _find(pointer, columns, min(i, j), max(i, j))
+                out[g, a, b] = -1 - at if i == j else at
+    return out
+
+
+@nb.njit(cache=True)
+def _product(
+    pointer: Positions, columns: Positions, skew: IntArray, blocks: FloatArray, x: FloatArray
+) -> FloatArray:
+    out = np.zeros_like(x)
+    for row in range(len(pointer) - 1):
+        r = 3 * row
+        x0, x1, x2 = x[r], x[r + 1], x[r + 2]
+        diagonal = blocks[pointer[row]]
+        y0 = diagonal[0, 0] * x0 + diagonal[0, 1] * x1 + diagonal[0, 2] * x2
+        y1 = diagonal[1, 0] * x0 + diagonal[1, 1] * x1 + diagonal[1, 2] * x2
+        y2 = diagonal[2, 0] * x0 + diagonal[2, 1] * x1 + diagonal[2, 2] * x2
+        for k in range(pointer[row] + 1, pointer[row + 1]):
+            block, c = blocks[k], 3 * columns[k]
+            z0, z1, z2 = x[c], x[c + 1], x[c + 2]
+            y0 += block[0, 0] * z0 + block[0, 1] * z1 + block[0, 2] * z2
+            y1 += block[1, 0] * z0 + block[1, 1] * z1 + block[1, 2] * z2
+            y2 += block[2, 0] * z0 + block[2, 1] * z1 + block[2, 2] * z2
+            out[c] += block[0, 0] * x0 + block[1, 0] * x1 + block[2, 0] * x2
+            out[c + 1] += block[0, 1] * x0 + block[1, 1] * x1 + block[2, 1] * x2
+            out[c + 2] += block[0, 2] * x0 + block[1, 2] * x1 + block[2, 2] * x2
+        out[r] += y0
+        out[r + 1] += y1
+        out[r + 2] += y2
+    for s in range(len(skew)):
+        block, r, c = blocks[len(columns) + s], 3 * skew[s, 0], 3 * skew[s, 1]
+        for i in range(3):
+            for j in range(3):
+                out[r + i] += block[i, j] * x[c + j]
+                if r != c:
+                    out[c + j] -= block[i, j] * x[r + i]
     return out
 
 
@@ -166,29 +340,42 @@ def add_forces(out: FloatArray, nodes: IntArray, forces: FloatArray) -> None:
 
 
 @nb.njit(cache=True)
-def scatter_matrices(data: FloatArray, positions: IntArray, matrices: FloatArray) -> None:
-    """Add matrices ``(g, 3r, 3c)`` (node-major) into block data at ``positions (g, r, c)``."""
+def scatter_matrices(
+    data: FloatArray, positions: Positions, skew: Positions, matrices: FloatArray
+) -> None:
+    """Add matrices ``(g, 3k, 3k)`` (node-major) to block data.
+
+    Their symmetric part at ``positions (g, k, k)``, the other at ``skew (g, k, k)``; neither where
+    the position is negative.
+    """
     for g in range(positions.shape[0]):
         for a in range(positions.shape[1]):
             for b in range(positions.shape[2]):
-                block = data[positions[g, a, b]]
+                at, at_skew = positions[g, a, b], skew[g, a, b]
                 for i in range(3):
                     for j in range(3):
-                        block[i, j] += matrices[g, 3 * a + i, 3 * b + j]
+                        one, other = (
+                            matrices[g, 3 * a + i, 3 * b + j],
+                            matrices[g, 3 * b + j, 3 * a + i],
+                        )
+                        if at >= 0:
+                            data[at, i, j] += 0.5 * (one + other)
+                        if at_skew >= 0:
+                            data[at_skew, i, j] += 0.5 * (one - other)
 
 
 @nb.njit(cache=True)
 def scatter_blocks(
-    data: FloatArray, positions: IntArray, weights: FloatArray, blocks: FloatArray
+    data: FloatArray, positions: Positions, weights: FloatArray, blocks: FloatArray
 ) -> None:
-    """Add ``w_a w_b block`` for points ``(k, w)`` with one 3x3 block each into the data."""
+    """Add ``w_a w_b block`` for points ``(k, w)`` with one symmetric 3x3 block each to the data."""
     for k in range(positions.shape[0]):
         for a in range(positions.shape[1]):
             if weights[k, a] == 0.0:
                 continue
             for b in range(positions.shape[2]):
                 factor = weights[k, a] * weights[k, b]
-                if factor == 0.0:
+                if factor == 0.0 or positions[k, a, b] < 0:
                     continue
                 target = data[positions[k, a, b]]
                 for i in range(3):

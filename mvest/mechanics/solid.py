@@ -26,6 +26,7 @@ from typing import Protocol, runtime_checkable
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.elements import Element
 from mvest.errors import InputError
@@ -198,14 +199,17 @@ class Solid:
         """Internal forces ``(e, k, 3)`` N."""
         return self._forces(state, state.stress)
 
-    def add_tangents(self, state: SolidState, positions: IntArray, blocks: FloatArray) -> None:
+    def add_tangents(
+        self, state: SolidState, positions: NDArray[np.int32], blocks: FloatArray
+    ) -> None:
         """Add the condensed consistent tangents, N/mm, to block data.
 
         Parameters
         ----------
         state : SolidState
         positions : ndarray
-            ``(e, k, k)`` where the blocks of the pairs of nodes lie in the data.
+            ``(e, k, k)`` where the blocks of the pairs of nodes lie in the data; negative where
+            the mirror image serves.
         blocks : ndarray
             ``(n_blocks, 3, 3)``.
         """
@@ -539,7 +543,7 @@ def _add_tangents(
     tangent: FloatArray,
     direction: FloatArray,
     polynomials: FloatArray,
-    positions: IntArray,
+    positions: NDArray[np.int32],
     blocks: FloatArray,
 ) -> None:
     """``K_ab = sum_q w g_a (dP/dF) g_b``, less what the enhanced strains take away."""
@@ -604,6 +608,8 @@ def _add_tangents(
                             k[b, 3 * i * n_a + c] -= factor * change[m, c]
         for b in range(n_a):
             for c in range(n_a):
+                if positions[e, b, c] < 0:
+                    continue
                 block = blocks[positions[e, b, c]]
                 for i in range(3):
                     for j in range(3):

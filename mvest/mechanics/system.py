@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import sparse
 
 from mvest.errors import InputError
 from mvest.mechanics.assembly import (
+    BlockMatrix,
     SparsityPattern,
     add_forces,
     adjacency,
-    coupling,
+    elements_of_nodes,
     scatter_blocks,
     scatter_matrices,
 )
@@ -139,7 +139,11 @@ class System:
         self.held[self.fixed_nodes] = True
         if fixed_components is not None:
             self.held |= fixed_components
-        self._static = adjacency(self.n, self._static_groups())
+        self._static = SparsityPattern.of(
+            adjacency(self.n, self._static_groups()),
+            np.zeros((0, 2), dtype=np.int64) if pressure is None else pressure.rim(),
+        )
+        self._around = elements_of_nodes(self.n, solid.mesh.elements)
         self._build_pattern(np.zeros((0, 2), dtype=np.int64))
 
     def retune(self, law: Law, factors: Factors) -> None:
@@ -170,25 +174,21 @@ class System:
         """Pattern with contact between the pairs of elements ``hosts (g, 2)``, in their order."""
         elements = self.solid.mesh.elements
         self._coupled = hosts[:, 0] * len(elements) + hosts[:, 1]
-        self.pattern = SparsityPattern.of(self._static + coupling(self.n, elements, hosts))
-        self._at_elements = self.pattern.positions(elements, elements)
+        self.pattern = self._static.with_coupling(elements, hosts, self._around)
+        self._at_elements = self.pattern.within(elements)
         if self.pressure is not None:
-            self._at_faces = self.pattern.positions(self.pressure.faces, self.pressure.faces)
+            self._at_faces = self.pattern.within(self.pressure.faces)
+            self._at_faces_skew = self.pattern.within_skew(self.pressure.faces)
         if self.cables is not None:
-            nodes = self.cables.patches.nodes
-            self._at_cables = self.pattern.positions(nodes, nodes)
+            self._at_cables = self.pattern.within(self.cables.patches.nodes)
         if self.hinge is not None:
-            nodes = self.hinge.points.nodes
-            self._at_hinge = self.pattern.positions(nodes, nodes)
+            self._at_hinge = self.pattern.within(self.hinge.points.nodes)
         if self.ties is not None:
-            nodes = self.ties.spans.nodes
-            self._at_ties = self.pattern.positions(nodes, nodes)
-        first, second = elements[hosts[:, 0]], elements[hosts[:, 1]]
-        self._forward = self.pattern.positions(first, second)
-        self._backward = self.pattern.positions(second, first)
-        self._at_diagonal = self.pattern.diagonal
+            self._at_ties = self.pattern.within(self.ties.spans.nodes)
+        self._at_contact = self.pattern.between(elements[hosts[:, 0]], elements[hosts[:, 1]])
+        self._at_diagonal = self.pattern.pointer[:-1]
         some: BoolArray = np.any(self.held, axis=1)
-        self._at_held = np.flatnonzero(some[self.pattern.rows] | some[self.pattern.columns])
+        self._at_held = np.flatnonzero(some[self.pattern.rows] | some[self.pattern.all_columns])
 
     def search_contact(self, x: FloatArray) -> ContactPairs | None:
         """Candidate pairs at nodal positions ``x``."""
@@ -263,7 +263,8 @@ class System:
         self.solid.add_tangents(state, self._at_elements, blocks)
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0:
-            scatter_matrices(blocks, self._at_faces, -p * self.pressure.tangents(x))
+            tangents = -p * self.pressure.tangents(x)
+            scatter_matrices(blocks, self._at_faces, self._at_faces_skew, tangents)
         if self.cables is not None:
             stiffness = self._cable_forces(self.cables, x, loads)[1]
             scatter_blocks(blocks, self._at_cables, self.cables.patches.weights, stiffness)
@@ -273,9 +274,7 @@ class System:
             _, stiffness = self.ties.forces(x, loads.tie_lengths)
             scatter_blocks(blocks, self._at_ties, self.ties.spans.weights, stiffness)
         if self.contact is not None and pairs is not None and y is not None and slots is not None:
-            self.contact.add_tangent(
-                pairs, y, blocks, slots, self._forward, self._backward, self._at_elements
-            )
+            self.contact.add_tangent(pairs, y, blocks, slots, self._at_contact, self._at_elements)
         return blocks
 
     def _cable_forces(
@@ -285,7 +284,7 @@ class System:
             x, loads.tips, self.factors.chord_stiffness, self.factors.chord_rest_length
         )
 
-    def matrix(self, blocks: FloatArray, mass_factor: float) -> sparse.bsr_matrix:
+    def matrix(self, blocks: FloatArray, mass_factor: float) -> BlockMatrix:
         """Tangent ``(3n, 3n)`` plus ``mass_factor`` times lumped mass; held rows are identity.
 
         Overwrites ``blocks`` and refers to them.
@@ -294,7 +293,7 @@ class System:
             blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
         if self._at_held.size:
             free, at = ~self.held, self._at_held
-            rows, columns = self.pattern.rows[at], self.pattern.columns[at]
+            rows, columns = self.pattern.rows[at], self.pattern.all_columns[at]
             blocks[at] *= free[rows][:, :, None] & free[columns][:, None, :]
             nodes, axes = np.nonzero(self.held)
             blocks[self._at_diagonal[nodes], axes, axes] = 1.0

@@ -56,7 +56,7 @@ def test_contact_hessian(case, measure):
     system, contact = c.system, c.system.contact
     slots = system._contact_slots(contact, c.pairs, c.y)
     blocks = system.pattern.zeros()
-    where = (slots, system._forward, system._backward, system._at_elements)
+    where = (slots, system._at_contact, system._at_elements)
     measure(lambda: contact.add_tangent(c.pairs, c.y, blocks, *where), **about)
 
 

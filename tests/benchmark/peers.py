@@ -13,8 +13,9 @@ fastest of its forms and solvers that were tried. What is set up once (mesh, spa
 compiled terms) is not timed; the symbolic analysis of the matrix is. All take turns, so that a busy
 machine slows all of them alike.
 
-    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 \
-        python -m tests.benchmark.peers [OUTPUT.json]
+    python -m tests.benchmark.peers [OUTPUT.json]
+
+All use one thread, which the package of this module sees to before any of them is imported.
 """
 
 from __future__ import annotations
@@ -33,9 +34,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import mvest
+from mvest.errors import InputError
 from mvest.mechanics import (
     Loads,
     NewtonSettings,
+    Parameter,
     Simulation,
     Step,
     System,
@@ -48,6 +51,7 @@ from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
+from tests.benchmark import THREADS
 
 MESHES = ((40, 40, 1), (60, 60, 1))
 SIZE = (20.0, 20.0, 1.3)
@@ -63,7 +67,6 @@ REPEATS = 6
 """Whole solves by each library; the first is not counted."""
 AGREEMENT = 1e-6
 """Relative difference of the deflections from mvest's above which the comparison is void."""
-THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 MU = YOUNG / (2 * (1 + POISSON))
 LAMBDA = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
@@ -142,9 +145,24 @@ class SaintVenantKirchhoff:
         stress = (green.reshape(-1, 6) @ self.moduli).reshape(green.shape)
         return stress, np.tile(self.moduli, (*green.shape[:2], 1, 1))
 
-    def stress_of_region(self, stress: FloatArray, region: IntArray, which: int) -> FloatArray:
-        """The stress is proportional to Young's modulus."""
-        return np.where((region == which)[:, None, None], stress, 0.0)
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Nothing is differentiated."""
+        return ()
+
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """No parameter is known."""
+        raise InputError(f"parameter {parameter.name!r}: the sheet has none")
 
     def history_stress(
         self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float

@@ -131,7 +131,7 @@ def bounds(case: Closed) -> list[dict[str, Any]]:
         {
             "what": "product of matrix and vector",
             "bound by": "GB/s",
-            "reached": (matrix.data.nbytes + matrix.indices.nbytes)
+            "reached": (matrix.blocks.nbytes + matrix.pattern.columns.nbytes)
             / _seconds(lambda: matrix @ v)
             / 1e9,
         },

@@ -1,8 +1,10 @@
 """Small bodies on which the physics can be checked by hand."""
 
 import numpy as np
+from scipy import sparse
 
 from mvest.elements import ELEMENTS
+from mvest.mechanics.assembly import BlockMatrix, SparsityPattern
 from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact
@@ -20,6 +22,25 @@ MATERIALS = {
     "A": TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL),
     "C": TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.NEARLY_INCOMPRESSIBLE),
 }
+
+
+def block_matrix(matrix):
+    """A sparse matrix of 3x3 blocks by its symmetric and its skew part."""
+    halves = [
+        sparse.bsr_matrix(0.5 * part, blocksize=(3, 3))
+        for part in (matrix + matrix.T, matrix - matrix.T)
+    ]
+    for half in halves:
+        half.sort_indices()
+    n = matrix.shape[0] // 3
+    rows = [np.repeat(np.arange(n), np.diff(half.indptr)) for half in halves]
+    skew = np.column_stack([rows[1], halves[1].indices])
+    stored = sparse.csr_matrix(
+        (np.ones(len(rows[0])), halves[0].indices, halves[0].indptr), shape=(n, n)
+    )
+    pattern = SparsityPattern.of(stored, skew)
+    upper = [half.data[row <= half.indices] for half, row in zip(halves, rows, strict=True)]
+    return BlockMatrix(pattern, np.concatenate(upper))
 
 
 def rotation(axis, angle):

@@ -50,7 +50,7 @@ def check_system(system, x, loads, *, previous=None, rate=0.0, pairs=None, final
     matrix = system.pattern.matrix(blocks)
     d = directions(x.shape)
     check(residual, matrix @ d.ravel(), x, d, final)
-    return matrix
+    return matrix.tobsr()
 
 
 def moved(mesh, amount=0.08, seed=1):
@@ -144,6 +144,21 @@ def test_contact():
     x, pairs = pressed(alone, loading)
     matrix = check_system(alone, x, Loads(), pairs=pairs)
     assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
+
+
+def test_contact_between_neighbours():
+    # A sheet pressed to half its width touches itself, also across elements that share nodes.
+    system, _ = sandwich()
+    law = BiotLaw(np.zeros((2, 6, 6)))
+    alone = System(Solid(system.solid.mesh, law, enhanced=False), contact=system.contact)
+    elements = alone.solid.mesh.elements
+    x = alone.solid.mesh.nodes * [0.55, 1.0, 1.0]
+    x += 0.02 * np.random.default_rng(3).uniform(-1, 1, x.shape)
+    pairs = alone.search_contact(x)
+    touching = pairs.hosts[alone.contact.touching(pairs, alone.contact.points(x))]
+    shared = [len(np.intersect1d(elements[a], elements[b])) for a, b in touching]
+    assert {6, 18} <= set(shared)  # with a side in common, and with itself
+    check_system(alone, x, Loads(), pairs=pairs)
 
 
 @pytest.mark.parametrize("element_type", ["hex18", "tet10", "wedge18"])

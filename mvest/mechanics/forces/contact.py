@@ -204,21 +204,21 @@ class Contact:
         y: FloatArray,
         data: FloatArray,
         slot: IntArray,
-        forward: IntArray,
-        backward: IntArray,
-        own: IntArray,
+        between: NDArray[np.int32],
+        own: NDArray[np.int32],
     ) -> None:
         """Add the exact Hessian of the contact energy to block data.
 
         Parameters
         ----------
         slot : ndarray
-            ``(g,)`` entry of ``forward`` and ``backward`` for each group, -1 for groups that do not
-            touch.
-        forward, backward : ndarray
-            ``(slots, w, w)`` positions of the blocks (host 1, host 2) and (host 2, host 1).
+            ``(g,)`` entry of ``between`` for each group, -1 for groups that do not touch.
+        between : ndarray
+            ``(slots, w, w)`` positions of the blocks (host 1, host 2), as
+            :meth:`mvest.mechanics.assembly.SparsityPattern.between` gives them.
         own : ndarray
-            ``(e, w, w)`` positions of the blocks of each host element with itself.
+            ``(e, w, w)`` positions of the blocks of each host element with itself, negative where
+            the mirror image serves.
         """
         _add_tangent(
             y,
@@ -234,8 +234,7 @@ class Contact:
             self._by_host,
             data,
             slot,
-            forward,
-            backward,
+            between,
             own,
         )
 
@@ -343,9 +342,8 @@ def _add_tangent(
     by_host: IntArray,
     data: FloatArray,
     slot: IntArray,
-    forward: IntArray,
-    backward: IntArray,
-    own: IntArray,
+    between: NDArray[np.int32],
+    own: NDArray[np.int32],
 ) -> None:
     n, n_w = weights.shape
     # The 3x3 block of a pair is symmetric: 00, 11, 22, 12, 02, 01. Components come first, so that
@@ -396,8 +394,11 @@ def _add_tangent(
                             block[c, a_, b] += w * row[c, b]
         for a_ in range(n_w):
             for b in range(n_w):
-                _add_symmetric(data[forward[slot[g], a_, b]], block[:, a_, b])
-                _add_symmetric(data[backward[slot[g], b, a_]], block[:, a_, b])
+                at = between[slot[g], a_, b]
+                if at < 0:  # a node that both hosts have
+                    at = -1 - at
+                    _add_symmetric(data[at], block[:, a_, b])
+                _add_symmetric(data[at], block[:, a_, b])
     p = 0
     while p < n:
         h, any_active = host[by_host[p]], False
@@ -416,7 +417,8 @@ def _add_tangent(
         if any_active:
             for a_ in range(n_w):
                 for b in range(n_w):
-                    _add_symmetric(data[own[h, a_, b]], block[:, a_, b])
+                    if own[h, a_, b] >= 0:
+                        _add_symmetric(data[own[h, a_, b]], block[:, a_, b])
 
 
 @nb.njit(cache=True, inline="always")

@@ -2,7 +2,8 @@
 
 The pressure acts on the current surface: on a face with positions ``x(xi, eta)`` the nodal force is
 ``f_a = p int N_a (x_xi x x_eta) dxi deta`` against the outward normal, hence the minus sign of the
-load. The load stiffness ``df_a/dx_b`` is exact and not symmetric at a free edge.
+load. The load stiffness ``df_a/dx_b`` is exact. Between faces its skew part cancels; along the rim
+of the loaded surface it stays.
 """
 
 from __future__ import annotations
@@ -30,6 +31,24 @@ class PressureLoad:
     def __init__(self, faces: IntArray, face_type: str) -> None:
         self.faces = faces
         self.face = FACES[face_type]
+
+    def rim(self) -> IntArray:
+        """Pairs ``(s, 2)`` of nodes between which the load stiffness is not symmetric.
+
+        Two nodes of a face on the rim of all faces: on a line from one of its nodes to the next
+        that no other face runs along the other way round.
+        """
+        lines = self.faces[:, self.face.corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
+        lines = lines.reshape(-1, 2)
+        size = int(self.faces.max(initial=0)) + 1
+        way, back = lines[:, 0] * size + lines[:, 1], lines[:, 1] * size + lines[:, 0]
+        _, which, count = np.unique(way, return_inverse=True, return_counts=True)
+        alone = (count[which] > 1) | ~np.isin(back, way)
+        on_rim = np.zeros(size, dtype=np.bool_)
+        on_rim[lines[alone]] = True
+        here = on_rim[self.faces]
+        face, a, b = np.nonzero(here[:, :, None] & here[:, None, :])
+        return np.column_stack([self.faces[face, a], self.faces[face, b]])
 
     def forces(self, x: FloatArray) -> FloatArray:
         """Nodal forces ``(f, k, 3)`` in N for a pressure of 1 MPa."""

@@ -1,0 +1,116 @@
+"""Assembly: where blocks lie, and that half of a matrix is all of it."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from mvest.mechanics.assembly import (
+    SparsityPattern,
+    adjacency,
+    elements_of_nodes,
+    scatter_blocks,
+    scatter_matrices,
+)
+from mvest.mechanics.blocks import outer_faces
+from mvest.mechanics.forces.pressure import PressureLoad
+from tests.mechanics.bodies import block, block_matrix
+
+NO_PAIRS = np.zeros((0, 2), dtype=int)
+
+
+def test_a_matrix_by_halves_is_the_matrix():
+    random = np.random.default_rng(0)
+    dense = sparse.random_array((30, 30), density=0.1, rng=random).toarray() + np.eye(30)
+    matrix = block_matrix(sparse.csr_matrix(dense))
+    assert len(matrix.pattern.skew) > 3
+    np.testing.assert_allclose(matrix.tobsr().toarray(), dense, atol=1e-15)
+    x = random.normal(size=(30, 2))
+    np.testing.assert_allclose(matrix @ x, dense @ x, atol=1e-14)
+    np.testing.assert_allclose(matrix @ x[:, 0], dense @ x[:, 0], atol=1e-14)
+
+
+def test_coupled_elements_couple_all_their_nodes():
+    mesh = block("hex18", (4, 3, 1))
+    elements, n = mesh.elements, len(mesh.nodes)
+    pairs = np.array([[0, 11], [0, 7], [3, 3], [3, 4], [5, 10]])
+    static = SparsityPattern.of(adjacency(n, [elements]), NO_PAIRS)
+    pattern = static.with_coupling(elements, pairs, elements_of_nodes(n, elements))
+    expected = adjacency(n, [elements]).toarray() != 0
+    for one, other in pairs:
+        expected[np.ix_(elements[one], elements[other])] = True
+        expected[np.ix_(elements[other], elements[one])] = True
+    rows, columns = np.nonzero(np.triu(expected))
+    np.testing.assert_array_equal(pattern.rows, rows)
+    np.testing.assert_array_equal(pattern.columns, columns)
+    assert static.with_coupling(elements, pairs[:0], elements_of_nodes(n, elements)) is static
+
+
+def test_positions_are_those_of_the_nodes():
+    mesh = block("hex18", (4, 3, 1))
+    elements, n = mesh.elements, len(mesh.nodes)
+    pairs = np.array([[0, 11], [3, 4]])
+    pattern = SparsityPattern.of(adjacency(n, [elements]), NO_PAIRS).with_coupling(
+        elements, pairs, elements_of_nodes(n, elements)
+    )
+    within = pattern.within(elements)
+    row, column = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
+    upper = row <= column
+    assert np.all(within[~upper] == -1)
+    np.testing.assert_array_equal(pattern.rows[within[upper]], row[upper])
+    np.testing.assert_array_equal(pattern.columns[within[upper]], column[upper])
+    first, second = elements[pairs[:, 0]], elements[pairs[:, 1]]
+    between = pattern.between(first, second)
+    row, column = np.broadcast_arrays(first[:, :, None], second[:, None, :])
+    same = row == column
+    assert np.count_nonzero(same) > 3  # neighbours have nodes in common
+    np.testing.assert_array_equal(between < 0, same)
+    at = np.where(same, -1 - between, between)
+    np.testing.assert_array_equal(pattern.rows[at], np.minimum(row, column))
+    np.testing.assert_array_equal(pattern.columns[at], np.maximum(row, column))
+
+
+def test_points_that_share_a_node_add_up():
+    # The second point has node 2 twice, as a tie between neighbours does.
+    nodes = np.array([[0, 3, 1], [2, 1, 2]])
+    weights = np.array([[0.5, 0.3, 0.2], [0.7, -1.0, 0.4]])
+    stiffness = np.random.default_rng(3).normal(size=(2, 3, 3))
+    stiffness += stiffness.transpose(0, 2, 1)
+    pattern = SparsityPattern.of(adjacency(4, [nodes]), NO_PAIRS)
+    blocks = pattern.zeros()
+    scatter_blocks(blocks, pattern.within(nodes), weights, stiffness)
+    expected = np.zeros((12, 12))
+    for own, w, k in zip(nodes, weights, stiffness, strict=True):
+        share = np.zeros((3, 12))
+        for node, factor in zip(own, w, strict=True):
+            share[:, 3 * node : 3 * node + 3] += factor * np.eye(3)
+        expected += share.T @ k @ share
+    np.testing.assert_allclose(pattern.matrix(blocks).tobsr().toarray(), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("element_type", ["hex18", "tet4", "tet10", "wedge12"])
+def test_pressure_is_unsymmetric_along_the_rim_alone(element_type):
+    mesh = block(element_type, (3, 3, 2), (3.0, 3.0, 2.0))
+    n, random = len(mesh.nodes), np.random.default_rng(6)
+    x = mesh.nodes + 0.2 * random.uniform(-1, 1, mesh.nodes.shape)
+    every = outer_faces(mesh.elements, element_type)
+    top = every[np.all(mesh.nodes[every][:, :, 2] == 2.0, axis=1)]
+    for faces in (top, top[1:]):  # the second with a corner cut out
+        load = PressureLoad(faces, mesh.reference.face)
+        pattern = SparsityPattern.of(adjacency(n, [faces]), load.rim())
+        inside = adjacency(n, [faces]).nnz
+        assert 0 < 2 * len(pattern.skew) < inside
+        blocks = pattern.zeros()
+        scatter_matrices(
+            blocks, pattern.within(faces), pattern.within_skew(faces), load.tangents(x)
+        )
+        expected = np.zeros((3 * n, 3 * n))
+        for own, tangent in zip(faces, load.tangents(x), strict=True):
+            at = (3 * own[:, None] + np.arange(3)).ravel()
+            expected[np.ix_(at, at)] += tangent
+        assert np.abs(expected - expected.T).max() > 0.01
+        np.testing.assert_allclose(pattern.matrix(blocks).tobsr().toarray(), expected, atol=1e-14)
+
+
+def test_a_closed_surface_has_no_rim():
+    mesh = block("tet4", (2, 2, 2))
+    assert len(PressureLoad(outer_faces(mesh.elements, "tet4"), "tri3").rim()) == 0
