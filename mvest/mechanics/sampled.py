@@ -14,9 +14,10 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.elements import Element
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 __all__ = ["Sampling"]
 
@@ -87,7 +88,7 @@ class Sampling:
         stress: FloatArray,
         tangent: FloatArray,
         modes: FloatArray,
-        positions: IntArray,
+        positions: NDArray[np.int32],
         blocks: FloatArray,
     ) -> None:
         """Add the tangents of all elements, N/mm, the modes ``(e, q, 6, m)`` eliminated.
@@ -130,7 +131,7 @@ def _add_tangents(
     from_covariant: FloatArray,
     to_mean: FloatArray,
     from_mean: FloatArray,
-    positions: IntArray,
+    positions: NDArray[np.int32],
     blocks: FloatArray,
 ) -> None:
     n_e, n_q, n_a, _ = gradients.shape
@@ -181,6 +182,8 @@ def _add_tangents(
             k -= np.dot(k_am.T, np.linalg.solve(np.dot(m.T, dm), k_am))
         for a in range(n_a):
             for c in range(n_a):
+                if positions[e, a, c] < 0:
+                    continue
                 block = blocks[positions[e, a, c]]
                 for i in range(3):
                     block[i, i] += geometric[a, c]
