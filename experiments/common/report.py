@@ -19,6 +19,7 @@ __all__ = [
     "page",
     "parameter_label",
     "percent",
+    "write_drawn",
     "write_each",
     "write_report",
 ]
@@ -112,6 +113,35 @@ def write_each(
                 if other is not None:
                     base = folder / f"{record.experiment}_{name}"
                     written += save_figure_with(base, other, record.line)
+        return written
+
+    return write
+
+
+def write_drawn(
+    table: Callable[[Record[F]], pd.DataFrame],
+    words: Callable[[Record[F]], str],
+    figure: Callable[[Record[F], Path], Figure],
+    note: Callable[[Record[F]], str] = lambda record: "",
+) -> Callable[[Path, Mapping[str, Record[F]], Mapping[str, Path]], list[Path]]:
+    """How a study writes whose figure needs the arrays of a run, and is left out without them.
+
+    A note may stand above the table, as its comments.
+    """
+
+    def write(
+        folder: Path, records: Mapping[str, Record[F]], arrays: Mapping[str, Path]
+    ) -> list[Path]:
+        written = []
+        for name, record in records.items():
+            base = folder / record.experiment
+            csv = note(record) + table(record).to_csv(index=False, float_format="%.6g")
+            written += [
+                write_atomically(base.with_suffix(".csv"), csv),
+                write_atomically(base.with_suffix(".md"), page(record, words(record))),
+            ]
+            if name in arrays:
+                written += save_figure_with(base, figure(record, arrays[name]), record.line)
         return written
 
     return write

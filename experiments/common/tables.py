@@ -4,36 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.reporting.markup import latex_rows, markdown_rows
 
-__all__ = ["checked_rows", "write_table"]
-
-
-def checked_rows(
-    rows: Sequence[Mapping[str, Any]], wanted: Sequence[str], what: str
-) -> pd.DataFrame:
-    """Rows as a table, each of which has all entries ``wanted``; ``what`` names them in an error.
-
-    Raises
-    ------
-    InputError
-        No rows, or an entry that is missing.
-    """
-    if not rows:
-        raise InputError(f"{what}: no rows, expected at least one")
-    for k, row in enumerate(rows):
-        missing = [name for name in wanted if name not in row]
-        if missing:
-            raise InputError(
-                f"{what}: row {k} has no {', '.join(missing)}, expected {', '.join(wanted)}"
-            )
-    return pd.DataFrame(list(rows))
+__all__ = ["write_table"]
 
 
 def write_table(

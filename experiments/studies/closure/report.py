@@ -28,8 +28,6 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.style import COLOURS, plain_axes
 from mvest.typing import FloatArray
-from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.gap import Gap, find_gap
 
 __all__ = [
     "Findings",
@@ -146,19 +144,11 @@ def _draw_moments(
         at_rest = found.equilibrium and k == len(found.rows) - 1
         when = "at rest" if at_rest else f"{row.time:.2f} s"
         panels[0, column].set_title(f"{when}, {row.pressure_mmhg:.0f} mmHg", fontsize=10)
-    paint_gap(panels[0, -1], *_gap(valve, shapes[moments[-1]], moments[-1]))
+    paint_gap(panels[0, -1], valve, shapes[moments[-1]], moments[-1])
     name_leaflets(panels[0, 0], valve, ("anterior", "posterior"))
     shown = [shapes[k] for k in moments]
     same_scale(list(panels[0]), shown, ATRIUM)
     same_scale(list(panels[1]), [*shown, *(valve.tips[k] for k in moments)], POSTERIOR)
-
-
-def _gap(valve: CaseFields, points: FloatArray, frame: int) -> tuple[Gap, FloatArray]:
-    """What is open between the thick leaflets, and the origin ``(3,)`` mm of its coordinates."""
-    annulus = points[valve.annulus]
-    own = valve.vertex_region[valve.annulus] == 0
-    plane = annulus_plane(annulus, valve.tips[frame].mean(axis=0), annulus[own].mean(axis=0))
-    return find_gap(points, valve.triangles, annulus, plane, 0.0), plane.origin
 
 
 def _draw_curves(part: Any, found: Findings, moments: list[int]) -> None:

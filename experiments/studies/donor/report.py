@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,11 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from experiments.common.record import Record
-from experiments.common.report import page
+from experiments.common.report import write_drawn
 from experiments.studies.donor.findings import Distances, Findings
 from mvest.errors import InputError
-from mvest.files import write_atomically
-from mvest.reporting.figures import DISTANCE_MAP, VIEWS, save_figure_with
+from mvest.reporting.figures import DISTANCE_MAP, VIEWS
+from mvest.reporting.markup import MISSING
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["donor_answer", "donor_figure", "donor_table", "donor_words", "write_donor"]
@@ -26,7 +25,6 @@ __all__ = ["donor_answer", "donor_figure", "donor_table", "donor_words", "write_
 PLAIN = np.array([0.82, 0.80, 0.76])
 """Colour of the recorded valve, which has no distance from itself."""
 LIGHT = np.array([0.30, 0.50, 0.81])
-MISSING = "–"
 WHOLE = ("mean", "median", "rms", "max", "surface")
 """Distances of the whole valve."""
 
@@ -213,25 +211,12 @@ def donor_words(record: Record[Findings]) -> str:
     return "\n".join([*lines, "", " ".join(facts)])
 
 
-def write_donor(
-    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Table of each run, and its picture where its surfaces are still there.
+def _note(record: Record[Findings]) -> str:
+    found = record.findings
+    return f"# {found.claim}\n# data: {found.data.citation}\n# {record.line}\n"
 
-    Raises
-    ------
-    InputError
-        If a file cannot be written, or the surfaces cannot be read.
-    """
-    written = []
-    for name, record in records.items():
-        found, base = record.findings, folder / record.experiment
-        table = donor_table(record).to_csv(index=False, float_format="%.6g")
-        note = f"# {found.claim}\n# data: {found.data.citation}\n# {record.line}\n"
-        written += [
-            write_atomically(base.with_suffix(".csv"), note + table),
-            write_atomically(base.with_suffix(".md"), page(record, donor_words(record))),
-        ]
-        if name in arrays:
-            written += save_figure_with(base, donor_figure(arrays[name]), record.line)
-    return written
+
+write_donor = write_drawn(
+    donor_table, donor_words, lambda record, fields: donor_figure(fields), _note
+)
+"""The table of each run, and its picture where its surfaces are still there."""

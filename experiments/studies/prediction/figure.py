@@ -30,8 +30,6 @@ from mvest.reporting.case.drawing import (
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.figures import COLOURS
 from mvest.typing import FloatArray
-from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.gap import Gap, find_gap
 
 __all__ = ["prediction_figure"]
 
@@ -106,9 +104,8 @@ def _draw_valves(part: Any, valve: CaseFields, shapes: FloatArray, findings: Fin
             panel.set_axis_off()
             panel.set_title(f"{title}\nnot closed: {scenarios[name].failure}", fontsize=9)
             continue
-        gap, origin = _gap(valve, shape, findings.reach_mm)
         draw_valve(panel, valve, shape, colours, ATRIUM, 0)
-        paint_gap(panel, gap, origin)
+        paint_gap(panel, valve, shape, 0, findings.reach_mm)
         area = scenarios[name].measures["gap_mm2"].estimate
         panel.set_title(f"{title}\ngap {area:.1f} mm²", fontsize=10)
     name_leaflets(panels[0], valve, ("anterior", "posterior"))
@@ -124,14 +121,6 @@ def _draw_valves(part: Any, valve: CaseFields, shapes: FloatArray, findings: Fin
         frameon=False,
         ncols=2,
     )
-
-
-def _gap(valve: CaseFields, shape: FloatArray, reach: float) -> tuple[Gap, FloatArray]:
-    """The gap, and the origin ``(3,)`` mm of its coordinates."""
-    annulus = shape[valve.annulus]
-    own = valve.vertex_region[valve.annulus] == 0
-    plane = annulus_plane(annulus, valve.tips[0].mean(axis=0), annulus[own].mean(axis=0))
-    return find_gap(shape, valve.triangles, annulus, plane, reach), plane.origin
 
 
 # -- measures -------------------------------------------------------------------------------------

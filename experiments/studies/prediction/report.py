@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import Literal
 
 import pandas as pd
 
 from experiments.common.record import Record
-from experiments.common.report import page
+from experiments.common.report import write_drawn
 from experiments.studies.prediction.figure import prediction_figure
 from experiments.studies.prediction.findings import Findings, Predicted
-from mvest.files import write_atomically
-from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import MISSING, markdown_rows, number
 
 __all__ = [
@@ -283,26 +280,9 @@ def prediction_answer(record: Record[Findings]) -> str:
     )
 
 
-# -- files ----------------------------------------------------------------------------------------
-def write_prediction(
-    folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
-) -> list[Path]:
-    """Tables of each run, and its figure where its valves are still there.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written, or the valves cannot be read.
-    """
-    written = []
-    for name, record in records.items():
-        base = folder / record.experiment
-        table = prediction_table(record.findings).to_csv(index=False, float_format="%.6g")
-        written += [
-            write_atomically(base.with_suffix(".csv"), table),
-            write_atomically(base.with_suffix(".md"), page(record, prediction_words(record))),
-        ]
-        if name in arrays:
-            figure = prediction_figure(record.findings, arrays[name])
-            written += save_figure_with(base, figure, record.line)
-    return written
+write_prediction = write_drawn(
+    lambda record: prediction_table(record.findings),
+    prediction_words,
+    lambda record, fields: prediction_figure(record.findings, fields),
+)
+"""Tables of each run, and its figure where its valves are still there."""

@@ -17,7 +17,8 @@ from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
-from mvest.valve.measure.gap import Gap
+from mvest.valve.measure.annulus import annulus_plane
+from mvest.valve.measure.gap import find_gap
 
 __all__ = [
     "ATRIUM",
@@ -208,11 +209,26 @@ def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
     )
 
 
-def paint_gap(axes: Any, gap: Gap, origin: FloatArray) -> None:
+def paint_gap(
+    axes: Any, fields: CaseFields, points: FloatArray, frame: int, reach_mm: float = 0.0
+) -> None:
     """Draw what is open of a valve seen from the atrium, and the slit where leaflets touch.
 
-    ``origin (3,)`` mm is that of the gap's coordinates: its annulus plane's.
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    fields : CaseFields
+    points : ndarray
+        ``(n, 3)`` mm.
+    frame : int
+        Whose papillary tips are below the valve.
+    reach_mm : float
+        Distance of midsurfaces within which leaflets touch.
     """
+    annulus = points[fields.annulus]
+    first = annulus[fields.vertex_region[fields.annulus] == 0]
+    plane = annulus_plane(annulus, fields.tips[frame].mean(axis=0), first.mean(axis=0))
+    gap, origin = find_gap(points, fields.triangles, annulus, plane, reach_mm), plane.origin
     image = np.zeros((*gap.open.shape, 4))
     image[gap.slit] = (*TISSUE, 1.0)
     image[gap.open] = (*BLOOD, 1.0)
