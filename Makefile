@@ -93,7 +93,6 @@ screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chro
 	$(BIN)/python -m experiments.runner.screenshot
 
 slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
-	$(UV) --constraint requirements.lock -r pyproject.toml --extra cluster
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'
 
 lock: $(DEVELOP) ## renew requirements.lock after a change of dependencies (add UPGRADE=--upgrade for the newest)

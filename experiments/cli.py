@@ -19,6 +19,7 @@ from typing import NoReturn
 
 from experiments.common.places import EXPERIMENTS
 from mvest import __version__
+from mvest.errors import MvestError
 
 __all__ = ["experiments_in", "main", "quoted"]
 
@@ -28,6 +29,8 @@ COMMANDS = {
     "own-valve": "moduli of a valve from a case folder",
     "volume": "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
     "tables": "every table and figure of results/ anew, from the records that are kept there",
+    "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
+    "collect": "what became of the jobs of a sweep that others ran",
     "dashboard": "MLflow's pages, on the comparison of the last sweep",
 }
 
@@ -68,6 +71,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser = Parser("mvest tables", description=COMMANDS[command])
             parser.add_argument("folder", nargs="?", default="results", metavar="FOLDER")
             return tables([parser.parse_args(rest).folder])
+        case "worker":
+            return _worker(rest)
+        case "collect":
+            parser = Parser("mvest collect", description=COMMANDS[command])
+            parser.add_argument("folder", type=Path, metavar="FOLDER")
+            return _collect(parser.parse_args(rest).folder)
         case "dashboard":
             from experiments.runner.dashboard import main as dashboard
 
@@ -84,6 +93,35 @@ def _help() -> str:
     about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
     lines = [f"  mvest {name:<10} {text}" for name, text in COMMANDS.items()]
     return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
+
+
+def _worker(rest: list[str]) -> int:
+    """Run a shard of a sweep; what becomes of its jobs is recorded, and no failure of this."""
+    from experiments.runner.drain import Shard, drain_shard
+    from experiments.runner.plan import Plan
+
+    parser = Parser("mvest worker", description=COMMANDS["worker"])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the sweep, in outputs/")
+    parser.add_argument("--shard", default="1/1", metavar="I/N", help="I from 1 to N")
+    parsed = parser.parse_args(rest)
+    try:
+        shard = Shard.parse(parsed.shard)
+        total, failed = drain_shard(Plan.read(parsed.folder), shard)
+    except (MvestError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"shard {shard}: {total} jobs, {failed} without an estimate")
+    return 0
+
+
+def _collect(folder: Path) -> int:
+    from experiments.runner.sweep import collect_sweep
+
+    try:
+        return collect_sweep(folder)
+    except (MvestError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
 
 
 def _application(overrides: list[str]) -> int:

@@ -91,8 +91,8 @@ def run_alone(config: DictConfig) -> None:
     """
     # Imports every study, for seconds: not where only help is asked for.
     from experiments.runner.check import require_admissible
+    from experiments.runner.compose import plan_run
     from experiments.runner.job import run_job
-    from experiments.runner.plan import plan_run
 
     request = Request.of(config)
     with nothing_empty(request.folder, Path(config.paths.outputs)):
@@ -102,7 +102,7 @@ def run_alone(config: DictConfig) -> None:
             print(plan.summary(), plan.listing(), sep="\n")
             return
         try:
-            run_job(config)
+            run_job(request)
         except FailedRunError:
             track_job(request.folder, request.values)
             raise

@@ -106,8 +106,6 @@ STUDIES, IN_COMMON = "experiments.studies", "experiments.common"
 
 IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
-    "hydra-joblib-launcher": ("hydra_plugins",),
-    "hydra-submitit-launcher": ("hydra_plugins", "submitit"),
     "markdown-it-py": ("markdown_it",),
     "matplotlib": ("matplotlib", "mpl_toolkits"),
     "pillow": ("PIL",),
@@ -116,7 +114,7 @@ IMPORT_NAME = {
     "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
 }
-OPTIONAL = ("viz", "cluster", "postgres", "second-model")
+OPTIONAL = ("viz", "postgres", "second-model")
 """Extras that mvest and experiments may use, within functions."""
 
 

@@ -7,7 +7,7 @@ adds to it is written down here.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import Any
 
@@ -40,6 +40,7 @@ NOT_THE_RESULT = (
     "publish",
     "force",
     "dry_run",
+    "detach",
     "time_limit_s",
     "isolate",
     "check",
@@ -153,6 +154,7 @@ class TrackingConfig:
 
     enabled: bool = True
     uri: str | None = None
+    runs: bool | None = None  # whether each job of a sweep is a run; null: of up to 1000 jobs
 
 
 @dataclass
@@ -197,6 +199,7 @@ class Config:
     figures: bool = True  # draw the run; a sweep need not draw every job
     force: bool = False  # run again what is done
     dry_run: bool = False  # only say what would run, and how long it would take
+    detach: bool = False  # of a sweep: submit its jobs, or only plan them, and leave
     time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
     isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
     factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
@@ -219,14 +222,15 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
     return found
 
 
-def hash_of(config: DictConfig) -> str:
-    """SHA-256 of everything in a configuration that can change the result."""
-    values = plain(config, NOT_THE_RESULT)
+def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
+    """SHA-256 of everything in a configuration, resolved or not, that can change the result."""
+    values = plain(config, NOT_THE_RESULT) if isinstance(config, DictConfig) else config
+    kept = {str(key): value for key, value in values.items() if key not in NOT_THE_RESULT}
     for name in NOT_THE_RESULT:
-        part, _, key = name.partition(".")
-        if key and values.get(part) is not None:
-            del values[part][key]
-    return config_hash(values)
+        part, _, inner = name.partition(".")
+        if inner and kept.get(part) is not None:
+            kept[part] = {key: value for key, value in kept[part].items() if key != inner}
+    return config_hash(kept)
 
 
 def _package_model() -> str | None:

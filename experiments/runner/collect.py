@@ -1,19 +1,28 @@
-"""One file of a whole sweep: ``sweep.json``, from the results of its jobs."""
+"""One file of a whole sweep: ``sweep.json``, from what its jobs ended with.
+
+That is appended to a file of the process that ran a job, so that ten thousand records need not be
+opened. The records stay the truth: a line that is torn, missing or of an older one is left aside.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
 
-from experiments.common.estimates import Paper
-from experiments.common.record import Record, here_and_now, model_of_values
+from pydantic import TypeAdapter, ValidationError
+
+from experiments.common.estimates import Paper, SeedRun
+from experiments.common.record import Record, Status, here_and_now, model_of_values
 from experiments.runner.compared import Compared, last_compared
+from experiments.runner.folder import is_done, result_time
 from experiments.runner.plan import Plan, PlannedJob
 from experiments.sweeps.collected import SCHEMA, Cost, Sweep, SweepJob
 from mvest.provenance import config_hash
 
-__all__ = ["NOT_RUN", "collect", "overheads"]
+__all__ = ["ENDS", "NOT_RUN", "End", "collect", "overheads", "read_ends"]
 
 UNSAID = ("factors", "paths", "tracking")
 """Settings that are no part of what a sweep has in common, or belong to a machine."""
@@ -22,30 +31,100 @@ NOT_RUN = "not run"
 """Reason of a job that never began or was interrupted."""
 
 
-def collect(
-    plan: Plan, returned: Mapping[str, Mapping[str, Any]], earlier: Mapping[str, float]
-) -> Sweep:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class End:
+    """What a sweep keeps of a job, from its record and from who ran it.
+
+    Attributes
+    ----------
+    hash : str
+        The job's short one.
+    status : {"converged", "failed"}
+    reason : str
+    runs : tuple of SeedRun
+        None where the job as a whole was lost.
+    truth_store : str or None
+    mesh_hash, commit : str
+    seconds_total, seconds_computing : float or None
+        All of the job, and of that simulating and estimating; None where it left no record.
+    written_ns : int or None
+        When the record was written.
+    finished : float
+        Seconds since the epoch, as the process that ran it says.
+    process : str
+        Which one ran it; empty where that is not known.
+    """
+
+    hash: str
+    status: Status
+    reason: str
+    runs: tuple[SeedRun, ...] = ()
+    truth_store: str | None = None
+    mesh_hash: str = "none"
+    commit: str = "None"
+    seconds_total: float | None = None
+    seconds_computing: float | None = None
+    written_ns: int | None = None
+    finished: float = 0.0
+    process: str = ""
+
+    @classmethod
+    def of(cls, job: PlannedJob, record: Record[Compared], process: str = "") -> End:
+        """What is kept of a record that a process has just written, or somebody before."""
+        found = record.findings
+        return cls(
+            hash=job.short_hash,
+            status=record.status,
+            reason=record.reason,
+            runs=() if found.died else found.repeats,
+            truth_store=found.truth_store,
+            mesh_hash=record.provenance.mesh_hash,
+            commit=str(record.provenance.git.sha),
+            seconds_total=record.seconds_total,
+            seconds_computing=(
+                found.seconds_computing or found.repeats[0].seconds or record.seconds_total
+            ),
+            written_ns=result_time(job.folder),
+            finished=time.time(),
+            process=process,
+        )
+
+
+ENDS = "ends"
+"""Folder within a sweep's of the files to which processes append the ends of their jobs."""
+
+_END = TypeAdapter(End)
+
+
+def read_ends(folder: Path) -> dict[str, End]:
+    """What the jobs of a sweep ended with last, by their short hashes."""
+    found: dict[str, End] = {}
+    for path in sorted((folder / ENDS).glob("*.jsonl")):
+        for line in path.read_bytes().splitlines():
+            try:
+                end = _END.validate_json(line)
+            except ValidationError:
+                # Between two lines, cut off with the process that wrote it, or of another version.
+                continue
+            if end.hash not in found or found[end.hash].finished < end.finished:
+                found[end.hash] = end
+    return found
+
+
+def collect(plan: Plan, appended: Mapping[str, End]) -> Sweep:
     """What all jobs of a sweep gave, in their order, failed and missing ones included.
 
     Parameters
     ----------
     plan : Plan
-    returned : mapping
-        Short hash -> what the job gave its launcher at its end, for those that ended.
-    earlier : mapping
-        Short hash -> overhead that was measured when the job was run before.
+    appended : mapping
+        From `read_ends`; jobs that are not there are read from their folders.
     """
-    records = [last_compared(job.folder, job.config_hash) for job in plan.jobs]
-    ended = [record for record in records if record is not None]
-    stored = [record.findings.truth_store for record in ended]
-    jobs = tuple(
-        _collected(job, record, returned.get(job.config_hash[:16]))
-        for job, record in zip(plan.jobs, records, strict=True)
-    )
+    ends = [_end(job, appended.get(job.short_hash)) for job in plan.jobs]
+    recorded = [end for end in ends if end.seconds_total is not None]
+    stored = [end.truth_store for end in recorded]
     first = plan.jobs[0].values
-    run_again = {job.config_hash[:16] for job in plan.to_run}
-    kept = {key: value for key, value in earlier.items() if key not in run_again}
-    spent = kept | overheads(plan, returned)
+    spent = overheads(ends)
     return Sweep(
         schema=SCHEMA,
         sweep=plan.sweep or {"name": plan.name, "size": None, "kind": None},
@@ -56,65 +135,67 @@ def collect(
         truth_misses=stored.count("miss"),
         provenance=here_and_now(
             config_hash({"jobs": [job.config_hash for job in plan.jobs]}),
-            next((r.provenance.mesh_hash for r in ended), "none"),
+            next((end.mesh_hash for end in recorded), "none"),
             first["seed"],
         ),
-        commits=tuple(sorted({str(r.provenance.git.sha) for r in ended})),
+        commits=tuple(sorted({end.commit for end in recorded})),
         settings={key: value for key, value in first.items() if key not in UNSAID},
-        jobs=jobs,
+        jobs=tuple(map(_collected, plan.jobs, ends)),
         cost=tuple(
             Cost(
-                job.hash,
-                sum(run.seconds or 0.0 for run in job.runs),
-                None if record is None else record.seconds_total,
-                spent.get(job.hash),
+                end.hash,
+                sum(run.seconds or 0.0 for run in end.runs),
+                end.seconds_total,
+                spent.get(end.hash),
             )
-            for job, record in zip(jobs, records, strict=True)
+            for end in ends
         ),
     )
 
 
-def overheads(plan: Plan, returned: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Seconds per job that were not spent in simulating or estimating.
+def overheads(ends: Iterable[End]) -> dict[str, float]:
+    """Seconds per job that were not spent in simulating or estimating, by its short hash.
 
     Measured from the end of one job to the end of the next of the same process, so that launching,
-    composing, writing, drawing and logging all count. A process's first job is left out: what is
-    imported and compiled with it is paid for once.
+    writing and drawing all count. A process's first job is left out: what is imported and compiled
+    with it is paid for once.
     """
-    computing = {}
-    for job in plan.to_run:
-        record = last_compared(job.folder, job.config_hash)
-        if record is not None and record.converged:
-            found = record.findings
-            computing[job.config_hash[:16]] = (
-                found.seconds_computing or found.repeats[0].seconds or record.seconds_total
-            )
-    processes: dict[str, list[Mapping[str, Any]]] = {}
-    for end in returned.values():
-        processes.setdefault(str(end["process"]), []).append(end)
+    processes: dict[str, list[End]] = {}
+    for end in ends:
+        if end.process:
+            processes.setdefault(end.process, []).append(end)
     spent = {}
-    for ends in processes.values():
-        ordered = sorted(ends, key=lambda end: float(end["finished"]))
-        for before, end in pairwise(ordered):
-            if end["hash"] in computing:
-                between = float(end["finished"]) - float(before["finished"])
-                spent[str(end["hash"])] = between - computing[str(end["hash"])]
+    for by_one in processes.values():
+        for before, end in pairwise(sorted(by_one, key=lambda end: end.finished)):
+            if end.status == "converged" and end.seconds_computing is not None:
+                spent[end.hash] = end.finished - before.finished - end.seconds_computing
     return spent
 
 
-def _collected(
-    job: PlannedJob, record: Record[Compared] | None, end: Mapping[str, Any] | None
-) -> SweepJob:
+def _end(job: PlannedJob, end: End | None) -> End:
+    """A job's end as it was appended, where that is of the record which is there now."""
+    written = result_time(job.folder)
+    if end is not None and end.written_ns == written:
+        whole = is_done(job.folder) == (end.status == "converged")
+        if written is None or whole:
+            return end
+    record = last_compared(job.folder, job.config_hash)
+    if record is None:
+        return End(hash=job.short_hash, status="failed", reason=NOT_RUN)
+    return End.of(job, record)
+
+
+def _collected(job: PlannedJob, end: End) -> SweepJob:
     """A job with what each seed gave."""
     values, settings = job.values, job.values["filter"]
     return SweepJob(
-        hash=job.config_hash[:16],
+        hash=job.short_hash,
         row=values["row"],
         factors=values["factors"],
         seed=values["seed"],
         repeats=values["repeats"],
-        status="failed" if record is None else record.status,
-        reason=record.reason if record else (end["reason"] if end else NOT_RUN),
+        status=end.status,
+        reason=end.reason,
         model=model_of_values(values),
         initial=settings["initial"],
         truth=values["truth"]["values"],
@@ -122,5 +203,5 @@ def _collected(
         Q=settings["Q"],
         R=settings["R"],
         filter=settings["mode"],
-        runs=record.findings.repeats if record and not record.findings.died else (),
+        runs=end.runs,
     )

@@ -26,6 +26,7 @@ from urllib.parse import quote
 
 from experiments.common.record import read_data
 from experiments.runner.plan import PLAN
+from experiments.runner.summary import IS_SWEEP
 from experiments.runner.sync import jobs_in
 from experiments.runner.tracking import open_store
 from mvest.errors import InputError, MvestError
@@ -55,15 +56,20 @@ class Comparison:
     sweep_id : str
     runs : tuple of str
         Ids of its runs.
+    summary : str
+        Id of the run that stands for the whole sweep; empty if there is none.
     """
 
     place: str
     experiment: str
     sweep_id: str
     runs: tuple[str, ...]
+    summary: str = ""
 
     def page(self, server: str) -> str:
         """Address of the page that compares the runs, or lists them where they are too many."""
+        if not self.runs:
+            return f"{server}/#/experiments/{self.experiment}/runs/{self.summary}"
         if len(self.runs) > MAX_COMPARED:
             chosen = quote(f'tags.sweep_id = "{self.sweep_id}"')
             return f"{server}/#/experiments/{self.experiment}/runs?searchFilter={chosen}"
@@ -113,18 +119,22 @@ def last_comparison(outputs: Path) -> Comparison:
             continue
         config = read_data(jobs[0] / "config.json")
         store = open_store(config["tracking"]["uri"], outputs, str(config["name"]))
-        runs = [
-            run.info.run_id
+        of_sweep = [
+            run
             for run in store.list_runs()
             if run.data.tags.get("sweep_id") == plan.get("sweep_id")
             and run.info.status != "RUNNING"
         ]
-        if not runs:
+        whole = [run.info.run_id for run in of_sweep if run.data.tags.get("kind") == IS_SWEEP]
+        runs = [run.info.run_id for run in of_sweep if run.info.run_id not in whole]
+        if not of_sweep:
             raise InputError(f"no run of {folder} is in {store.place}: try `make sync`")
-        if len(runs) < len(jobs):
+        if len(runs) < len(jobs) and (runs or not whole):
             left = len(jobs) - len(runs)
             print(f"warning: {left} results are not in MLflow; `make sync`", file=sys.stderr)
-        return Comparison(store.place, store.experiment, str(plan["sweep_id"]), tuple(runs))
+        return Comparison(
+            store.place, store.experiment, str(plan["sweep_id"]), tuple(runs), "".join(whole[:1])
+        )
     raise InputError(f"{outputs} holds no finished sweep; run one, or name another folder")
 
 

@@ -1,6 +1,6 @@
 """Runs a job in a process apart, so that its death costs its own row and nothing else.
 
-Every worker of a launcher keeps one such process and gives it job after job: what is imported and
+Whoever works on a sweep keeps one such process and gives it job after job: what is imported and
 compiled is paid for once. A process that was killed, or ran out of memory or time, is replaced.
 """
 
@@ -19,25 +19,28 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 import experiments
 from experiments.runner.folder import (
     clear,
     finished_record,
+    is_done,
     lock,
     read_result,
     require_writable,
+    result_time,
     write_failure,
 )
 from experiments.runner.request import Request
-from mvest.errors import MvestError
 from mvest.provenance import THREAD_VARIABLES
 
-__all__ = ["WorkerProcess", "run_apart", "run_guarded"]
+__all__ = ["StoppedError", "WorkerProcess", "new_worker", "run_apart"]
 
 WORKER = (sys.executable, "-m", "experiments.runner.worker")
 """Command of a process that runs jobs."""
+
+
+class StoppedError(Exception):
+    """A process was stopped from outside; of the job that it ran nothing is recorded."""
 
 
 class WorkerProcess:
@@ -51,10 +54,17 @@ class WorkerProcess:
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._process: subprocess.Popen[str] | None = None
+        self._stopped = False
         atexit.register(self.close)
 
     def run(self, request: Request, time_limit_s: float | None = None) -> str | None:
-        """Run one job; None if it left its record, otherwise the reason why it did not."""
+        """Run one job; None if it left its record, otherwise the reason why it did not.
+
+        Raises
+        ------
+        StoppedError
+            If `stop` was called.
+        """
         process = self._started()
         assert process.stdin is not None
         assert process.stdout is not None
@@ -86,6 +96,8 @@ class WorkerProcess:
                 self.close()
             return None if answered["reason"] is None else str(answered["reason"])
         self.close()
+        if self._stopped:
+            raise StoppedError
         if expired.is_set():
             return f"time limit of {time_limit_s:g} s"
         return _end(process.returncode)
@@ -96,6 +108,13 @@ class WorkerProcess:
             _kill(self._process)
             self._process.communicate()
             self._process = None
+
+    def stop(self) -> None:
+        """End the process for good, from another thread than the one that waits for its job."""
+        self._stopped = True
+        process = self._process
+        if process is not None:
+            _kill(process)
 
     def _started(self) -> subprocess.Popen[str]:
         if self._process is not None and self._process.poll() is not None:
@@ -117,42 +136,26 @@ class WorkerProcess:
                 | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
                 start_new_session=True,
             )
+        if self._stopped:
+            self.close()
+            raise StoppedError
         return self._process
+
+
+def new_worker() -> WorkerProcess:
+    """One that runs the jobs of studies."""
+    return WorkerProcess(WORKER)
 
 
 @cache
 def own_worker() -> WorkerProcess:
-    """The one that this process keeps."""
-    return WorkerProcess(WORKER)
+    """The one that this process keeps for a run by itself."""
+    return new_worker()
 
 
-def run_guarded(config: DictConfig) -> dict[str, Any]:
-    """What a launcher runs for each job of a sweep: never raises for what happens to the job.
-
-    Returns
-    -------
-    dict
-        ``hash``, ``status`` and ``reason`` of the job, when it ``started`` and ``finished``
-        (seconds since the epoch) and in which ``process``.
-    """
-    started = time.time()
-    request = Request.of(config)
-    try:
-        record = run_apart(request)
-        status, reason = record["status"], record["reason"]
-    except (MvestError, OSError) as error:
-        status, reason = "failed", str(error)
-    return {
-        "hash": request.config_hash[:16],
-        "status": status,
-        "reason": reason,
-        "started": started,
-        "finished": time.time(),
-        "process": f"{os.uname().nodename}:{os.getpid()}",
-    }
-
-
-def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str, Any]:
+def run_apart(
+    request: Request, worker: WorkerProcess | None = None, asked_ns: int | None = None
+) -> dict[str, Any]:
     """Run a job in a process apart unless it is done already; its record, whatever happened.
 
     Parameters
@@ -160,6 +163,9 @@ def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str
     request : Request
     worker : WorkerProcess, optional
         The one kept by this process if not given.
+    asked_ns : int, optional
+        When the job was asked for: one that is to be run again (``force``) need not be once more
+        if it was done since.
 
     Raises
     ------
@@ -170,7 +176,7 @@ def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str
     require_writable(request.folder)
     worker = worker or own_worker()
     with lock(request.folder):
-        if not values["force"]:
+        if not values["force"] or _done_since(request.folder, asked_ns):
             done = finished_record(request.folder, request.config_hash)
             if done is not None:
                 return done
@@ -182,6 +188,13 @@ def run_apart(request: Request, worker: WorkerProcess | None = None) -> dict[str
                 return record
             reason = "it left no record"
         return write_failure(request, reason, started)
+
+
+def _done_since(folder: Path, asked_ns: int | None) -> bool:
+    written = result_time(folder)
+    if asked_ns is None or written is None:
+        return False
+    return written > asked_ns and is_done(folder)
 
 
 def _kill(process: subprocess.Popen[str]) -> None:

@@ -7,9 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
-from experiments.common.config import register
 from experiments.common.record import Record, record_from, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Study, load_study, study_names
@@ -32,12 +29,9 @@ from mvest.provenance import write_json
 
 __all__ = ["FailedRunError", "compute", "run_job"]
 
-# Workers of a launcher import this module before they compose their configuration.
-register()
 
-
-def run_job(config: DictConfig) -> None:
-    """Run one composed configuration by itself in Hydra's output folder, unless it is done.
+def run_job(request: Request) -> None:
+    """Run a job in this process, unless it is done.
 
     Raises
     ------
@@ -46,7 +40,6 @@ def run_job(config: DictConfig) -> None:
     FailedRunError
         If the computation found no estimate; the run is recorded all the same.
     """
-    request = Request.of(config)
     values, folder = request.values, request.folder
     study = load_study(values["study"])
     require_no_password(values["tracking"]["uri"])

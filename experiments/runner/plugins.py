@@ -1,4 +1,4 @@
-"""What Hydra is extended by: a sweeper that plans first, and a launcher for Slurm."""
+"""What Hydra is extended by: a sweeper that plans all jobs, and then has them run."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
-
-from experiments.runner.slurm import SlurmLauncher
 
 __all__ = ["FailedSweepError", "PlannedSweeper", "register_plugins"]
 
@@ -63,7 +61,6 @@ def register_plugins() -> None:
     """Make them known to Hydra; may be called again."""
     place = ModuleType(PLACE)
     sys.modules[PLACE] = place
-    for plugin in (SlurmLauncher, PlannedSweeper):
-        plugin.__module__ = PLACE
-        setattr(place, plugin.__name__, plugin)
-        Plugins.instance().register(plugin)
+    PlannedSweeper.__module__ = PLACE
+    place.__dict__[PlannedSweeper.__name__] = PlannedSweeper
+    Plugins.instance().register(PlannedSweeper)

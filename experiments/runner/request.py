@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from experiments.common.config import NOT_THE_RESULT, hash_of, plain
 
-__all__ = ["Request", "as_published"]
+__all__ = ["Request", "as_published", "publish_as"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,11 @@ class Request:
         """What Hydra composed for the job it is just starting."""
         hydra = HydraConfig.get()
         values = plain(config)
-        # A sweep is published as a whole.
-        publish = values["publish"] and not values["sweep"]
-        as_configured = as_published(hydra.overrides.task, hydra.sweeper.get("params"))
         return cls(
             values,
-            hash_of(config),
+            hash_of(values),
             Path(hydra.runtime.output_dir),
-            _slug(values, hydra) if publish and as_configured else None,
+            publish_as(values, hydra.overrides.task, None),
         )
 
     @classmethod
@@ -67,15 +64,29 @@ class Request:
         }
 
 
+def publish_as(
+    values: Mapping[str, Any], overrides: Sequence[str], swept: Mapping[str, Any] | None
+) -> str | None:
+    """Name of a run's record in the results; None where they are not to be touched.
+
+    Parameters
+    ----------
+    values : mapping
+        The resolved configuration.
+    overrides : sequence of str
+    swept : mapping or None
+        What the experiment itself varies (empty: nothing), if this is one run of several.
+    """
+    # A sweep is published as a whole.
+    if not values["publish"] or values["sweep"] or not as_published(overrides, swept):
+        return None
+    if swept is None:
+        return str(values["name"])
+    return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
+
+
 def as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
     """Whether a run is its experiment as configured: nothing overridden that changes the result."""
     allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
     keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
     return all(key in allowed or key.partition(".")[0] in allowed for key in keys)
-
-
-def _slug(values: Mapping[str, Any], hydra: Any) -> str:
-    """Name of a published record: the experiment's, with its row if it has several."""
-    if str(hydra.mode).endswith("MULTIRUN"):
-        return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
-    return str(values["name"])

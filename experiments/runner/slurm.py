@@ -1,28 +1,32 @@
-"""The launcher of ``launcher=slurm``: one Slurm array through submitit, whatever its jobs' fate.
+"""Slurm: arrays whose tasks each drain a shard of a sweep's list, whatever their fate.
 
-Submitit's own launcher for Hydra raises at the first job that dies, with the others still running,
-and asks Slurm ever less often, down to every ten minutes. This one waits for all of them, and a job
-that died comes back as failed, with Slurm's word for why.
+A task runs ``mvest worker``, as any other scheduler would. Here its arrays are submitted, waited
+for or asked about later, and what died with a task is recorded, with Slurm's word for why.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import os
+import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from hydra.core.singleton import Singleton
-from hydra.core.utils import JobReturn, JobStatus
-from hydra.plugins.launcher import Launcher
-from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig, OmegaConf
+import experiments
+from experiments.runner.drain import Shard
+from experiments.runner.folder import is_done, require_writable, result_time, write_failure
+from experiments.runner.plan import Plan, PlannedJob
+from mvest.errors import ConfigurationError
+from mvest.provenance import write_json
 
-from mvest.errors import ConfigurationError, MvestError
-
-__all__ = ["JobDiedError", "SlurmLauncher"]
+__all__ = ["Submission", "record_dead", "submit", "submitted", "under_way", "wait_for"]
 
 WORDS = {
     "OUT_OF_MEMORY": "it ran out of memory (hydra.launcher.mem_gb)",
@@ -32,171 +36,280 @@ WORDS = {
     "PREEMPTED": "it was preempted",
     "FAILED": "its process died",
 }
-"""Slurm's states of a job that did not complete, in words."""
+"""Slurm's states of a task that did not complete, in words."""
 
-SHARED = (
-    "timeout_min", "cpus_per_task", "gpus_per_node", "mem_gb", "nodes", "name", "tasks_per_node",
-    "stderr_to_stdout",
+NO_OPTIONS = (
+    "array_parallelism", "jobs_per_task", "setup", "poll_s", "additional_parameters", "_target_",
 )  # fmt: skip
-"""Settings that submitit names alike for every kind of cluster."""
+"""Settings that are no options of sbatch."""
+
+NAMES = {"name": "job-name", "timeout_min": "time"}
+"""Options of sbatch that settings name otherwise."""
+
+FOLDER, SUBMITTED = ".slurm", "submitted.json"
+"""Within a sweep's folder, of what Slurm writes and what it was asked for."""
+
+DEFAULT_MAX = 1001
+"""Slurm's ``MaxArraySize`` where it is not told."""
+
+LAST_LOOKS = 3
+"""Questions to Slurm's accounting about tasks that have ended, while it still knows no state."""
 
 
-class JobDiedError(MvestError):
-    """A job ended without a result of any kind."""
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """One array that was submitted.
+
+    Attributes
+    ----------
+    array : str
+        Slurm's number.
+    offset : int
+        Task k of it drains shard ``offset + k``.
+    tasks : tuple of int
+    count : int
+        Shards of the sweep.
+    asked_ns : int
+        When the plan that it works on was written.
+    """
+
+    array: str
+    offset: int
+    tasks: tuple[int, ...]
+    count: int
+    asked_ns: int
+
+    def shard(self, task: int) -> Shard:
+        """What a task drains."""
+        return Shard(self.offset + task, self.count)
+
+    def ended(self, job: PlannedJob) -> bool:
+        """Whether a job is done, or has failed since the array was asked for."""
+        return is_done(job.folder) or (result_time(job.folder) or 0) > self.asked_ns
 
 
-class SlurmLauncher(Launcher):
-    """Submits the jobs of a sweep as one array and waits until each of them has ended.
+def submit(plan: Plan, settings: Mapping[str, Any]) -> list[Submission]:
+    """Submit the shards in which something is left, in as many arrays as Slurm's limit makes.
 
     Parameters
     ----------
+    plan : Plan
+        Which was written.
+    settings : mapping
+        ``hydra.launcher``.
+
+    Raises
+    ------
+    ConfigurationError
+        If Slurm is not there or refuses an array; none is then left with it.
+    """
+    assert plan.written_ns is not None
+    each = settings["jobs_per_task"]
+    if not each >= 1:
+        raise ConfigurationError(f"hydra.launcher.jobs_per_task = {each}, expected >= 1")
+    count = math.ceil(len(plan.jobs) / each)
+    left = {job.config_hash for job in plan.to_run}
+    shards = [
+        number
+        for number in range(1, count + 1)
+        if any(job.config_hash in left for job in Shard(number, count).of(plan.jobs))
+    ]
+    size = _max_array_size() - 1
+    chunks = [
+        (offset, [number - offset for number in within])
+        for first, within in groupby(shards, lambda number: (number - 1) // size)
+        for offset in (first * size,)
+    ]
+    at_once = max(1, settings["array_parallelism"] // max(1, len(chunks)))
+    folder = plan.folder.resolve() / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    script = folder / "task.sh"
+    script.write_text(_script(plan, settings, count), encoding="utf-8")
+    found: list[Submission] = []
+    try:
+        for offset, tasks in chunks:
+            array = (
+                _run(
+                    *("sbatch", "--parsable", f"--array={_ranges(tasks)}%{at_once}"),
+                    *(
+                        f"--output={folder}/%A_%a.out",
+                        *_options(settings),
+                        str(script),
+                        str(offset),
+                    ),
+                )
+                .strip()
+                .partition(";")[0]
+            )
+            found.append(Submission(array, offset, tuple(tasks), count, plan.written_ns))
+    except ConfigurationError:
+        cancel(found)
+        raise
+    write_json(folder / SUBMITTED, [asdict(one) for one in found])
+    names = " ".join(one.array for one in found)
+    print(
+        f"Slurm array {names}: {len(shards)} tasks, {len(left)} jobs; `scancel {names}` ends it",
+        file=sys.stderr,
+    )
+    return found
+
+
+def submitted(folder: Path) -> list[Submission]:
+    """The arrays that were submitted last for the sweep in a folder; none if there were none."""
+    try:
+        data = json.loads((folder / FOLDER / SUBMITTED).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [Submission(**{**one, "tasks": tuple(one["tasks"])}) for one in data]
+
+
+def wait_for(arrays: Sequence[Submission], poll_s: float) -> None:
+    """Wait until no task of the arrays waits or runs; if interrupted, they are cancelled."""
+    try:
+        while under_way(arrays):
+            time.sleep(poll_s)
+    except KeyboardInterrupt:
+        cancel(arrays)
+        raise
+
+
+def cancel(arrays: Sequence[Submission]) -> None:
+    """End the arrays."""
+    if arrays:
+        subprocess.run(["scancel", *(one.array for one in arrays)], check=False)
+
+
+def under_way(arrays: Sequence[Submission]) -> set[str]:
+    """Tasks that wait or run; all of them if the queue cannot be asked."""
+    waiting: set[str] = set()
+    for one in arrays:
+        asked = _ask("squeue", "--noheader", "--array", "--jobs", one.array, "--format", "%i")
+        if asked.returncode == 0:
+            waiting |= set(asked.stdout.split())
+        elif "Invalid job id" not in asked.stderr:
+            waiting |= {f"{one.array}_{task}" for task in one.tasks}
+        # Of an array that ended some minutes ago the queue knows nothing.
+    return waiting
+
+
+def record_dead(plan: Plan, arrays: Sequence[Submission], poll_s: float) -> int:
+    """Record the jobs that ended with their tasks, and why; how many are still to come.
+
+    Parameters
+    ----------
+    plan : Plan
+    arrays : sequence of Submission
     poll_s : float
-        Longest time (s) between two questions to Slurm's accounting.
-    **settings
-        As for the launcher of hydra-submitit-launcher.
+        Time (s) between two questions to Slurm's accounting.
     """
+    alive = under_way(arrays)
+    to_come = 0
+    lost: dict[str, list[PlannedJob]] = {}
+    for one in arrays:
+        for task in one.tasks:
+            left = [job for job in one.shard(task).of(plan.jobs) if not one.ended(job)]
+            if f"{one.array}_{task}" in alive:
+                to_come += len(left)
+            elif left:
+                lost[f"{one.array}_{task}"] = left
+    states: dict[str, str] = {}
+    for look in range(LAST_LOOKS if lost else 0):
+        if look:
+            time.sleep(poll_s)
+        states = _states(arrays)
+        if all(states.get(task, "PENDING") not in ("PENDING", "RUNNING") for task in lost):
+            break
+    for name, jobs in lost.items():
+        output = plan.folder.resolve() / FOLDER / f"{name}.out"
+        state = states.get(name)
+        words = WORDS.get(state or "", f"Slurm's state is {state}")
+        if state in (None, "PENDING", "RUNNING"):
+            words = "it died, of what Slurm's accounting does not say"
+            if not output.exists():
+                words = "it was cancelled before it began"
+        reason = f"Slurm job {name}: {words}"
+        if output.exists():
+            reason += f"; its output is in {output}"
+        for job in jobs:
+            require_writable(job.folder)
+            write_failure(job.request, reason, time.time())
+    return to_come
 
-    def __init__(self, poll_s: float = 20.0, **settings: Any) -> None:
-        self._poll_s = poll_s
-        self._settings = {
-            key: OmegaConf.to_container(value, resolve=True)
-            if OmegaConf.is_config(value)
-            else value
-            for key, value in settings.items()
-        }
-        self._parts: dict[str, Any] = {}
 
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
-    ) -> None:
-        """Keep what Hydra has to say about the sweep."""
-        self._parts = {
-            "hydra_context": hydra_context,
-            "task_function": task_function,
-            "config": config,
-        }
+def _states(arrays: Sequence[Submission]) -> dict[str, str]:
+    """Task -> Slurm's last word on it."""
+    numbers = ",".join(one.array for one in arrays)
+    asked = _ask(
+        *("sacct", "--allocations", "--noheader", "--parsable2"),
+        *("--jobs", numbers, "--format", "JobID,State"),
+    )
+    pairs = (line.partition("|") for line in asked.stdout.splitlines())
+    # "CANCELLED by 1000"
+    return {task: state.split(" ")[0] for task, _, state in pairs}
 
-    def launch(
-        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
-    ) -> Sequence[JobReturn]:
-        """Submit, wait, and return how every job ended, in order.
 
-        Raises
-        ------
-        ConfigurationError
-            If submitit or Slurm is not there, or Slurm refuses the array.
-        """
-        try:
-            import submitit
-            from hydra_plugins.hydra_submitit_launcher.submitit_launcher import (
-                SlurmLauncher as Submitted,
-            )
-            from submitit.core.utils import FailedJobError
-            from submitit.slurm.slurm import SlurmJob
-        except ImportError as error:
-            raise ConfigurationError(
-                "launcher=slurm needs the extra cluster: pip install -e .[cluster]"
-            ) from error
-        Path(str(self._parts["config"].hydra.sweep.dir)).mkdir(parents=True, exist_ok=True)
-        # What is sent to the jobs is the plain launcher, which they can import.
-        call = Submitted(**self._settings)
-        call.setup(**self._parts)
-        state = Singleton.get_state()
-        calls = [
-            (list(overrides), "hydra.sweep.dir", number, f"job_id_for_{number}", state)
-            for number, overrides in enumerate(job_overrides, start=initial_job_idx)
+def _script(plan: Plan, settings: Mapping[str, Any], count: int) -> str:
+    """What a task runs; its first argument is the offset of its array."""
+    places = [str(Path(experiments.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]
+    path = shlex.quote(os.pathsep.join(filter(None, places)))
+    worker = shlex.join([sys.executable, "-m", "experiments.cli", "worker"])
+    folder = shlex.quote(str(plan.folder.resolve()))
+    return "\n".join(
+        [
+            "#!/bin/bash",
+            *settings["setup"],
+            f"export PYTHONPATH={path}",
+            f'exec {worker} {folder} --shard "$(($1 + SLURM_ARRAY_TASK_ID))/{count}"',
+            "",
         ]
-        try:
-            executor = submitit.AutoExecutor(
-                folder=self._settings["submitit_folder"], cluster="slurm"
-            )
-            executor.update_parameters(**_for_executor(self._settings))
-            jobs = executor.map_array(call, *zip(*calls, strict=True))
-        except (RuntimeError, FailedJobError) as error:
-            # Submitit repeats sbatch's own message at the end.
-            text = str(error).strip().splitlines()
-            raise ConfigurationError(
-                f"Slurm takes no jobs: {text[-1] if text else error}"
-            ) from error
-        SlurmJob.watcher._delay_s = self._poll_s
-        array = str(jobs[0].job_id).split("_")[0]
-        print(f"Slurm array {array}: {len(jobs)} jobs; `scancel {array}` ends it", file=sys.stderr)
-        try:
-            lost = _wait(jobs, array, self._poll_s)
-        except KeyboardInterrupt:
-            subprocess.run(["scancel", array], check=False)
-            raise
-        return [
-            _ended(job, overrides, job in lost)
-            for job, overrides in zip(jobs, job_overrides, strict=True)
-        ]
+    )
 
 
-def _for_executor(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings by the names that submitit's executor gives them."""
-    return {
-        key if key in SHARED else f"slurm_{key}": value
-        for key, value in settings.items()
-        if key != "submitit_folder" and value is not None
-    }
+def _options(settings: Mapping[str, Any]) -> list[str]:
+    """Options of sbatch."""
+    given = {key: value for key, value in settings.items() if key not in NO_OPTIONS}
+    if given.pop("mem_gb", None) is not None:
+        given["mem"] = f"{settings['mem_gb']}G"
+    named = {NAMES.get(key, key.replace("_", "-")): value for key, value in given.items()}
+    named |= settings["additional_parameters"]
+    return [f"--{key}={value}" for key, value in named.items() if value is not None]
 
 
-def _wait(jobs: Sequence[Any], array: str, poll_s: float) -> set[Any]:
-    """Wait until every job has ended; returns those of which Slurm no longer knows anything.
+def _max_array_size() -> int:
+    for line in _run("scontrol", "show", "config").splitlines():
+        key, _, value = line.partition("=")
+        if key.strip() == "MaxArraySize":
+            return max(2, int(value))
+    return DEFAULT_MAX
 
-    A job that is cancelled before it starts may never appear in Slurm's accounting, where submitit
-    would look for it for ever. It is lost when the queue does not have it either, twice in a row.
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Increasing numbers as sbatch takes them: 1-3,5."""
+    parts = []
+    for _, pairs in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
+        run = [number for _, number in pairs]
+        parts.append(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}")
+    return ",".join(parts)
+
+
+def _run(*command: str) -> str:
+    """What a command of Slurm's says.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is not there or refuses; Slurm's own words are kept.
     """
-    waiting = list(jobs)
-    missed: set[Any] = set()
-    lost: set[Any] = set()
-    asked = time.monotonic()
-    while waiting:
-        waiting = [job for job in waiting if not job.done()]
-        if waiting and time.monotonic() - asked > poll_s:
-            asked = time.monotonic()
-            queued = _queued(array)
-            if queued is not None:
-                gone = {job for job in waiting if str(job.job_id) not in queued}
-                lost |= gone & missed
-                waiting = [job for job in waiting if job not in lost]
-                missed = gone
-        time.sleep(min(1.0, poll_s))
-    return lost
+    done = _ask(*command)
+    if done.returncode:
+        raise ConfigurationError(f"Slurm takes no jobs: {' '.join(done.stderr.split())}")
+    return done.stdout
 
 
-def _queued(array: str) -> set[str] | None:
-    """Ids of the array's jobs that wait or run; None if the queue could not be asked."""
-    asked = subprocess.run(
-        ["squeue", "--noheader", "--array", "--jobs", array, "--format", "%i"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if asked.returncode == 0:
-        return set(asked.stdout.split())
-    # Of an array that ended some minutes ago the queue knows nothing.
-    return set() if "Invalid job id" in asked.stderr else None
-
-
-def _ended(job: Any, overrides: Sequence[str], lost: bool) -> JobReturn:
-    """How a job ended."""
-    from submitit.core.utils import FailedJobError, UncompletedJobError
-
-    began = job.paths.stdout.exists()
-    words = "it died, of what Slurm's accounting does not say"
-    if lost and not began:
-        words = "it was cancelled before it began"
-    elif not lost:
-        try:
-            returned: JobReturn = job.results()[0]
-            return returned
-        except (FailedJobError, UncompletedJobError, OSError, EOFError):
-            state = str(job.state).split(" ")[0].upper()
-            words = WORDS.get(state, f"Slurm's state is {state}")
-    reason = f"Slurm job {job.job_id}: {words}"
-    if began:
-        reason += f"; its output is in {job.paths.stdout}"
-    return JobReturn(
-        overrides=list(overrides), status=JobStatus.FAILED, _return_value=JobDiedError(reason)
-    )
+def _ask(*command: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError as error:
+        raise ConfigurationError(
+            f"launcher=slurm needs Slurm: {command[0]} is not on this machine"
+        ) from error

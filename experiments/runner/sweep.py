@@ -1,43 +1,43 @@
-"""From a sweep's plan to its file of results: skip what is done, launch the rest, collect, log."""
+"""From a sweep's plan to its file of results: skip what is done, run the rest, collect, log."""
 
 from __future__ import annotations
 
-import json
-import os
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from hydra.core.plugins import Plugins
-from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
 from experiments.common.study import load_study
 from experiments.results.page import write_report
+from experiments.runner import slurm
 from experiments.runner.check import require_admissible
-from experiments.runner.collect import NOT_RUN, collect
-from experiments.runner.folder import is_done, nothing_empty, require_writable, write_failure
-from experiments.runner.guard import run_guarded
-from experiments.runner.job import FailedRunError, run_job
-from experiments.runner.plan import Plan, PlannedJob, make_plan
+from experiments.runner.collect import NOT_RUN, collect, read_ends
+from experiments.runner.compose import make_plan
+from experiments.runner.drain import drain_here, drain_inline
+from experiments.runner.folder import nothing_empty, require_writable
+from experiments.runner.plan import Plan
 from experiments.runner.progress import SweepBar
-from experiments.runner.request import Request, as_published
+from experiments.runner.summary import SWEEP
 from experiments.runner.sync import log_sweep, open_early
+from experiments.runner.tracking import Store
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
-from mvest.provenance import THREAD_VARIABLES, write_json
+from mvest.provenance import write_json
 
-__all__ = ["run_sweep", "sweep_task"]
+__all__ = ["collect_sweep", "run_sweep"]
 
-FILE = "sweep.json"
-"""The results of a sweep, in its folder."""
+LAUNCHERS = ("local", "basic", "slurm")
+"""Who can run jobs; Hydra's basic one stands for one process."""
+
+LOOK_AGAIN = 2.0
+"""Seconds between two questions to Slurm about a sweep that is collected later."""
 
 
 def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str]) -> int:
@@ -72,13 +72,34 @@ def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str
         return 0
     with nothing_empty(plan.folder, Path(config.paths.outputs)):
         require_writable(plan.folder)
-        plan.write()
+        plan = plan.write()
     print(plan.summary())
-    return run_plan(config, plan, context)
+    return run_plan(config, plan)
 
 
-def run_plan(config: DictConfig, plan: Plan, context: HydraContext) -> int:
-    """Launch the jobs that are not done, and write and log what became of all of them.
+def collect_sweep(folder: Path) -> int:
+    """Write and log what became of the jobs of a sweep that others work on, also before its end.
+
+    Returns
+    -------
+    int
+        Exit status: 1 if a job has no estimate.
+
+    Raises
+    ------
+    MvestError
+        If nothing is planned in the folder, or the results cannot be written.
+    """
+    plan = Plan.read(folder)
+    arrays = slurm.submitted(plan.folder)
+    to_come = slurm.record_dead(plan, arrays, LOOK_AGAIN) if arrays else 0
+    if to_come:
+        print(f"{plan.name}: {to_come} jobs wait or run in Slurm")
+    return _collect(plan, to_come)
+
+
+def run_plan(config: DictConfig, plan: Plan) -> int:
+    """Run the jobs that are not done, and write and log what became of all of them.
 
     Returns
     -------
@@ -92,79 +113,70 @@ def run_plan(config: DictConfig, plan: Plan, context: HydraContext) -> int:
     KeyboardInterrupt
         If the sweep was interrupted; what was done by then is collected.
     """
-    returned: dict[str, dict[str, Any]] = {}
-    left = plan.to_run
-    lost = interrupted = None
-    # Before any worker starts: the store is made by one process, and a wrong address is seen now.
-    store = open_early(config, plan) if config.tracking.enabled else None
-    if left:
+    settings: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+    launcher = _launcher(config)
+    if config.detach and plan.to_run:
+        if launcher == "slurm":
+            slurm.submit(plan, settings)
+        else:
+            print(f"`mvest worker {plan.folder} --shard I/N`, for I from 1 to N, runs the jobs")
+        print(f"`mvest collect {plan.folder}` writes what became of them")
+        return 0
+    # Before any job runs: a wrong address is seen now.
+    store = open_early(plan.common, plan) if plan.common["tracking"]["enabled"] else None
+    if plan.to_run:
         announce_compilation("the first jobs")
         try:
+            arrays = slurm.submit(plan, settings) if launcher == "slurm" else []
             with SweepBar(plan):
-                returned = _launch(config, left, context)
-        except KeyboardInterrupt as error:
-            interrupted = error
-        except ConfigurationError:
-            # Refused before any job was launched.
+                if arrays:
+                    slurm.wait_for(arrays, settings["poll_s"])
+                    slurm.record_dead(plan, arrays, settings["poll_s"])
+                elif config.isolate:
+                    drain_here(plan)
+                else:
+                    drain_inline(plan)
+        except KeyboardInterrupt:
+            _write(plan)
             raise
-        except Exception as error:
-            # A launcher raises whatever its system tells it; the jobs that ended are on disk.
-            lost = f"{type(error).__name__}: {_first_sentence(error)}"
-    path = plan.folder / FILE
-    found = collect(plan, returned, _measured(path))
-    write_json(path, asdict(found))
-    if lost is not None:
-        print(
-            f"error: the launcher lost its jobs ({lost}); run the same command again to go on",
-            file=sys.stderr,
+        except OSError as error:
+            # The jobs that ended are on disk.
+            print(
+                f"error: the sweep cannot go on ({error}); run the same command again to go on",
+                file=sys.stderr,
+            )
+    return _collect(plan, 0, store)
+
+
+def _launcher(config: DictConfig) -> str:
+    """Who runs the jobs."""
+    chosen = str(config.hydra.runtime.choices["hydra/launcher"])
+    if chosen not in LAUNCHERS:
+        raise ConfigurationError(
+            f"hydra/launcher = {chosen!r}, expected local or slurm; any other scheduler may run "
+            "`mvest worker` on a sweep that detach=true has planned"
         )
+    return chosen
+
+
+def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
+    """Write, log and publish what became of a sweep; the exit status."""
+    found = _write(plan)
+    if plan.common["tracking"]["enabled"]:
+        log_sweep(plan.common, plan, store)
+    missing = any(job.reason == NOT_RUN for job in found.jobs)
+    if not missing and not to_come:
+        _publish(plan, found)
+    return 0 if all(job.converged for job in found.jobs) else 1
+
+
+def _write(plan: Plan) -> Sweep:
+    path = plan.folder / SWEEP
+    found = collect(plan, read_ends(plan.folder))
+    write_json(path, asdict(found))
     print(_outcome(plan, found))
     print(f"Written to {path}")
-    if interrupted is not None:
-        raise interrupted
-    if config.tracking.enabled:
-        log_sweep(config, plan, store)
-    if lost is None:
-        _publish(config, plan, found)
-    done = all(job.converged for job in found.jobs)
-    return 0 if done and lost is None else 1
-
-
-def _launch(
-    config: DictConfig, jobs: Sequence[PlannedJob], context: HydraContext
-) -> dict[str, dict[str, Any]]:
-    """Hand jobs to the configured launcher; short hash -> how the job ended.
-
-    A job of which the launcher says that it died is recorded here: no one else is left to do it.
-    """
-    began = time.time()
-    # Whatever the user has set: a launcher's workers share the machine's cores.
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    task = run_guarded if config.isolate else sweep_task
-    launcher = Plugins.instance().instantiate_launcher(
-        hydra_context=context, task_function=task, config=config
-    )
-    ends = launcher.launch([list(job.overrides) for job in jobs], initial_job_idx=0)
-    for job, end in zip(jobs, ends, strict=True):
-        if not _completed(end) and not is_done(job.folder):
-            require_writable(job.folder)
-            reason = _first_sentence(end._return_value)
-            write_failure(Request(job.values, job.config_hash, job.folder), reason, began)
-    values = [end.return_value for end in ends if _completed(end)]
-    return {value["hash"]: value for value in values if value is not None}
-
-
-def _measured(path: Path) -> dict[str, float]:
-    """The overheads that an earlier run of the sweep measured; none if there was none."""
-    try:
-        costs = json.loads(path.read_text(encoding="utf-8"))["cost"]
-    except (OSError, ValueError, KeyError):
-        return {}
-    return {cost["hash"]: cost["overhead"] for cost in costs if cost["overhead"] is not None}
-
-
-def _completed(end: JobReturn) -> bool:
-    return end.status == JobStatus.COMPLETED
+    return found
 
 
 def _outcome(plan: Plan, found: Sweep) -> str:
@@ -172,7 +184,8 @@ def _outcome(plan: Plan, found: Sweep) -> str:
     total, ran = len(plan.jobs), len(plan.to_run)
     failed = [job for job in found.jobs if not job.converged]
     missing = sum(job.reason == NOT_RUN for job in failed)
-    text = f"{plan.name}: {total - len(failed)} of {total} jobs done ({total - ran} before), "
+    text = f"{plan.name}: {total - len(failed)} of {total} jobs done"
+    text += f" ({total - ran} before), " if total > ran else ", "
     text += f"{len(failed) - missing} without an estimate"
     if missing:
         text += f", {missing} not finished"
@@ -183,15 +196,12 @@ def _outcome(plan: Plan, found: Sweep) -> str:
     return text
 
 
-def _publish(config: DictConfig, plan: Plan, found: Sweep) -> None:
+def _publish(plan: Plan, found: Sweep) -> None:
     """Let the results take over a sweep that was run as it is configured."""
-    if not config.publish or not plan.sweep:
+    if plan.publish is None:
         return
-    results = Path(config.paths.results)
-    # The size is chosen on the command line; anything else that is swept or changed is another one.
-    changed = [line for line in config.hydra.overrides.task if line.startswith("sweep.")]
-    sized = all(line.startswith("sweep.size=") for line in changed)
-    if not (sized and as_published(config.hydra.overrides.task, None)):
+    results = Path(plan.common["paths"]["results"])
+    if not plan.publish:
         print(f"{results} left as it is: this sweep has overrides")
         return
     folder = results / "sweeps"
@@ -223,16 +233,3 @@ def _run_checks(plan: Plan) -> None:
         if not checks or job.values["study"] != plan.jobs[0].values["study"]:
             raise ConfigurationError(f"check=true has nothing to say of the job {job.label}")
         print(job.label, *(check(job.values, job.folder) for check in checks), "", sep="\n")
-
-
-def _first_sentence(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [""])[0].split(". ")[0]
-
-
-def sweep_task(config: DictConfig) -> dict[str, Any] | None:
-    """A job of a sweep in the launcher's own process, for debuggers; its death ends the sweep."""
-    try:
-        run_job(config)
-    except (MvestError, FailedRunError) as error:
-        print(f"failed: {error}", file=sys.stderr)
-    return None

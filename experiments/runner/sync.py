@@ -8,14 +8,15 @@ logs what a server that was away has missed, and rebuilds a database that was lo
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from experiments.common.record import read_data
 from experiments.runner.plan import PLAN, Plan
+from experiments.runner.summary import SWEEP, log_summary
 from experiments.runner.tracking import (
     REMEDY,
     Store,
@@ -28,6 +29,9 @@ from experiments.runner.tracking import (
 from mvest.errors import InputError, MvestError
 
 __all__ = ["jobs_in", "log_sweep", "main", "open_early"]
+
+MANY = 1000
+"""Jobs of a sweep above which each is a run of its own only where that is asked for."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,48 +47,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     status = 0
     for folder in folders:
-        groups: dict[tuple[str | None, str], list[Path]] = {}
+        groups: dict[tuple[str | None, str, bool | None], list[Path]] = {}
         for job in jobs_in(folder):
             try:
                 config = read_data(job / "config.json")
                 if config["tracking"]["enabled"] and is_complete(job):
-                    key = config["tracking"]["uri"], str(config["name"])
+                    tracking = config["tracking"]
+                    key = tracking["uri"], str(config["name"]), tracking.get("runs")
                     groups.setdefault(key, []).append(job)
             except (MvestError, KeyError) as error:
                 print(f"warning: {job} left out: {first_line(error)}", file=sys.stderr)
                 status = 1
-        for (uri, name), jobs in groups.items():
+        for (uri, name, each), jobs in groups.items():
             try:
                 store = open_store(uri, folder, name)
-                added, unreadable = _log(store, name, jobs)
+                added, there, unreadable = _log(store, name, jobs, each)
             except MvestError as error:
                 print(f"error: {name}: {error}; nothing is lost, try again later", file=sys.stderr)
                 status = 1
                 continue
-            there = len(jobs) - added - unreadable
             print(f"{name}: {added} uploaded, {there} already there, in {store.place}")
             status = max(status, int(unreadable > 0))
     return status
 
 
-def open_early(config: DictConfig, plan: Plan) -> Store | None:
+def open_early(config: Mapping[str, Any], plan: Plan) -> Store | None:
     """Make the store and the experiment of a sweep; None, with a warning, if that cannot be."""
     try:
-        return open_store(config.tracking.uri, Path(config.paths.outputs), plan.name)
+        return open_store(config["tracking"]["uri"], Path(config["paths"]["outputs"]), plan.name)
     except MvestError as error:
         print(f"warning: {error}; {REMEDY}", file=sys.stderr)
         return None
 
 
-def log_sweep(config: DictConfig, plan: Plan, store: Store | None) -> None:
+def log_sweep(config: Mapping[str, Any], plan: Plan, store: Store | None) -> None:
     """Log all finished jobs of a sweep, also those that were done before; say what is not logged.
 
-    A store that fails costs a line of warning: the results are on disk, to be logged later.
+    One run sums the sweep up; each job is a run of its own as well, unless they are very many. A
+    store that fails costs a line of warning: the results are on disk, to be logged later.
     """
     jobs = [job.folder for job in plan.jobs if (job.folder / "result.json").is_file()]
     try:
-        store = store or open_store(config.tracking.uri, Path(config.paths.outputs), plan.name)
-        _log(store, plan.name, [job for job in jobs if is_complete(job)])
+        tracking, outputs = config["tracking"], Path(config["paths"]["outputs"])
+        store = store or open_store(tracking["uri"], outputs, plan.name)
+        complete = [job for job in jobs if is_complete(job)]
+        _log(store, plan.name, complete, tracking.get("runs"))
     except MvestError as error:
         left = sum(not is_tracked(job) for job in jobs)
         tqdm.write(
@@ -104,22 +111,34 @@ def jobs_in(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _log(store: Store, name: str, jobs: Sequence[Path]) -> tuple[int, int]:
-    """Log jobs of one experiment; how many were added, and how many could not be read."""
-    store.list_runs()
-    plans: dict[Path, tuple[str | None, dict[str, str]]] = {}
+def _log(
+    store: Store, name: str, jobs: Sequence[Path], each: bool | None = None
+) -> tuple[int, int, int]:
+    """Log jobs of one experiment; how many were added, were there, and could not be read.
+
+    ``each`` says whether those of a sweep are runs of their own; None: unless they are many.
+    """
+    plans = {folder: _sweep_in(folder) for folder in {job.parent for job in jobs}}
     added = unreadable = 0
-    for job in tqdm(jobs, desc=f"{name} to MLflow", unit="job", disable=None, leave=False):
+    own = []
+    for job in jobs:
+        _, names = plans[job.parent]
+        if job.name not in names or (len(names) <= MANY if each is None else each):
+            own.append(job)
+    if own:
+        store.list_runs()
+    for job in tqdm(own, desc=f"{name} to MLflow", unit="job", disable=None, leave=False):
         try:
-            if job.parent not in plans:
-                plans[job.parent] = _sweep_in(job.parent)
             sweep_id, names = plans[job.parent]
             within = job.name in names
             added += upload(store, job, sweep_id if within else None, names.get(job.name))
         except InputError as error:
             tqdm.write(f"warning: {job} left out: {error}", file=sys.stderr)
             unreadable += 1
-    return added, unreadable
+    for folder, (sweep_id, _) in plans.items():
+        if sweep_id is not None and (folder / SWEEP).is_file():
+            log_summary(store, folder, sweep_id)
+    return added, len(own) - added - unreadable, unreadable
 
 
 def _sweep_in(folder: Path) -> tuple[str | None, dict[str, str]]:

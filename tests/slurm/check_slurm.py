@@ -6,6 +6,7 @@ commands.
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,11 +18,12 @@ import pytest
 
 from tests.places import ROOT
 
-PATIENCE = 240.0
+PATIENCE = 600.0
 SWEEP = (
     sys.executable, "-m", "experiments.run", "-m", "sweep=debug", "launcher=slurm",
     "hydra.launcher.mem_gb=2", "hydra.launcher.poll_s=5",
 )  # fmt: skip
+COLLECT = (sys.executable, "-m", "experiments.cli", "collect", "outputs/sweep_debug")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -34,10 +36,10 @@ def asked(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
-def start(folder: Path, *overrides: str) -> subprocess.Popen[str]:
+def start(folder: Path, *overrides: str, command=SWEEP) -> subprocess.Popen[str]:
     places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     return subprocess.Popen(
-        [*SWEEP, *overrides],
+        [*command, *overrides],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": places},
         stdout=subprocess.PIPE,
@@ -70,7 +72,7 @@ def job_process(raw_id: str) -> str:
             command = Path("/proc", pid, "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue
-        if b"submitit.core._submit" in command and b"python" in command[0]:
+        if b"experiments.cli" in command and b"python" in command[0]:
             return pid
     return ""
 
@@ -113,6 +115,44 @@ def test_jobs_that_die_cost_their_rows_and_run_again(tmp_path) -> None:
     after = results(tmp_path)
     assert len(after) == 4
     assert {name: after[name] for name in done} == done, "a job that was done ran again"
+
+
+def test_tasks_of_several_jobs_are_left_to_themselves_and_collected_later(tmp_path) -> None:
+    # Eight jobs in four tasks, of which Slurm's limit here allows three in an array.
+    several = ("sweep.small.seed='1,2,3,4'", "hydra.launcher.jobs_per_task=2", "detach=true")
+    out = end(start(tmp_path, *several))
+    arrays = re.search(r"Slurm array (\d+) (\d+): 4 tasks, 8 jobs", out)
+    assert arrays, out
+    first, second = arrays.groups()
+    place = tmp_path / "outputs" / "sweep_debug"
+    assert not (place / "sweep.json").exists(), "nobody has waited"
+    # Its task dies between its two jobs, or in the second of them.
+    folders = [job["folder"] for job in json.loads((place / "plan.json").read_text())["jobs"]]
+    until(lambda: (place / folders[0] / "done").exists())
+    raw = until(lambda: asked("squeue", "-h", "-r", "-j", f"{first}_1", "-o", "%A").strip())
+    os.kill(int(until(lambda: job_process(raw))), signal.SIGKILL)
+
+    early = start(tmp_path, command=COLLECT)
+    assert "jobs wait or run in Slurm" in end(early)
+    assert early.returncode == 1
+    until(lambda: not asked("squeue", "-h", "-j", f"{first},{second}").strip())
+    late = start(tmp_path, command=COLLECT)
+    out = end(late)
+    assert late.returncode == 1
+    assert "7 of 8 jobs done, 1 without an estimate" in out
+    (lost,) = [row for row in rows(tmp_path).values() if row["status"] != "converged"]
+    assert lost["reason"].startswith(f"Slurm job {first}_1: its process died; its output is in ")
+    done = results(tmp_path)
+    assert folders[0] in done
+    assert len(done) == 7
+
+    again = start(tmp_path, *several[:2])
+    out = end(again)
+    assert "1 tasks, 1 jobs" in out
+    assert again.returncode == 0
+    after = results(tmp_path)
+    assert {name: after[name] for name in done} == done, "a job that was done ran again"
+    assert len(after) == 8
 
 
 def test_a_job_over_its_memory_costs_its_row(tmp_path) -> None:

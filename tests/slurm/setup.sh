@@ -111,8 +111,8 @@ JobAcctGatherFrequency=2
 JobAcctGatherParams=OverMemoryKill
 AccountingStorageType=accounting_storage/slurmdbd
 AccountingStorageHost=localhost
-# The whole array of a sweep of ten thousand jobs.
-MaxArraySize=20001
+# Tasks 0 to 3 only, so that a sweep of a few jobs needs several arrays.
+MaxArraySize=4
 MaxJobCount=30000
 KillWait=5
 StateSaveLocation=/var/spool/slurmctld

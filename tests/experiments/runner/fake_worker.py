@@ -1,12 +1,13 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``raise-SEED`` and ``full-SEED`` end the job of that seed, once; every run leaves a
-line in ``runs``.
+``kill-SEED``, ``raise-SEED`` and ``full-SEED`` end the job of that seed, once; one with
+``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
 """
 
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -20,6 +21,8 @@ def run(job):
     seed = job.values["seed"]
     with Path("runs").open("a") as runs:
         runs.write(f"{seed}\n")
+    while Path(f"wait-{seed}").exists():
+        time.sleep(0.02)
     for name in ("kill", "raise", "full"):
         order = Path(f"{name}-{seed}")
         if not order.exists():

@@ -260,17 +260,15 @@ def test_a_disk_that_fills_up_within_a_job_costs_its_row(run):
     assert "result.json: No space left on device" in collected()["jobs"][1]["reason"]
 
 
-def test_a_launcher_that_loses_its_jobs_is_told_in_a_line_and_can_go_on(run, monkeypatch):
-    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
-
-    def lose(self, job_overrides, initial_job_idx):
-        raise RuntimeError("a worker died. At length.")
+def test_a_sweep_that_cannot_go_on_says_so_in_a_line_and_can_be_resumed(run, monkeypatch):
+    def lose(plan):
+        raise OSError(errno.ENOSPC, "No space left on device", "ends")
 
     with monkeypatch.context() as patched:
-        patched.setattr(BasicLauncher, "launch", lose)
+        patched.setattr(sweep, "drain_here", lose)
         status, _, err = run("sweep=debug", "publish=true")
     assert status == 1
-    assert err.startswith("error: the launcher lost its jobs (RuntimeError: a worker died); run ")
+    assert err.startswith("error: the sweep cannot go on ([Errno 28] No space left on device: 'en")
     assert len(err.splitlines()) == 1
     assert [job["reason"] for job in collected()["jobs"]] == ["not run"] * 4
     assert not Path("results").exists()
@@ -278,13 +276,11 @@ def test_a_launcher_that_loses_its_jobs_is_told_in_a_line_and_can_go_on(run, mon
 
 
 def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
-    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
-
-    def interrupt(self, job_overrides, initial_job_idx):
+    def interrupt(plan):
         raise KeyboardInterrupt
 
     run("sweep=debug", "filter.initial=[5,3]")
-    monkeypatch.setattr(BasicLauncher, "launch", interrupt)
+    monkeypatch.setattr(sweep, "drain_here", interrupt)
     status, out, err = run("sweep=debug")
     assert status == 130
     assert err.startswith("interrupted")
@@ -423,28 +419,31 @@ def undisturbed(tmp_path_factory) -> bytes:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
-@pytest.mark.parametrize("victim", ["job", "launcher"])
+@pytest.mark.parametrize("victim", ["job", "sweep"])
 def test_a_sweep_whose_worker_was_killed_ends_as_an_undisturbed_one(tmp_path, undisturbed, victim):
     running = sweep_process(tmp_path)
     while not list(tmp_path.glob("outputs/sweep_debug/*/done")):
         assert running.poll() is None
         time.sleep(0.05)
     pid = worker_of(tmp_path)
-    if victim == "launcher":
+    if victim == "sweep":
         pid = int(Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1].split()[1])
     os.kill(pid, 9)
     out, err = running.communicate(timeout=600)
-    found = json.loads((tmp_path / "outputs" / "sweep_debug" / "sweep.json").read_text())
-    lost = [job["reason"] for job in found["jobs"] if job["status"] == "failed"]
-    assert running.returncode == 1, out + err
+    place = tmp_path / "outputs" / "sweep_debug"
     if victim == "job":
+        found = json.loads((place / "sweep.json").read_text())
+        lost = [job["reason"] for job in found["jobs"] if job["status"] == "failed"]
+        assert running.returncode == 1, out + err
         assert len(lost) == 1
         assert lost[0].startswith("killed by signal 9")
     else:
-        assert "the launcher lost its jobs" in err
-        assert lost
+        assert running.returncode == -9
+        assert not (place / "sweep.json").exists()
+    done = {path: path.stat().st_mtime_ns for path in place.glob("*/done")}
 
     again = sweep_process(tmp_path)
     out, err = again.communicate(timeout=600)
     assert again.returncode == 0, out + err
+    assert {path: path.stat().st_mtime_ns for path in done} == done, "a job was done twice"
     assert (tmp_path / "results" / "sweep_debug.csv").read_bytes() == undisturbed

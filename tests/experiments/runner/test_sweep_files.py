@@ -15,7 +15,7 @@ from experiments.common.config import hash_of, register
 from experiments.common.estimates import SeedRun
 from experiments.common.record import Outcome
 from experiments.common.study import Job
-from experiments.runner.plan import expand, grids
+from experiments.runner.compose import expand, grids
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin.findings import Findings
 from experiments.studies.twin.settings import Settings

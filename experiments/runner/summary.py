@@ -1,0 +1,130 @@
+"""A sweep as one run of MLflow: how it ended in a few numbers, and a table of all its jobs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Any
+
+from experiments.common.estimates import SeedRun
+from experiments.common.record import read_data
+from experiments.runner.comparison import short_names
+from experiments.runner.tracking import Store, telling
+from experiments.sweeps.collected import Sweep, check_sweep
+from mvest.files import write_atomically
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["IS_SWEEP", "SWEEP", "TABLE", "log_summary", "table"]
+
+SWEEP, TABLE = "sweep.json", "jobs.parquet"
+"""Files in a sweep's folder: its results, and all its jobs as a table."""
+
+IS_SWEEP = "sweep"
+"""Tag ``kind`` of a run that is a whole sweep."""
+
+
+def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
+    """Bring the one run that stands for a sweep to the state of its folder.
+
+    Raises
+    ------
+    TrackingError
+        If the store cannot be written.
+    InputError
+        If the sweep's results cannot be read, or its table not written.
+    """
+    from mlflow.entities import Metric
+
+    sweep = check_sweep(read_data(folder / SWEEP), str(folder / SWEEP))
+    result_hash = hashlib.sha256((folder / SWEEP).read_bytes()).hexdigest()
+    with telling(store.place):
+        chosen = f"tags.kind = '{IS_SWEEP}' and tags.sweep_id = '{sweep_id}'"
+        before = store.client.search_runs([store.experiment], chosen)
+        whole = [run for run in before if run.info.status == "FINISHED"]
+        if whole and whole[0].data.tags.get("result_hash") == result_hash:
+            return
+    write_atomically(folder / TABLE, table(sweep).to_parquet())
+    tags = {
+        "kind": IS_SWEEP,
+        "sweep_id": sweep_id,
+        "result_hash": result_hash,
+        "git_sha": sweep.provenance.git.sha,
+        "folder": folder.name,
+    }
+    now = int(1000 * (folder / SWEEP).stat().st_mtime)
+    with telling(store.place):
+        run_id = store.client.create_run(
+            store.experiment,
+            run_name=f"all {len(sweep.jobs)} jobs",
+            tags={key: str(value) for key, value in tags.items()},
+        ).info.run_id
+        numbers = [Metric(key, value, now, 0) for key, value in _totals(sweep).items()]
+        store.client.log_batch(run_id, metrics=numbers)
+        for name in (TABLE, SWEEP):
+            store.client.log_artifact(run_id, str(folder / name))
+        store.client.set_terminated(run_id, "FINISHED")
+        for run in before:
+            store.client.delete_run(run.info.run_id)
+
+
+def table(sweep: Sweep) -> DataFrame:
+    """All jobs of a sweep, a row for each of their seeds; one without numbers for a lost job."""
+    from pandas import DataFrame
+
+    frame = DataFrame(list(_rows(sweep)))
+    for name in frame.select_dtypes("object"):
+        # What is varied may be a number in one job and a text in another; a column has one type.
+        frame[name] = [value if value is None else str(value) for value in frame[name]]
+    return frame
+
+
+def _rows(sweep: Sweep) -> Iterator[dict[str, Any]]:
+    names = short_names(sweep.parameters)
+    unknown = [None] * len(names)
+    costs = {cost.hash: cost for cost in sweep.cost}
+    for job in sweep.jobs:
+        cost = costs[job.hash]
+        for run in job.runs or (SeedRun(seed=job.seed, status=job.status, reason=job.reason),):
+            yield {
+                "hash": job.hash,
+                "row": job.row,
+                "seed": run.seed,
+                "status": run.status,
+                "reason": run.reason,
+                **{f"factor.{name}": value for name, value in job.factors.items()},
+                **{
+                    f"{what}.{name}": value
+                    for what, values in (
+                        ("estimate", run.estimate),
+                        ("std", run.std),
+                        ("relative_error", run.relative_error),
+                    )
+                    for name, value in zip(names, values or unknown, strict=True)
+                },
+                "nis": run.nis,
+                "iterations": run.iterations,
+                "forward_solves": run.forward_solves,
+                "seconds": run.seconds,
+                "seconds_of_job": cost.seconds_total,
+                "overhead_of_job": cost.overhead,
+            }
+
+
+def _totals(sweep: Sweep) -> dict[str, float]:
+    runs = [run for job in sweep.jobs for run in job.runs if run.converged]
+    errors = [abs(error) for run in runs for error in run.relative_error or ()]
+    overheads = [cost.overhead for cost in sweep.cost if cost.overhead is not None]
+    totals: dict[str, float] = {
+        "jobs": len(sweep.jobs),
+        "failed": sum(not job.converged for job in sweep.jobs),
+        "seconds": sum(cost.seconds_total or 0.0 for cost in sweep.cost),
+    }
+    if errors:
+        totals["error.mean"] = 100.0 * fmean(errors)
+    if overheads:
+        totals["overhead"] = median(overheads)
+    return totals
