@@ -49,6 +49,12 @@ NOT_SETTINGS = ("paths", "hydra", "sweep", "title", "paper", "parameters", "name
 
 OTHERS = (
     Section("strip", title="Clamped strips", validation=True),
+    Section(
+        "shells",
+        {"shells": "Thin shells under their largest load, and published deflections (points)."},
+        "Thin shells",
+        validation=True,
+    ),
     Section("benchmark", {"benchmark": "Where the time goes."}, "How fast", validation=True),
 )
 """What no study made."""
