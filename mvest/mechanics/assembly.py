@@ -30,7 +30,6 @@ __all__ = [
     "adjacency",
     "elements_of_nodes",
     "scatter_blocks",
-    "scatter_matrices",
 ]
 
 Positions = NDArray[np.int32]
@@ -337,31 +336,6 @@ def add_forces(out: FloatArray, nodes: IntArray, forces: FloatArray) -> None:
         for a in range(nodes.shape[1]):
             for i in range(3):
                 out[nodes[g, a], i] += forces[g, a, i]
-
-
-@nb.njit(cache=True)
-def scatter_matrices(
-    data: FloatArray, positions: Positions, skew: Positions, matrices: FloatArray
-) -> None:
-    """Add matrices ``(g, 3k, 3k)`` (node-major) to block data.
-
-    Their symmetric part at ``positions (g, k, k)``, the other at ``skew (g, k, k)``; neither where
-    the position is negative.
-    """
-    for g in range(positions.shape[0]):
-        for a in range(positions.shape[1]):
-            for b in range(positions.shape[2]):
-                at, at_skew = positions[g, a, b], skew[g, a, b]
-                for i in range(3):
-                    for j in range(3):
-                        one, other = (
-                            matrices[g, 3 * a + i, 3 * b + j],
-                            matrices[g, 3 * b + j, 3 * a + i],
-                        )
-                        if at >= 0:
-                            data[at, i, j] += 0.5 * (one + other)
-                        if at_skew >= 0:
-                            data[at_skew, i, j] += 0.5 * (one - other)
 
 
 @nb.njit(cache=True)

@@ -596,7 +596,12 @@ def _add_tangents(
                     for i in range(3):
                         for b in range(n_a):
                             k_am[m, i * n_a + b] += p * row[i, b]
-        np.dot(g_t, t, k)
+        if n_q == 1:  # a call would take longer than the product
+            for b in range(n_a):
+                for c in range(9 * n_a):
+                    k[b, c] = g_t[b, 0] * t[0, c] + g_t[b, 1] * t[1, c] + g_t[b, 2] * t[2, c]
+        else:
+            np.dot(g_t, t, k)
         if n_m > 0:
             change = k_am.copy()
             _solve_small(k_mm, change)

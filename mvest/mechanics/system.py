@@ -19,7 +19,6 @@ from mvest.mechanics.assembly import (
     adjacency,
     elements_of_nodes,
     scatter_blocks,
-    scatter_matrices,
 )
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact, ContactPairs
@@ -187,8 +186,11 @@ class System:
             self._at_ties = self.pattern.within(self.ties.spans.nodes)
         self._at_contact = self.pattern.between(elements[hosts[:, 0]], elements[hosts[:, 1]])
         self._at_diagonal = self.pattern.pointer[:-1]
+        free, rows, columns = ~self.held, self.pattern.rows, self.pattern.all_columns
         some: BoolArray = np.any(self.held, axis=1)
-        self._at_held = np.flatnonzero(some[self.pattern.rows] | some[self.pattern.all_columns])
+        at = np.flatnonzero(some[rows] | some[columns])
+        held = ~(free[rows[at]][:, :, None] & free[columns[at]][:, None, :])
+        self._held_entries = (9 * at[:, None] + np.arange(9))[held.reshape(-1, 9)]
 
     def search_contact(self, x: FloatArray) -> ContactPairs | None:
         """Candidate pairs at nodal positions ``x``."""
@@ -263,8 +265,7 @@ class System:
         self.solid.add_tangents(state, self._at_elements, blocks)
         p = self.factors.pressure * loads.pressure
         if self.pressure is not None and p != 0:
-            tangents = -p * self.pressure.tangents(x)
-            scatter_matrices(blocks, self._at_faces, self._at_faces_skew, tangents)
+            self.pressure.add_tangent(x, -p, self._at_faces, self._at_faces_skew, blocks)
         if self.cables is not None:
             stiffness = self._cable_forces(self.cables, x, loads)[1]
             scatter_blocks(blocks, self._at_cables, self.cables.patches.weights, stiffness)
@@ -291,10 +292,8 @@ class System:
         """
         for i in range(3):
             blocks[self._at_diagonal, i, i] += mass_factor * self.solid.lumped_mass
-        if self._at_held.size:
-            free, at = ~self.held, self._at_held
-            rows, columns = self.pattern.rows[at], self.pattern.all_columns[at]
-            blocks[at] *= free[rows][:, :, None] & free[columns][:, None, :]
+        if self._held_entries.size:
+            blocks.reshape(-1)[self._held_entries] = 0.0
             nodes, axes = np.nonzero(self.held)
             blocks[self._at_diagonal[nodes], axes, axes] = 1.0
         return self.pattern.matrix(blocks)

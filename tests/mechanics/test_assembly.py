@@ -1,7 +1,6 @@
 """Assembly: where blocks lie, and that half of a matrix is all of it."""
 
 import numpy as np
-import pytest
 from scipy import sparse
 
 from mvest.mechanics.assembly import (
@@ -9,7 +8,6 @@ from mvest.mechanics.assembly import (
     adjacency,
     elements_of_nodes,
     scatter_blocks,
-    scatter_matrices,
 )
 from mvest.mechanics.blocks import outer_faces
 from mvest.mechanics.forces.pressure import PressureLoad
@@ -85,30 +83,6 @@ def test_points_that_share_a_node_add_up():
             share[:, 3 * node : 3 * node + 3] += factor * np.eye(3)
         expected += share.T @ k @ share
     np.testing.assert_allclose(pattern.matrix(blocks).tobsr().toarray(), expected, atol=1e-14)
-
-
-@pytest.mark.parametrize("element_type", ["hex18", "tet4", "tet10", "wedge12"])
-def test_pressure_is_unsymmetric_along_the_rim_alone(element_type):
-    mesh = block(element_type, (3, 3, 2), (3.0, 3.0, 2.0))
-    n, random = len(mesh.nodes), np.random.default_rng(6)
-    x = mesh.nodes + 0.2 * random.uniform(-1, 1, mesh.nodes.shape)
-    every = outer_faces(mesh.elements, element_type)
-    top = every[np.all(mesh.nodes[every][:, :, 2] == 2.0, axis=1)]
-    for faces in (top, top[1:]):  # the second with a corner cut out
-        load = PressureLoad(faces, mesh.reference.face)
-        pattern = SparsityPattern.of(adjacency(n, [faces]), load.rim())
-        inside = adjacency(n, [faces]).nnz
-        assert 0 < 2 * len(pattern.skew) < inside
-        blocks = pattern.zeros()
-        scatter_matrices(
-            blocks, pattern.within(faces), pattern.within_skew(faces), load.tangents(x)
-        )
-        expected = np.zeros((3 * n, 3 * n))
-        for own, tangent in zip(faces, load.tangents(x), strict=True):
-            at = (3 * own[:, None] + np.arange(3)).ravel()
-            expected[np.ix_(at, at)] += tangent
-        assert np.abs(expected - expected.T).max() > 0.01
-        np.testing.assert_allclose(pattern.matrix(blocks).tobsr().toarray(), expected, atol=1e-14)
 
 
 def test_a_closed_surface_has_no_rim():

@@ -8,6 +8,8 @@ the final size are asserted rather than a loose tolerance.
 import numpy as np
 import pytest
 
+from mvest.mechanics.assembly import SparsityPattern, add_forces, adjacency
+from mvest.mechanics.blocks import outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw
@@ -72,20 +74,31 @@ def test_material(element_type, rate, material):
     assert abs(matrix - matrix.T).max() < 1e-10 * abs(matrix).max()
 
 
-@pytest.mark.parametrize("element_type", ["tet4", "tet10", "hex18"])
+@pytest.mark.parametrize("element_type", ["tet4", "tet10", "hex18", "wedge12"])
 def test_follower_load(element_type):
-    # Forces are quadratic in the positions on a face: central differences are exact.
-    mesh = block(element_type, (2, 2, 1))
-    load = PressureLoad(mesh.pressure_faces, mesh.reference.face)
-    x = moved(mesh)
+    # Forces are quadratic in the positions on a face: central differences are exact. The rim of
+    # what is loaded has a corner cut out.
+    mesh = block(element_type, (3, 3, 2), (3.0, 3.0, 2.0))
+    every = outer_faces(mesh.elements, element_type)
+    top = every[np.all(mesh.nodes[every][:, :, 2] == 2.0, axis=1)]
+    load = PressureLoad(top[1:], mesh.reference.face)
+    x, n = moved(mesh), len(mesh.nodes)
     d = directions(x.shape)
+    pattern = SparsityPattern.of(adjacency(n, [load.faces]), load.rim())
+    assert 0 < 2 * len(pattern.skew) < adjacency(n, [load.faces]).nnz
+    blocks = pattern.zeros()
+    load.add_tangent(x, 1.7, pattern.within(load.faces), pattern.within_skew(load.faces), blocks)
 
     def forces(at):
-        return load.forces(at).ravel()
+        out = np.zeros_like(at)
+        add_forces(out, load.faces, 1.7 * load.forces(at))
+        return out.ravel()
 
-    product = np.einsum("fab,fb->fa", load.tangents(x), d[load.faces].reshape(len(load.faces), -1))
     difference = (forces(x + 1e-2 * d) - forces(x - 1e-2 * d)) / 2e-2
-    np.testing.assert_allclose(difference, product.ravel(), atol=1e-12)
+    product = pattern.matrix(blocks) @ d.ravel()
+    np.testing.assert_allclose(difference, product, atol=1e-12)
+    whole = pattern.matrix(blocks).tobsr()
+    assert abs(whole - whole.T).max() > 0.01
 
 
 def test_follower_load_pushes_against_the_normal_and_sums_to_pressure_times_area():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from mvest.elements import FACES
 from mvest.typing import FloatArray, IntArray
@@ -54,9 +55,38 @@ class PressureLoad:
         """Nodal forces ``(f, k, 3)`` in N for a pressure of 1 MPa."""
         return _forces(x, self.faces, self.face.shape, self.face.gradient, self.face.weights)
 
-    def tangents(self, x: FloatArray) -> FloatArray:
-        """Derivatives ``(f, 3k, 3k)`` of :meth:`forces` by the nodal positions, N/mm."""
-        return _tangents(x, self.faces, self.face.shape, self.face.gradient, self.face.weights)
+    def add_tangent(
+        self,
+        x: FloatArray,
+        factor: float,
+        positions: NDArray[np.int32],
+        skew: NDArray[np.int32],
+        blocks: FloatArray,
+    ) -> None:
+        """Add ``factor`` times the derivative of :meth:`forces` by the positions to block data.
+
+        Parameters
+        ----------
+        x : ndarray
+            ``(n, 3)`` mm.
+        factor : float
+            MPa.
+        positions, skew : ndarray
+            ``(f, k, k)`` where the blocks of pairs of nodes lie in the symmetric and in the skew
+            part, negative where they are in none.
+        blocks : ndarray
+            N/mm.
+        """
+        _add_tangent(
+            x,
+            self.faces,
+            self.face.shape,
+            self.face.gradient,
+            factor * self.face.weights,
+            positions,
+            skew,
+            blocks,
+        )
 
 
 @nb.njit(cache=True)
@@ -92,26 +122,51 @@ def _forces(
 
 
 @nb.njit(cache=True)
-def _tangents(
-    x: FloatArray, faces: IntArray, shape: FloatArray, gradient: FloatArray, weights: FloatArray
-) -> FloatArray:
+def _add_tangent(
+    x: FloatArray,
+    faces: IntArray,
+    shape: FloatArray,
+    gradient: FloatArray,
+    weights: FloatArray,
+    positions: NDArray[np.int32],
+    skew: NDArray[np.int32],
+    blocks: FloatArray,
+) -> None:
     n_f, n_a = faces.shape
-    out = np.zeros((n_f, 3 * n_a, 3 * n_a))
-    g1, g2, h = np.empty(3), np.empty(3), np.empty(3)
+    g1, g2, h = np.empty(3), np.empty(3), np.empty((n_a, 3))
+    sums = np.empty((n_a, n_a, 3))
     for f in range(n_f):
+        sums[:] = 0.0
         for q in range(weights.shape[0]):
             _surface_vectors(x, faces[f], gradient[q], g1, g2)
             for b in range(n_a):
                 # d(g1 x g2) = [g1]x dg2 - [g2]x dg1 = [h]x dx_b
                 for i in range(3):
-                    h[i] = gradient[q, b, 1] * g1[i] - gradient[q, b, 0] * g2[i]
-                for a in range(n_a):
-                    c = -weights[q] * shape[q, a]
-                    r, s = 3 * a, 3 * b
-                    out[f, r, s + 1] -= c * h[2]
-                    out[f, r, s + 2] += c * h[1]
-                    out[f, r + 1, s] += c * h[2]
-                    out[f, r + 1, s + 2] -= c * h[0]
-                    out[f, r + 2, s] -= c * h[1]
-                    out[f, r + 2, s + 1] += c * h[0]
-    return out
+                    h[b, i] = gradient[q, b, 1] * g1[i] - gradient[q, b, 0] * g2[i]
+            for a in range(n_a):
+                factor = -weights[q] * shape[q, a]
+                for b in range(n_a):
+                    for i in range(3):
+                        sums[a, b, i] += factor * h[b, i]
+        # The block of nodes a and b is [sums_ab]x, and the transpose of that of b and a is
+        # -[sums_ba]x.
+        for a in range(n_a):
+            for b in range(n_a):
+                if positions[f, a, b] >= 0:
+                    _add_cross(blocks[positions[f, a, b]], sums[a, b], sums[b, a], -1.0)
+                if skew[f, a, b] >= 0:
+                    _add_cross(blocks[skew[f, a, b]], sums[a, b], sums[b, a], 1.0)
+
+
+@nb.njit(cache=True, inline="always")
+def _add_cross(out: FloatArray, one: FloatArray, other: FloatArray, sign: float) -> None:
+    """Add the matrix of the vector product with ``(one + sign * other) / 2``."""
+    v0 = 0.5 * (one[0] + sign * other[0])
+    v1 = 0.5 * (one[1] + sign * other[1])
+    v2 = 0.5 * (one[2] + sign * other[2])
+    out[0, 1] -= v2
+    out[0, 2] += v1
+    out[1, 0] += v2
+    out[1, 2] -= v0
+    out[2, 0] -= v1
+    out[2, 1] += v0
