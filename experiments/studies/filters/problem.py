@@ -247,11 +247,11 @@ def _run_all(problem: ComparedProblem, points: FloatArray, store: Path) -> list[
     """
     log_prior = problem.log_prior
     entries = [Entry(store / f"{k}.npz", _read) for k in range(len(points))]
-    found = [entry.found() for entry in entries]
-    left = {k for k, run in enumerate(found) if run is None}
+    runs = [entry.found() for entry in entries]
+    left = {k for k, run in enumerate(runs) if run is None}
     at = np.zeros(points.shape[1])
 
-    def run() -> _Run:
+    def compute() -> _Run:
         m = np.exp(log_prior.mean + log_prior.std * at)
         prediction = problem.model(m)
         scale = m * log_prior.std if prediction.converged else 1.0
@@ -264,8 +264,8 @@ def _run_all(problem: ComparedProblem, points: FloatArray, store: Path) -> list[
         k = min(left, key=lambda i: float(np.linalg.norm(points[i] - at)))
         left.remove(k)
         at = points[k]
-        found[k] = entries[k].get_or_make(run, write)
-    return [run for run in found if run is not None]
+        runs[k] = entries[k].get_or_make(compute, write)
+    return [run for run in runs if run is not None]
 
 
 def _read(path: Path) -> _Run:

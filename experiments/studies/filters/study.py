@@ -166,7 +166,7 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated
     y = y + problem.noise * np.random.default_rng(seed).standard_normal(y.shape)
     problem.model.restart()
     began, before = time.process_time(), problem.model.seconds
-    found = filter_(
+    estimate = filter_(
         problem.model,
         problem.prior,
         y,
@@ -176,19 +176,19 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated
         on_iterate=SolveBar(problem.name, 0, 0, problem.parameters).iterate,
     )
     seconds = time.process_time() - began
-    low, high = found.interval()
-    draws = found.transformed_samples
+    low, high = estimate.interval()
+    draws = estimate.transformed_samples
     return Estimated(
-        converged=found.converged,
-        reason=found.reason.value,
-        detail=found.detail,
-        forward_solves=found.forward_solves,
-        iterations=found.iterations,
+        converged=estimate.converged,
+        reason=estimate.reason.value,
+        detail=estimate.detail,
+        forward_solves=estimate.forward_solves,
+        iterations=estimate.iterations,
         seconds=seconds,
         model_seconds=problem.model.seconds - before,
-        estimate=vector(found.mean),
-        log_mean=vector(found.transformed.mean),
-        log_std=vector(found.transformed.std),
+        estimate=vector(estimate.mean),
+        log_mean=vector(estimate.transformed.mean),
+        log_std=vector(estimate.transformed.std),
         low=vector(low),
         high=vector(high),
         skewness=None if draws is None else vector(scipy.stats.skew(draws, axis=0)),
@@ -219,10 +219,10 @@ def _repeats(
             else:
                 if isinstance(filter_, EnsembleFilter):
                     filter_ = replace(filter_, seed=k)
-                found = filter_(
+                estimate = filter_(
                     fitted.model, problem.prior, y, problem.noise**2, transform=TRANSFORM
                 )
-                interval = _interval(found, log_prior.mean, log_prior.std)
+                interval = _interval(estimate, log_prior.mean, log_prior.std)
             every[method].append(None if interval is None else (*interval, truth))
     return {method: _summary(own, every[REFERENCE], log_prior.std) for method, own in every.items()}
 
@@ -240,12 +240,14 @@ def _truths(size: int, reach: float, rng: np.random.Generator) -> Iterator[Float
 
 
 def _interval(
-    found: Estimate, mean: FloatArray, std: FloatArray
+    estimate: Estimate, mean: FloatArray, std: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    if found.prediction is None:
+    if estimate.prediction is None:
         return None
-    low, high = found.interval()
-    centre, low, high = ((z - mean) / std for z in (found.transformed.mean, *np.log([low, high])))
+    low, high = estimate.interval()
+    centre, low, high = (
+        (z - mean) / std for z in (estimate.transformed.mean, *np.log([low, high]))
+    )
     return centre, low, high
 
 

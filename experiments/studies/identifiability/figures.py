@@ -166,7 +166,7 @@ def profiles_figure(findings: Findings, parameters: tuple[str, ...]) -> Figure:
 
 
 def _titled_legend(figure: Figure, axes: Any, title: str, columns: int | None = None) -> None:
-    """One legend above all panels, with the figure's title: below is where provenance is told."""
+    """One legend above all panels, with the figure's title: below stands where it comes from."""
     handles, texts = axes.get_legend_handles_labels()
     figure.legend(
         handles, texts, loc="outside upper center", ncols=columns or len(texts), frameon=False,

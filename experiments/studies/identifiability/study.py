@@ -293,7 +293,7 @@ STUDY = Study(
                 "identifiability_designs": "Expected standard deviation of a modulus with each "
                 "design: which vertices are seen, with which errors, in which frames, and what is "
                 "known of the nuisances; dark where the target is met. Simulated.",
-                "identifiability_profiles": "Profile likelihoods: the least misfit with one "
+                "identifiability_profiles": "Profile likelihoods: the smallest misfit with one "
                 "parameter held, and how the "
                 "others then make up for it. Simulated.",
                 "identifiability_valley": "95 % regions of a modulus with a nuisance, for "

@@ -16,7 +16,7 @@ __all__ = ["Accuracy", "Confidences", "Correlations", "Coverage", "DetectedVolum
 Row = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class DetectedVolume:
     """A valve in one volume of one frame, errors with sign, mean distances without.
 

@@ -134,8 +134,8 @@ def _volumes(
         )
         with PartBar("held-out volumes", len(left), "volume") as bar:
             done = in_processes(try_volume, calls, store.processes)
-            for sizes, (found, _) in zip(left.values(), done, strict=True):
-                yield from ({"row": json.dumps(found[str(size)])} for size in sizes)
+            for sizes, (result, _) in zip(left.values(), done, strict=True):
+                yield from ({"row": json.dumps(result[str(size)])} for size in sizes)
                 bar.step()
 
     rows: dict[int, list[dict[str, Any]]] = {}
@@ -171,8 +171,8 @@ def _sequences(
             for t in left
         )
         with PartBar(f"volumes over time, {left[0].kind}", len(left), "volume") as bar:
-            for found, _ in in_processes(try_sequence, calls, store.processes):
-                yield found
+            for result, _ in in_processes(try_sequence, calls, store.processes):
+                yield result
                 bar.step()
 
     return get_or_make(entries, make, _write)

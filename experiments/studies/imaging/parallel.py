@@ -38,5 +38,5 @@ def in_processes(
 
 def _timed(function: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[T, float]:
     began = time.process_time()
-    found = function(*arguments)
-    return found, time.process_time() - began
+    made = function(*arguments)
+    return made, time.process_time() - began

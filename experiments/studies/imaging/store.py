@@ -214,8 +214,8 @@ class ImagingStore:
                 for k in (numbers[at] for at in missing)
             )
             with PartBar("training volumes", len(missing), "volume") as bar:
-                for found in in_processes(volume_samples, calls, self.processes):
-                    yield found
+                for made in in_processes(volume_samples, calls, self.processes):
+                    yield made
                     bar.step()
 
         return get_or_make(entries, make, _write_samples)
@@ -301,8 +301,8 @@ def _cpu_s() -> float:
     return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
-def _write_samples(path: Path, found: tuple[Samples, float]) -> None:
-    samples, cpu_s = found
+def _write_samples(path: Path, made: tuple[Samples, float]) -> None:
+    samples, cpu_s = made
     arrays: dict[str, Any] = {"cpu_s": np.array(cpu_s)}
     for name, (x, y) in samples.items():
         arrays |= {f"{name}.x": x, f"{name}.y": y}

@@ -235,16 +235,9 @@ def _require_min(minimum: int, name: str, value: int) -> None:
 
 def _require_targets(targets: Mapping[str, Any]) -> None:
     """Targets that no table has would only be noticed at the end."""
-    blank = [
-        DetectedVolume(
-            setting=setting, valve="", frame=0, confidence=1.0, surface_mm=1.0, point_mm=1.0,
-            tips_mm=1.0, annulus_area_error_percent=1.0, ap_error_mm=1.0, state_right=True,
-            seconds=1.0,
-        )
-        for setting in SETTINGS
-    ]  # fmt: skip
+    blank = DetectedVolume("", "", 0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, state_right=True, seconds=1.0)
     try:
-        imaging_words(imaging_table(blank), targets)
+        imaging_words(imaging_table([replace(blank, setting=s) for s in SETTINGS]), targets)
     except (InputError, AttributeError, TypeError, ValueError) as error:
         raise ConfigurationError(f"imaging.targets: {error}") from error
 

@@ -49,14 +49,7 @@ AT_LEAST: Final = (SHARE, "valve detected [%]")
 def imaging_table(rows: Sequence[DetectedVolume]) -> pd.DataFrame:
     """One row for each setting that summarises its volumes.
 
-    Parameters
-    ----------
-    rows : sequence of DetectedVolume
-
-    Returns
-    -------
-    DataFrame
-        Sizes of errors are means over the volumes with a valve detected; the shares are of all.
+    Sizes of errors are means over the volumes with a valve detected; the shares are of all.
 
     Raises
     ------
@@ -102,11 +95,7 @@ def imaging_table(rows: Sequence[DetectedVolume]) -> pd.DataFrame:
 def imaging_words(table: pd.DataFrame, targets: Targets | None = None) -> list[str]:
     """What a table of `imaging_table` says beside its targets.
 
-    Parameters
-    ----------
-    table : DataFrame
-    targets : mapping, optional
-        Setting -> column of the table -> value; an upper limit, but a lower one for shares.
+    These are by setting and column, an upper limit, but a lower one for shares.
 
     Raises
     ------
@@ -137,25 +126,7 @@ def imaging_words(table: pd.DataFrame, targets: Targets | None = None) -> list[s
 def write_imaging_table(
     base: Path, tested: Evaluation, targets: Targets, notes: Sequence[str], line: str
 ) -> list[Path]:
-    """Write the table, and below each of its rows the targets, if there are any.
-
-    Parameters
-    ----------
-    base : Path
-        Without suffix.
-    tested : Evaluation
-    targets : mapping
-        As for `imaging_words`.
-    notes : sequence of str
-        Sentences.
-    line : str
-        Provenance.
-
-    Raises
-    ------
-    InputError
-        As `imaging_table` and `imaging_words`, or a file that cannot be written.
-    """
+    """Write the table, and below each of its rows the targets, if there are any."""
     table = imaging_table(tested.rows)
     readable = []
     for _, row in table.iterrows():

@@ -126,7 +126,7 @@ def try_volume(
     volume = seen.volume
     if asked.kind == "white noise":
         volume = _white_noise(volume, render)
-    found = {}
+    detected = {}
     for name, path in models.items():
         model = _model(str(path))
         began = time.process_time()
@@ -148,8 +148,8 @@ def try_volume(
                 "true": measures(seen.vertices, seen.tips, layout),
                 "estimated": measures(fitted.vertices, fitted.tips, layout),
             }
-        found[name] = row
-    return found
+        detected[name] = row
+    return detected
 
 
 def _white_noise(volume: VolumeSequence, seed: np.random.SeedSequence) -> VolumeSequence:
@@ -191,18 +191,18 @@ def try_sequence(
     true = true_sequence(valve, probe)
     model, layout = _model(str(model_file)), valve.layout
     began = time.process_time()
-    found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
+    detected = detect_valve(volume, model, replace(settings, min_confidence=0.0))
     cpu_s = time.process_time() - began
     frames = []
     for k in range(len(true.times)):
-        x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
+        x, tips, right = detected.vertices[k], detected.tips[k], true.vertices[k]
         there, back = surface_distances(x, right, layout)
         frames.append(
             {
                 "surface": float(0.5 * (there.mean() + back.mean())),
                 "points": float(np.linalg.norm(x - right, axis=1).mean()),
                 "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
-                "confidence": float(found.frame_confidence[k]),
+                "confidence": float(detected.frame_confidence[k]),
                 "true": measures(right, true.tips[k], layout),
                 "estimated": measures(x, tips, layout),
             }
@@ -220,8 +220,8 @@ def try_sequence(
     turn = np.concatenate([pose.rotation for pose in axes])
     return {
         "row": json.dumps(row),
-        "errors": (found.vertices[two] - true.vertices[two]) @ turn,
-        "tip_errors": (found.tips[two] - true.tips[two]) @ turn,
+        "errors": (detected.vertices[two] - true.vertices[two]) @ turn,
+        "tip_errors": (detected.tips[two] - true.tips[two]) @ turn,
         "rest": (true.vertices[0] - axes[0].centre[0]) @ turn[0],
     }
 
