@@ -19,8 +19,8 @@ from experiments.common.cases.findings import Findings as OfPatients
 from experiments.common.cases.skill import median_errors
 from experiments.results.keep import records_of
 from experiments.studies.imaged_patient.findings import Findings as OfVolumes
-from experiments.studies.imaged_patient.report import answered_of_volumes
-from experiments.studies.patient.report import answered_of_patients
+from experiments.studies.imaged_patient.report import moduli_of_volumes
+from experiments.studies.patient.report import moduli_of_patients
 from mvest.mechanics.parameters import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,11 +79,11 @@ def guess_comparison() -> str:
     leaflets = ("anterior", "posterior")
     rows = []
     results = ROOT / "results"
-    for title, records, answered in (
-        ("known geometry", records_of(results, "population", OfPatients), answered_of_patients),
-        ("simulated volumes", records_of(results, "volume", OfVolumes), answered_of_volumes),
+    for title, records, moduli_of in (
+        ("known geometry", records_of(results, "population", OfPatients), moduli_of_patients),
+        ("simulated volumes", records_of(results, "volume", OfVolumes), moduli_of_volumes),
     ):
-        moduli = answered(records.values())
+        moduli = moduli_of(records.values())
         cells = [f"{title}, {len(records)} virtual patients"]
         for wanted in ((leaflets[0],), (leaflets[1],), leaflets):
             errors = median_errors([one for one in moduli if one.leaflet in wanted])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.common.estimates import (
-    EstimatedModulus,
     Identified,
     Innovation,
     SeedRun,
@@ -22,7 +21,6 @@ __all__ = [
     "identified_of",
     "innovation_of",
     "moduli_error",
-    "moduli_of",
     "seed_run",
 ]
 
@@ -54,14 +52,6 @@ def seed_run(seed: int | None, result: StudyResult) -> SeedRun:
 
 def _known(values: FloatArray | None) -> Vector | None:
     return None if values is None else vector(values)
-
-
-def moduli_of(result: StudyResult) -> tuple[EstimatedModulus, ...]:
-    """All moduli that follow from the estimated ones."""
-    return tuple(
-        EstimatedModulus(m.region, m.name, m.estimate, m.std, m.truth, m.relative_error)
-        for m in result.moduli
-    )
 
 
 def moduli_error(result: StudyResult) -> Spread | None:

@@ -8,7 +8,7 @@ from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
 from mvest.reporting.findings import Identified, Innovation, Spread
 
-__all__ = ["Data", "EstimatedModulus", "Identified", "Innovation", "Paper", "SeedRun", "Spread"]
+__all__ = ["Data", "Identified", "Innovation", "Paper", "SeedRun", "Spread"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +31,6 @@ class Paper:
     error_percent: Vector | None = None
     moduli_error_percent: Vector | None = None
     distance_mm: Vector | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatedModulus:
-    """One modulus of a leaflet in MPa, estimated or following from one that is."""
-
-    region: str
-    name: str
-    estimate: float
-    std: float | None
-    truth: float | None = None
-    relative_error: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

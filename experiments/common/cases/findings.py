@@ -17,6 +17,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.result import Personalised
 from mvest.problem.estimate import StudyResult
+from mvest.problem.registration import unit_of
 from mvest.reporting.case.findings import (
     MODULUS,
     NUISANCE,
@@ -62,20 +63,10 @@ class Revealed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """What a run computed of a case.
+    """What a run computed of a case, and of a virtual patient what was revealed.
 
-    Attributes
-    ----------
-    case : CaseFindings
-    repeats : (SeedRun,)
-        The moduli among its unknowns, by which runs are compared.
-    data : Data
-    revealed : Revealed or None
-        Of a virtual patient; the truth stands in the others.
-    memory_mb : float
-        The peak of the process.
-    parts_s : mapping
-        Wall-clock time of each part.
+    The one of ``repeats`` is of the moduli among its unknowns, by which runs are compared. The
+    process took ``memory_mb`` at its peak, and each part ``parts_s`` of wall-clock time.
     """
 
     case: CaseFindings
@@ -89,16 +80,7 @@ class Findings:
 def outcome_of_case(
     fit: Personalised, settings: Mapping[str, Any], image_step: ImageStep | None = None
 ) -> Outcome[Findings]:
-    """What follows from a personalised case, what it hides excluded.
-
-    Parameters
-    ----------
-    fit : Personalised
-    settings : mapping
-        Shown in the report.
-    image_step : ImageStep, optional
-        Where the case came from a volume.
-    """
+    """What follows from a personalised case; the settings are shown in its report."""
     case, result, grid = fit.case, fit.result, fit.settings.mesh
     run = seed_run(None, result)
     moduli = [k for k, name in enumerate(fit.names) if name.startswith("E_f.")]
@@ -185,54 +167,51 @@ def _case_findings(
 
 def fields_of(fit: Personalised) -> dict[str, Any]:
     """The arrays of the report, mm."""
-    case, surface = fit.case, fit.case.surface
+    case, surface, filtered = fit.case, fit.case.surface, fit.result.filtered
     frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
     seen = [by_name[name] for name in frames]
+    shapes = {"generic": fit.generic, "registered": fit.registered, "fitted": fit.fitted}
     reference = case.frame(Role.REFERENCE)
+    whole = {
+        "triangles": surface.triangles,
+        "annulus": case.annulus,
+        "free_edge": case.free_edge,
+        "chord_tip": case.chordae.tip,
+        "chord_insertion": [
+            np.argmin(np.linalg.norm(surface.vertices - point, axis=1))
+            for point in case.chordae.insertion
+        ],
+    }
+    reals: dict[str, Any] = {
+        "rest": surface.vertices,
+        "tips": np.stack([reference.papillary_tips, *(frame.papillary_tips for frame in seen)]),
+        **{name: np.stack([of[frame] for frame in frames]) for name, of in shapes.items()},
+    }
     arrays: dict[str, Any] = {
-        "triangles": surface.triangles.astype(np.int32),
         "region": surface.region.astype(np.int8),
-        "rest": surface.vertices.astype(np.float32),
-        "annulus": case.annulus.astype(np.int32),
-        "free_edge": case.free_edge.astype(np.int32),
         "frames": np.array(frames),
         "seen": np.array([d.seen for d in fit.distances]),
-        "tips": np.stack(
-            [reference.papillary_tips, *(frame.papillary_tips for frame in seen)]
-        ).astype(np.float32),
-        "chord_tip": case.chordae.tip.astype(np.int32),
-        "chord_insertion": np.array(
-            [
-                int(np.argmin(np.linalg.norm(surface.vertices - point, axis=1)))
-                for point in case.chordae.insertion
-            ],
-            dtype=np.int32,
-        ),
     }
-    for name, positions in (
-        ("generic", fit.generic),
-        ("registered", fit.registered),
-        ("fitted", fit.fitted),
-    ):
-        arrays[name] = np.stack([positions[frame] for frame in frames]).astype(np.float32)
     if all(frame.corresponds for frame in seen):
-        arrays["observed"] = np.stack([frame.vertices for frame in seen]).astype(np.float32)
+        reals["observed"] = np.stack([frame.vertices for frame in seen])
         if fit.settings.correspondence:
             arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
             arrays["distance_registered"] = np.stack([d.registered for d in fit.distances])
             arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
     else:
-        for frame in seen:
-            arrays[f"observed_points_{frame.name}"] = frame.vertices.astype(np.float32)
-    filtered = fit.result.filtered
+        reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
     if filtered is not None and filtered.prediction is not None:
         sensitivity = filtered.prediction.jacobian
         if sensitivity.size == surface.vertices.size * len(fit.names):
-            arrays["sensitivity"] = sensitivity.reshape(-1, 3, len(fit.names)).astype(np.float32)
+            reals["sensitivity"] = sensitivity.reshape(-1, 3, len(fit.names))
             if filtered.innovation is not None:
                 arrays["innovation"] = filtered.innovation.standardised.reshape(-1, 3)
-    return arrays
+    return (
+        arrays
+        | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
+        | {name: values.astype(np.float32) for name, values in reals.items()}
+    )
 
 
 def _about(case: ValveCase) -> About:
@@ -257,7 +236,7 @@ def _unknowns(
         UnknownRow(
             name=name,
             label=_label(name),
-            unit=_unit(name),
+            unit=unit_of(name),
             kind=MODULUS if about[name].is_modulus else NUISANCE,
             treatment=about[name].treatment.value,
             prior_mean=about[name].mean,
@@ -394,8 +373,3 @@ def _label(name: str) -> str:
     if kind in ("shift", "turn"):
         return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
     return LABELS.get(name, name)
-
-
-def _unit(name: str) -> str:
-    kind = name.partition(".")[0]
-    return {"E_f": "MPa", "shift": "mm", "turn": "degrees"}.get(kind, "")

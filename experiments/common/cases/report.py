@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import FIELDS
@@ -18,7 +18,6 @@ __all__ = [
     "case_text",
     "estimation_text",
     "interval_words",
-    "write_case",
     "write_case_run",
     "write_cases",
 ]
@@ -49,20 +48,7 @@ def estimation_text(
     return "\n".join(lines)
 
 
-class Interval(Protocol):
-    """An estimate with its 95 % interval, and whether that contains the truth."""
-
-    @property
-    def estimate(self) -> float | None: ...
-    @property
-    def low(self) -> float | None: ...
-    @property
-    def high(self) -> float | None: ...
-    @property
-    def inside(self) -> bool | None: ...
-
-
-def interval_words(row: Interval) -> str:
+def interval_words(row: UnknownRow) -> str:
     """Estimate and interval of an unknown, crossed if the truth is not in it."""
     if row.estimate is None:
         return MISSING
@@ -77,17 +63,15 @@ def write_cases(
     return [path for record in records.values() for path in write_case_run(folder, record)]
 
 
-def write_case_run(folder: Path, record: Record[Findings]) -> list[Path]:
-    """``unknowns.csv`` of a case, and its page where its run left arrays."""
-    return write_case(folder, record.findings.case, record)
-
-
-def write_case(folder: Path, case: CaseFindings, record: Record[Any]) -> list[Path]:
-    """The same of findings that are not the record's own."""
+def write_case_run(
+    folder: Path, record: Record[Any], case: CaseFindings | None = None
+) -> list[Path]:
+    """``unknowns.csv`` of a record's case, or of another, and its page where there are arrays."""
     import pandas as pd
 
     from mvest.reporting.case.report import write_case_report
 
+    case = case or record.findings.case
     rows = pd.DataFrame([asdict(row) for row in case.unknowns], columns=UNKNOWN_COLUMNS)
     written = [write_atomically(folder / "unknowns.csv", rows.to_csv(index=False))]
     fields = folder / FIELDS

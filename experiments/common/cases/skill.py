@@ -3,57 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import median
 
 from mvest.reporting.case.findings import UnknownRow
 
-__all__ = ["Answered", "median_errors", "skill_words"]
+__all__ = ["median_errors", "skill_words"]
 
 
-@dataclass(frozen=True, slots=True)
-class Answered:
-    """One modulus of a simulated valve, MPa.
+def median_errors(moduli: Sequence[UnknownRow]) -> tuple[float, float] | None:
+    """Median error of the estimates that there are, and of the generic guess for all, relative.
 
-    Attributes
-    ----------
-    leaflet : str
-    truth : float
-    estimate, low, high : float or None
-        With its 95 % interval; None where a run ended without an estimate.
-    generic : float
-        The value of the literature, which is what is said of a valve without an estimation.
+    The guess is the value of the literature, which is the mean of the prior. Truths are known.
     """
-
-    leaflet: str
-    truth: float
-    estimate: float | None
-    low: float | None
-    high: float | None
-    generic: float
-
-    @classmethod
-    def of(cls, row: UnknownRow) -> Answered:
-        """A modulus whose truth was revealed."""
-        assert row.truth is not None
-        leaflet = row.name.partition(".")[2]
-        return cls(leaflet, row.truth, row.estimate, row.low, row.high, row.prior_mean)
-
-
-def median_errors(moduli: Sequence[Answered]) -> tuple[float, float] | None:
-    """Median error of the estimates that there are, and of the generic guess for all, relative."""
-    errors = [abs(one.estimate / one.truth - 1) for one in moduli if one.estimate is not None]
-    guesses = [abs(one.generic / one.truth - 1) for one in moduli]
+    known = [(row, row.truth) for row in moduli if row.truth is not None]
+    errors = [abs(row.estimate / truth - 1) for row, truth in known if row.estimate is not None]
+    guesses = [abs(row.prior_mean / truth - 1) for row, truth in known]
     return (median(errors), median(guesses)) if errors else None
 
 
-def skill_words(moduli: Sequence[Answered]) -> str:
+def skill_words(moduli: Sequence[UnknownRow]) -> str:
     """Coverage and median error, beside the error of the generic guess, runs lost included."""
-    lost = sum(one.estimate is None for one in moduli)
-    inside = sum(
-        one.low is not None and one.high is not None and one.low <= one.truth <= one.high
-        for one in moduli
-    )
+    lost = sum(row.estimate is None for row in moduli)
+    inside = sum(row.inside is True for row in moduli)
     text = f"{inside} of {len(moduli)} moduli lie inside their 95 % intervals"
     errors = median_errors(moduli)
     if errors:

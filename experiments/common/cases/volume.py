@@ -1,4 +1,4 @@
-"""A volume over time to its moduli: valve found, measured, written as a case, and personalised."""
+"""A volume over time to its moduli: the valve detected, measured, made a case, personalised."""
 
 from __future__ import annotations
 
@@ -52,18 +52,9 @@ IMAGES, CASE = "images", "case"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedValve:
-    """The valve that the image step detected in a volume.
+    """The valve that the image step detected in a volume, with the measures of every frame.
 
-    Attributes
-    ----------
-    volume : VolumeSequence
-    valve : ValveSequence
-    rows : list of dict
-        Measures of every frame.
-    frames : CaseFrames
-    case : ValveCase
-    model : dict
-        What is known of the detection model, plain data.
+    Of the detection model there is what is known of it, as plain data.
     """
 
     volume: VolumeSequence
@@ -94,7 +85,7 @@ def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValv
     Raises
     ------
     MvestError
-        If the volume cannot be read, shows no valve, or the valve found makes no case.
+        If the volume cannot be read, shows no valve, or the valve in it makes no case.
     """
     if file is None:
         raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
@@ -192,7 +183,7 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
             montage_figure(
                 detected.volume, detected.valve, title=name, closed=detected.frames.closed
             ),
-            "The valve as it was found, drawn on the volume.",
+            "The valve as it was detected, drawn on the volume.",
         ),
         "measures_over_time": (
             measures_figure(detected.rows, title=name),
@@ -241,7 +232,7 @@ def _sentences(detected: DetectedValve) -> tuple[str, ...]:
     size = " x ".join(map(str, volume.frames.shape[1:]))
     return (
         f"{volume.source}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
-        f"Valve found with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
+        f"Valve detected with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
         f"(open frame {detected.frames.open}: {confidence[detected.frames.open]:.2f}, closed frame "
         f"{detected.frames.closed}: {confidence[detected.frames.closed]:.2f}).",
         "The detectors were trained and tested on simulated volumes only; their error there is "

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.common.estimates import Data, EstimatedModulus, Identified, Innovation, Spread
+from experiments.common.estimates import Data, Identified, Innovation, Spread
 from experiments.common.findings import Rows, Vector
 from experiments.common.record import Status
+from mvest.problem.estimate import Modulus
 
 __all__ = ["Distances", "Findings", "Row"]
 
@@ -64,7 +65,7 @@ class Findings:
     std: Vector | None
     iterates: Rows | None
     iterate_std: Rows | None
-    moduli: tuple[EstimatedModulus, ...]
+    moduli: tuple[Modulus, ...]
     distance_mm: Spread | None
     innovation: Innovation | None
     identifiability: Identified | None

@@ -21,7 +21,6 @@ from experiments.common.build import build_filter, mechanics_of
 from experiments.common.estimate_record import (
     identified_of,
     innovation_of,
-    moduli_of,
     seed_run,
 )
 from experiments.common.estimates import Data
@@ -221,7 +220,7 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         std=run.std,
         iterates=run.iterates,
         iterate_std=run.iterate_std,
-        moduli=moduli_of(first),
+        moduli=first.moduli,
         distance_mm=run.distance_mm,
         innovation=innovation_of(first.filtered),
         identifiability=identified_of(first),

@@ -13,28 +13,16 @@ KNOWN = "known"
 """Folder of the estimation from the known geometry, in that of the run."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Row:
-    """A modulus of a leaflet, MPa: as it is, as is said without an estimation, and as estimated.
+    """A modulus as it was estimated from the volume, and as it was from the known geometry, MPa.
 
-    From the volume with its 95 % interval, and from the known geometry; None without an estimate.
+    The truth was revealed. Neither has an estimate where that did not converge.
     """
 
     patient: str
-    modulus: str
-    truth: float
-    generic: float
-    estimate: float | None = None
-    low: float | None = None
-    high: float | None = None
-    known_geometry: float | None = None
-
-    @property
-    def inside(self) -> bool | None:
-        """Whether the interval contains the truth; None without one."""
-        if self.low is None or self.high is None:
-            return None
-        return self.low <= self.truth <= self.high
+    modulus: UnknownRow
+    known_geometry: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from experiments.common.cases.blind import ESTIMATE, read_estimate
-from experiments.common.cases.report import estimation_text, write_case
-from experiments.common.cases.skill import Answered, skill_words
+from experiments.common.cases.report import estimation_text, write_case_run
+from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
 from experiments.studies.imaged_patient.findings import KNOWN, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables
+from mvest.reporting.case.findings import UnknownRow
 
-__all__ = ["answered_of_volumes", "volume_text", "volumes_answer", "write_run", "write_volumes"]
+__all__ = ["moduli_of_volumes", "volume_text", "volumes_answer", "write_run", "write_volumes"]
 
 
 def volume_text(record: Record[Findings]) -> str:
@@ -22,18 +23,14 @@ def volume_text(record: Record[Findings]) -> str:
     return estimation_text(title, findings.unknowns, findings.distances)
 
 
-def answered_of_volumes(records: Iterable[Record[Findings]]) -> list[Answered]:
+def moduli_of_volumes(records: Iterable[Record[Findings]]) -> list[UnknownRow]:
     """The modulus of each leaflet of each patient."""
-    return [
-        Answered(row.modulus, row.truth, row.estimate, row.low, row.high, row.generic)
-        for record in records
-        for row in record.findings.rows
-    ]
+    return [row.modulus for record in records for row in record.findings.rows]
 
 
 def volumes_answer(records: Mapping[str, Record[Findings]]) -> str:
     """How good moduli from volumes are, in one line."""
-    words = skill_words(answered_of_volumes(records.values()))
+    words = skill_words(moduli_of_volumes(records.values()))
     return f"{len(records)} simulated volumes: {words}"
 
 
@@ -43,7 +40,7 @@ def write_run(folder: Path, record: Record[Findings]) -> list[Path]:
         path
         for place in (folder, folder / KNOWN)
         if (place / ESTIMATE).is_file()
-        for path in write_case(place, read_estimate(place).findings.case, record)
+        for path in write_case_run(place, record, read_estimate(place).findings.case)
     ]
 
 

@@ -60,14 +60,9 @@ MAX_DRAWS = 10
 
 @dataclass(frozen=True, slots=True)
 class ImagedPlace:
-    """Where an imaged patient lies.
+    """Where an imaged patient lies: the file that an estimator is given, and what it cannot open.
 
-    Attributes
-    ----------
-    volume : Path
-        The file that an estimator is given.
-    hidden : Path
-        The folder that it cannot open: the truth, and a case of where the valve truly was.
+    Hidden are the truth, and a case of where the valve truly was.
     """
 
     volume: Path
@@ -106,30 +101,28 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
     beside = folder / KNOWN
     beside.mkdir(exist_ok=True)
     known = _estimated(values, beside, place.known, place.truth)
-    if isinstance(volume, str):
-        if isinstance(known, str):
-            raise InputError(known)
-        run, status, reason, detail = known, FAILED, volume, ""
-    else:
-        run, status, reason, detail = volume, volume.status, volume.reason, volume.detail
-    found = None if isinstance(volume, str) else volume.findings
+    lost = volume if isinstance(volume, str) else ""
+    run = known if isinstance(volume, str) else volume
+    if isinstance(run, str):
+        raise InputError(run)
+    left = None if lost else run.findings
     findings = Findings(
         rows=volume_rows(job.settings.patient.name, volume, known, hidden["values"]),
-        unknowns=found.case.unknowns if found else (),
+        unknowns=left.case.unknowns if left else (),
         known_geometry=KnownGeometry(False, known)
         if isinstance(known, str)
         else KnownGeometry(known.status != FAILED, known.reason, known.findings.case.unknowns),
-        image_errors=found.case.image_errors if found else None,
-        distances=found.case.distances if found else (),
-        repeats=(replace(found.repeats[0], seed=values["seed"]),) if found else (),
-        data=found.data if found else None,
+        image_errors=left.case.image_errors if left else None,
+        distances=left.case.distances if left else (),
+        repeats=(replace(left.repeats[0], seed=values["seed"]),) if left else (),
+        data=left.data if left else None,
         anatomies_drawn=hidden["anatomies_drawn"],
     )
     return Outcome(
         findings=findings,
-        status=status,
-        reason=reason,
-        detail=detail,
+        status=FAILED if lost else run.status,
+        reason=lost or run.reason,
+        detail="" if lost else run.detail,
         mesh=run.mesh,
         forward_solves=run.forward_solves,
         parameters=run.parameters,
@@ -154,22 +147,14 @@ def volume_rows(
     patient: str, volume: Estimation, known: Estimation, truth: Mapping[str, float]
 ) -> tuple[Row, ...]:
     """Each modulus as estimated from the volume and from the known geometry."""
-    rows = []
-    for name in sorted(name for name in truth if name.startswith("E_f.")):
-        one, other = _unknown(volume, known, name), _unknown(known, volume, name)
-        rows.append(
-            Row(
-                patient=patient,
-                modulus=name.partition(".")[2],
-                truth=truth[name],
-                generic=one.prior_mean,
-                estimate=one.estimate,
-                low=one.low,
-                high=one.high,
-                known_geometry=other.estimate,
-            )
+    return tuple(
+        Row(
+            patient,
+            replace(_unknown(volume, known, name), truth=truth[name]),
+            _unknown(known, volume, name).estimate,
         )
-    return tuple(rows)
+        for name in sorted(name for name in truth if name.startswith("E_f."))
+    )
 
 
 def _unknown(estimation: Estimation, other: Estimation, name: str) -> UnknownRow:
@@ -179,7 +164,7 @@ def _unknown(estimation: Estimation, other: Estimation, name: str) -> UnknownRow
     (row,) = [row for row in left.findings.case.unknowns if row.name == name]
     if left is estimation and left.status != FAILED:
         return row
-    return replace(row, estimate=None, low=None, high=None)
+    return replace(row, estimate=None, std=None, low=None, high=None)
 
 
 def make_imaged_patient(

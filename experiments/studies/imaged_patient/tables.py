@@ -21,7 +21,7 @@ __all__ = ["volume_table", "volume_words", "write_volume_tables"]
 TRUTH_OF_MODULI: Final = (
     "Moduli estimated from simulated transoesophageal echo (TEE) volumes of simulated valves. The "
     "truth is the modulus with which the valve was simulated; the known geometry is that valve's "
-    "own midsurface in every frame, in place of what the image step found. Errors have a sign: "
+    "own midsurface in every frame, in place of what the image step detected. Errors have a sign: "
     "that from known geometry and the part from the images add up to the whole. Nothing here was "
     "measured in patients."
 )
@@ -37,22 +37,22 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
     """
     if not rows:
         raise InputError("moduli from volumes: no rows, expected at least one")
-    table = pd.DataFrame([asdict(row) for row in rows])
-    numbers = table[["truth", "estimate", "low", "high", "known_geometry"]].astype(float)
+    moduli = pd.DataFrame([asdict(row.modulus) for row in rows])
+    numbers = moduli[["truth", "estimate", "low", "high"]].astype(float)
     truth = numbers["truth"]
     if not (truth > 0).all():
         raise InputError(f"moduli from volumes: truth {truth.min()} MPa, expected > 0")
     error = 100.0 * (numbers["estimate"] - truth) / truth
-    known = 100.0 * (numbers["known_geometry"] - truth) / truth
+    known = 100.0 * (np.array([row.known_geometry for row in rows], dtype=float) - truth) / truth
     return pd.DataFrame(
         {
-            "patient": table["patient"],
-            "modulus": table["modulus"],
+            "patient": [row.patient for row in rows],
+            "modulus": [row.modulus.leaflet for row in rows],
             "truth [MPa]": truth,
             "estimate [MPa]": numbers["estimate"],
             "95 % low [MPa]": numbers["low"],
             "95 % high [MPa]": numbers["high"],
-            "inside": pd.Series([row.inside for row in rows], dtype=object),
+            "inside": pd.Series([row.modulus.inside for row in rows], dtype=object),
             "error [%]": error,
             "error from known geometry [%]": known,
             "part from the images [%]": error - known,
@@ -67,7 +67,7 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     out = [f"The 95 % interval contains the truth for {inside} of {len(known)} moduli."]
     lost = int(table["estimate [MPa]"].isna().sum())
     if lost:
-        out.append(f"For {lost} of {len(table)} moduli no estimate was found.")
+        out.append(f"For {lost} of {len(table)} moduli there is no estimate.")
     sizes = {
         words: table[column].abs().median()
         for words, column in (
@@ -97,9 +97,9 @@ def write_volume_tables(results: Path, rows: Sequence[Row], line: str) -> list[P
     readable = [
         {
             "patient (simulated)": row.patient.replace("_", " "),
-            "modulus": row.modulus,
-            "truth [MPa]": number(row.truth),
-            "estimate, 95 % [MPa]": interval_words(row),
+            "modulus": row.modulus.leaflet,
+            "truth [MPa]": number(row.modulus.truth),
+            "estimate, 95 % [MPa]": interval_words(row.modulus),
             **{
                 str(name): MISSING if pd.isna(value) else f"{value:+.1f}"
                 for name, value in errors.items()

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from experiments.common.cases.findings import Findings
-from experiments.common.cases.skill import Answered, skill_words
+from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
+from mvest.reporting.case.findings import UnknownRow
 
 __all__ = [
-    "answered_of_patients",
     "arrays_of_patient",
     "kept_of_patient",
+    "moduli_of_patients",
     "patients_answer",
     "write_patients",
 ]
@@ -41,19 +42,15 @@ def write_patients(
     return write_patient_tables(folder, kept, arrays)
 
 
-def answered_of_patients(records: Iterable[Record[Findings]]) -> list[Answered]:
+def moduli_of_patients(records: Iterable[Record[Findings]]) -> list[UnknownRow]:
     """The modulus of each leaflet of each patient."""
-    return [
-        Answered.of(row)
-        for record in records
-        for row in record.findings.case.unknowns
-        if row.is_modulus
-    ]
+    unknowns = [row for record in records for row in record.findings.case.unknowns]
+    return [row for row in unknowns if row.is_modulus]
 
 
 def patients_answer(records: Mapping[str, Record[Findings]]) -> str:
     """How good the moduli of the patients are, in one line."""
-    words = skill_words(answered_of_patients(records.values()))
+    words = skill_words(moduli_of_patients(records.values()))
     return f"{len(records)} simulated patients, known geometry: {words}"
 
 

@@ -15,7 +15,6 @@ from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.findings import Findings, Revealed
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.cases.report import case_text, write_case_run
-from experiments.common.estimates import SeedRun
 from experiments.common.expectation import expect_own
 from experiments.common.record import Outcome
 from experiments.common.schema import build
@@ -54,15 +53,7 @@ MAX_DRAWS = 5
 
 @dataclass(frozen=True, slots=True)
 class PatientPlace:
-    """Where a virtual patient lies.
-
-    Attributes
-    ----------
-    case : Path
-        The folder that an estimator is given.
-    hidden : Path
-        The folder that it cannot open.
-    """
+    """Where a virtual patient lies: the folder that an estimator is given, and the sealed one."""
 
     case: Path
     hidden: Path
@@ -142,16 +133,12 @@ def reveal(
 ) -> Outcome[Findings]:
     """The outcome of an estimation, beside what its case had hidden.
 
-    Parameters
-    ----------
-    estimated : Outcome
-        Of the estimation, which is over.
-    place : PatientPlace
-    fields : Path
-        The estimation's arrays; the true positions are added to them.
-    patient : PatientSettings
-    seed : int
-        Of the patient.
+    The true positions are added to its arrays in the file ``fields``.
+
+    Raises
+    ------
+    InputError
+        If the patient hides nothing.
     """
     try:
         hidden = json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
@@ -175,9 +162,10 @@ def reveal(
         distances=_to_truth(case.distances, positions, fields),
     )
     drawn = Revealed(hidden["anatomies_drawn"], patient.paper_moduli, patient.paper_distance_mm)
-    true = tuple(truth[name] for name in estimated.parameters)
     (run,) = estimated.findings.repeats
-    run = replace(_against(run, true), seed=seed)
+    true = (truth[name] for name in estimated.parameters)
+    errors = run.estimate and tuple((a - b) / b for a, b in zip(run.estimate, true, strict=True))
+    run = replace(run, relative_error=errors, seed=seed)
     findings = replace(estimated.findings, case=revealed, repeats=(run,), revealed=drawn)
     return replace(estimated, findings=findings)
 
@@ -188,13 +176,6 @@ def _known(rows: tuple[UnknownRow, ...], truth: Mapping[str, float]) -> tuple[Un
 
 def _alone(alone: ModuliAlone | None, truth: Mapping[str, float]) -> ModuliAlone | None:
     return None if alone is None else replace(alone, parameters=_known(alone.parameters, truth))
-
-
-def _against(run: SeedRun, truth: tuple[float, ...]) -> SeedRun:
-    if run.estimate is None:
-        return run
-    error = tuple((a - b) / b for a, b in zip(run.estimate, truth, strict=True))
-    return replace(run, relative_error=error)
 
 
 def _to_truth(

@@ -179,7 +179,7 @@ def _other_words(other: ModuliAlone | None, k: int) -> str:
         return MISSING
     row = _moduli(other.parameters)[k]
     if row.estimate is None:
-        return "none found"
+        return "none"
     return interval_words(row) + ("" if other.converged else ", not converged")
 
 
@@ -220,7 +220,7 @@ def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[st
         if column.notna().any():
             said.append(f"{words} for {int(column.sum())} of {int(column.notna().sum())}")
     if known.empty:
-        return ["No estimation of these patients found moduli."]
+        return ["No estimation of these patients ended with moduli."]
     relative = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
     out = [
         "; ".join(said) + ".",
@@ -287,28 +287,28 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
         Name of each patient -> its arrays.
     """
     distances = []
-    for found in fields.values():
-        if found.distance_generic is None or found.distance_fitted is None:
+    for valve in fields.values():
+        if valve.distance_generic is None or valve.distance_fitted is None:
             raise InputError("Figure 3 needs the distances of the generic and personalised valves")
-        distances += [found.distance_generic[found.closed], found.distance_fitted[found.closed]]
+        distances += [valve.distance_generic[valve.closed], valve.distance_fitted[valve.closed]]
     top = distance_top(*distances)
     scale = ScalarMappable(Normalize(0.0, top), DISTANCE_MAP)
     columns = len(fields)
     figure = Figure(figsize=(2.6 * columns + 0.6, 5.4), layout="constrained")
     grid = figure.subplots(2, columns, squeeze=False)
-    for column, (name, found) in enumerate(fields.items()):
-        k = found.closed
+    for column, (name, valve) in enumerate(fields.items()):
+        k = valve.closed
         shapes = (
-            ("generic", found.generic, found.distance_generic),
-            ("personalised", found.fitted, found.distance_fitted),
+            ("generic", valve.generic, valve.distance_generic),
+            ("personalised", valve.fitted, valve.distance_fitted),
         )
         drawn = []
         for row, (words, positions, distance) in enumerate(shapes):
             assert positions is not None
             assert distance is not None
             axes = grid[row, column]
-            colours = corner_colours(scale, distance[k], found.triangles)
-            draw_valve(axes, found, positions[k], colours, ATRIUM, k + 1, strength=0.3)
+            colours = corner_colours(scale, distance[k], valve.triangles)
+            draw_valve(axes, valve, positions[k], colours, ATRIUM, k + 1, strength=0.3)
             title = f"{_words(name)}\n" if row == 0 else ""
             axes.set_title(f"{title}{Spread.of(distance[k])} mm", fontsize=9)
             if column == 0:

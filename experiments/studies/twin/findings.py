@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from experiments.common.estimates import (
-    EstimatedModulus,
     Identified,
     Innovation,
     Paper,
@@ -15,6 +14,7 @@ from experiments.common.estimates import (
     Spread,
 )
 from experiments.common.findings import Vector
+from mvest.problem.estimate import Modulus
 from mvest.valve.measure.measurements import ClosureMeasurements
 
 __all__ = ["Findings"]
@@ -31,7 +31,7 @@ class Findings:
         In units of the parameters.
     repeats : tuple of SeedRun
         The estimate from each seed.
-    moduli : tuple of EstimatedModulus
+    moduli : tuple of Modulus
     moduli_error_percent : Spread or None
         Without sign, of all moduli.
     closure : mapping or None
@@ -50,7 +50,7 @@ class Findings:
     truth: Vector
     initial: Vector
     repeats: tuple[SeedRun, ...]
-    moduli: tuple[EstimatedModulus, ...]
+    moduli: tuple[Modulus, ...]
     moduli_error_percent: Spread | None
     closure: Mapping[str, ClosureMeasurements | str] | None
     innovation: Innovation | None

@@ -17,7 +17,6 @@ from experiments.common.estimate_record import (
     identified_of,
     innovation_of,
     moduli_error,
-    moduli_of,
     seed_run,
 )
 from experiments.common.estimates import Paper
@@ -77,7 +76,7 @@ def run_twin(job: Job[Settings]) -> Outcome[Findings]:
         truth=vector(twin.truth_values),
         initial=tuple(values["filter"]["initial"]),
         repeats=repeats,
-        moduli=moduli_of(result),
+        moduli=result.moduli,
         moduli_error_percent=moduli_error(result),
         closure=_measured(twin, result) if values["measure"] else None,
         innovation=innovation_of(result.filtered),

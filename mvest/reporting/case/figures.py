@@ -35,6 +35,7 @@ __all__ = [
     "information_figure",
     "innovation_map_figure",
     "shapes_figure",
+    "views_figure",
 ]
 
 INFORMATION_MAP = "YlOrRd"
@@ -51,18 +52,25 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
         shapes.append(("closed, personalised model", fields.fitted[k], k + 1))
     elif fields.generic is not None:
         shapes.append(("closed, generic model", fields.generic[k], k + 1))
+    return views_figure([(title, fields, points, frame) for title, points, frame in shapes], names)
+
+
+def views_figure(
+    shapes: Sequence[tuple[str, CaseFields, FloatArray, int]], names: Sequence[str]
+) -> Figure:
+    """Shapes of valves from two sides: title, valve, positions ``(n, 3)`` mm and whose tips."""
     figure = Figure(figsize=(3.0 * len(shapes), 5.9), layout="constrained")
     grid = figure.subplots(2, len(shapes), squeeze=False, height_ratios=[1.0, 1.15])
-    colours = leaflet_colours(fields.region)
     for row, view in enumerate(VIEWS):
-        for column, (title, points, frame) in enumerate(shapes):
-            axes = grid[row, column]
+        reach = []
+        for axes, (title, fields, points, frame) in zip(grid[row], shapes, strict=True):
+            colours = leaflet_colours(fields.region)
             draw_valve(axes, fields, points, colours, view, frame, chords=True)
+            reach += [points, fields.tips[frame]] if view is SIDE else [points]
             if row == 0:
                 axes.set_title(title, fontsize=10, pad=10)
                 name_leaflets(axes, fields, names)
-        tips = [fields.tips.reshape(-1, 3)] if view is SIDE else []
-        same_scale(grid[row], [points for _, points, _ in shapes] + tips, view)
+        same_scale(grid[row], reach, view)
         _say_view(grid[row, 0], view.name)
     return figure
 

@@ -56,6 +56,11 @@ class UnknownRow:
     truth: float | None = None
 
     @property
+    def leaflet(self) -> str:
+        """Of a modulus; ``E_f.anterior`` is of the anterior one."""
+        return self.name.partition(".")[2]
+
+    @property
     def is_modulus(self) -> bool:
         """Whether it is a modulus of a leaflet."""
         return self.kind == MODULUS
@@ -191,12 +196,10 @@ class ImageStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseFindings:
-    """All that a run computed of a case.
+    """All that a run computed of a case, and why its estimation ended.
 
     Attributes
     ----------
-    reason : str
-        Why the estimation ended.
     moduli : tuple of ModulusRow
         All that follow from the estimated ones through fixed ratios.
     iterates, iterate_std : (i, p)

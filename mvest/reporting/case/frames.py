@@ -7,15 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from mvest.reporting.case.drawing import (
-    SIDE,
-    VIEWS,
-    draw_valve,
-    leaflet_colours,
-    name_leaflets,
-    same_scale,
-)
 from mvest.reporting.case.fields import CaseFields
+from mvest.reporting.case.figures import views_figure
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
@@ -76,19 +69,4 @@ def frames_figure(frames: Mapping[str, CaseFields], names: Sequence[str]) -> Fig
     names : sequence of str
         Of the leaflets.
     """
-    columns = len(frames)
-    figure = Figure(figsize=(3.0 * columns, 5.9), layout="constrained")
-    grid = figure.subplots(2, columns, squeeze=False, height_ratios=[1.0, 1.15])
-    for row, view in enumerate(VIEWS):
-        shapes = []
-        for column, (title, found) in enumerate(frames.items()):
-            axes = grid[row, column]
-            draw_valve(axes, found, found.rest, leaflet_colours(found.region), view, 0, chords=True)
-            shapes.append(found.rest)
-            if view is SIDE:
-                shapes.append(found.tips[0])
-            if row == 0:
-                axes.set_title(title, fontsize=10)
-                name_leaflets(axes, found, names)
-        same_scale(list(grid[row]), shapes, view)
-    return figure
+    return views_figure([(title, one, one.rest, 0) for title, one in frames.items()], names)

@@ -27,7 +27,6 @@ from mvest.reporting.case.figures import (
     shapes_figure,
 )
 from mvest.reporting.case.findings import CaseFindings
-from mvest.reporting.case.image_step import frame_rows, image_error_words
 from mvest.reporting.case.information import Information, information, where_words
 from mvest.reporting.case.plots import (
     distances_figure,
@@ -85,19 +84,22 @@ def write_case_report(
     names = words.leaflet_names(case, int(shapes.region.max()) + 1)
     informations = information(shapes, case.unknowns, case.observation_std_mm)
     note = words.provenance_note(case, line)
+    marked = " Simulated." if case.about.simulated else ""
     written: list[Path] = []
     pictures: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
     for name, make, caption in _figures(case, shapes, names, informations):
         try:
-            figure, text = make(), caption()
+            figure = make()
         except InputError as error:
             missing[name] = f"Not shown: {error}."
             continue
         _print_dollars(figure)
         paths = save_figure_with(folder / name, figure, note)
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
-        pictures[name] = embedded(paths[0], text) | {"percent": round(100 * share)}
+        pictures[name] = embedded(paths[0], (caption or figure3_caption(shapes)) + marked) | {
+            "percent": round(100 * share)
+        }
         written += paths
     for name, shown in (case.image_step.pictures if case.image_step else {}).items():
         # Drawn with the volume at hand, and kept beside the page.
@@ -116,7 +118,9 @@ def write_case_report(
         missing=missing,
         view=case_view(shapes, names),
         files=[path.name for path in written],
-        **_content(case, shapes, names, informations),
+        case=case,
+        words=words,
+        where=_where(shapes, names, informations),
         provenance=words.setting_rows(
             {
                 **(provenance or {}),
@@ -132,83 +136,54 @@ def _figures(
     shapes: CaseFields,
     names: Sequence[str],
     informations: Sequence[Information],
-) -> list[tuple[str, Callable[[], Figure], Callable[[], str]]]:
-    """Name, drawing and caption of each picture; either raises where something is missing."""
-    marked = " Simulated." if case.about.simulated else ""
-    texts = {
-        "shapes": "The valve open and closed, from the atrium and from the side. Colours tell the "
-        "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary tips. "
-        + MIDSURFACES,
-        "estimates": "What was believed before the images (grey) and what they add (blue).",
-        "identifiability": "Fisher information on the logarithm of each modulus that each observed "
-        "point of the closed valve adds, seen from the atrium. Dark: how the valve closes there "
-        "depends on the modulus. Both pictures of a column have one colour scale, which is finer "
-        "for small values. Grey: not observed.",
-        "iterations": "How the filter got there.",
-        "innovation": "The innovation (observed minus predicted before the update), each over its "
-        "predicted standard deviation. Left: histogram. Right: its quantiles; points on the line "
-        "mean that it is distributed as the filter assumes. ",
-        "innovation_map": "Where on the closed valve the innovation is large.",
-        "distances": "Distance between model and observed valve in each frame.",
-        "narrow": "Standard deviation of the estimate if one more thing were known exactly.",
-    }
-
-    def said(name: str) -> Callable[[], str]:
-        return lambda: texts[name].strip() + marked
-
+) -> list[tuple[str, Callable[[], Figure], str]]:
+    """Name, drawing and caption of each picture; a drawing raises where something is missing."""
     return [
-        ("shapes", lambda: shapes_figure(shapes, names), said("shapes")),
-        ("figure3", lambda: case_figure(shapes, names), lambda: figure3_caption(shapes) + marked),
-        ("estimates", lambda: estimates_figure(case), said("estimates")),
+        (
+            "shapes",
+            lambda: shapes_figure(shapes, names),
+            "The valve open and closed, from the atrium and from the side. Colours tell the "
+            "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary "
+            "tips. " + MIDSURFACES,
+        ),
+        ("figure3", lambda: case_figure(shapes, names), ""),
+        (
+            "estimates",
+            lambda: estimates_figure(case),
+            "What was believed before the images (grey) and what they add (blue).",
+        ),
         (
             "identifiability",
             lambda: information_figure(shapes, informations),
-            said("identifiability"),
+            "Fisher information on the logarithm of each modulus that each observed point of the "
+            "closed valve adds, seen from the atrium. Dark: how the valve closes there depends on "
+            "the modulus. Both pictures of a column have one colour scale, which is finer for "
+            "small values. Grey: not observed.",
         ),
-        ("iterations", lambda: iterations_figure(case), said("iterations")),
-        ("innovation", lambda: innovation_figure(shapes), said("innovation")),
+        ("iterations", lambda: iterations_figure(case), "How the filter got there."),
+        (
+            "innovation",
+            lambda: innovation_figure(shapes),
+            "The innovation (observed minus predicted before the update), each over its predicted "
+            "standard deviation. Left: histogram. Right: its quantiles; points on the line mean "
+            "that it is distributed as the filter assumes.",
+        ),
         (
             "innovation_map",
             lambda: innovation_map_figure(shapes, names),
-            said("innovation_map"),
+            "Where on the closed valve the innovation is large.",
         ),
-        ("distances", lambda: distances_figure(case.distances), said("distances")),
-        ("narrow", lambda: narrow_figure(case.narrow), said("narrow")),
+        (
+            "distances",
+            lambda: distances_figure(case.distances),
+            "Distance between model and observed valve in each frame.",
+        ),
+        (
+            "narrow",
+            lambda: narrow_figure(case.narrow),
+            "Standard deviation of the estimate if one more thing were known exactly.",
+        ),
     ]
-
-
-def _content(
-    case: CaseFindings,
-    shapes: CaseFields,
-    names: Sequence[str],
-    informations: Sequence[Information],
-) -> dict[str, Any]:
-    step = case.image_step
-    return {
-        "title": case.title,
-        "badges": words.badges(case),
-        "answer": words.answer(case),
-        "status": case.status,
-        "reason": case.reason,
-        "gate": words.confirmation(case),
-        "case": case.about,
-        "moduli": words.moduli_rows(case),
-        "parameters": words.parameter_rows(case),
-        "has_without": case.without_nuisances is not None,
-        "has_truth": case.about.simulated and any(m.truth is not None for m in case.moduli),
-        "where": _where(shapes, names, informations),
-        "identifiability": words.identifiability_words(case),
-        "innovation": words.innovation_words(case.innovation),
-        "whiteness": words.whiteness_rows(case.whiteness),
-        "distances": words.distance_rows(case),
-        "held_out": words.distance_words(case),
-        "measurements": words.measurement_rows(case),
-        "image_step": step,
-        "image_frames": frame_rows(step.frames) if step else [],
-        "image_errors": image_error_words(case),
-        "narrow": words.narrow_words(case.narrow) if case.narrow else "",
-        "settings": words.setting_rows(case.settings),
-    }
 
 
 def _where(

@@ -22,24 +22,10 @@ from mvest.reporting.expectation import alike_words
 from mvest.reporting.findings import Innovation, Spread
 from mvest.reporting.markup import MISSING, number
 
-__all__ = [
-    "answer",
-    "badges",
-    "confirmation",
-    "distance_rows",
-    "distance_words",
-    "identifiability_words",
-    "innovation_words",
-    "leaflet_names",
-    "measurement_rows",
-    "moduli_rows",
-    "narrow_words",
-    "parameter_rows",
-    "percent",
-    "provenance_note",
-    "setting_rows",
-    "whiteness_rows",
-]
+__all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "frame_rows",
+           "identifiability_words", "image_error_words", "innovation_words", "leaflet_names",
+           "measurement_rows", "moduli_rows", "narrow_words", "parameter_rows", "percent",
+           "provenance_note", "setting_rows", "whiteness_rows"]  # fmt: skip
 
 Rows = list[dict[str, str]]
 
@@ -53,6 +39,16 @@ HASH_DIGITS = 12
 NO_BREAK = "\N{NO-BREAK SPACE}"
 WHICH = ("observed", "generic", "personalised")
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
+
+OF_FRAMES = {
+    "frame": ("frame", 0),
+    "time_s": ("time [s]", 3),
+    "confidence": ("confidence", 2),
+    "annulus_area_mm2": ("annulus area [mm²]", 0),
+    "orifice_mm2": ("orifice [mm²]", 0),
+    "coaptation_area_mm2": ("coaptation [mm²]", 0),
+}
+"""Measure -> its column and digits."""
 
 
 def leaflet_names(case: CaseFindings, regions: int) -> list[str]:
@@ -307,6 +303,37 @@ def _measurement_label(name: str) -> str:
         return name.replace("_", " ")
     text = re.sub(r"\bap\b", "AP", words.replace("_", " "))
     return f"{text} [{UNITS[unit]}]" if UNITS[unit] else text
+
+
+def frame_rows(frames: Sequence[Mapping[str, Any]]) -> Rows:
+    """Table of the frames of a sequence; a dash for what could not be measured."""
+    return [
+        {
+            column: MISSING if row.get(name) is None else f"{row[name]:.{digits}f}"
+            for name, (column, digits) in OF_FRAMES.items()
+            if name in row
+        }
+        for row in frames
+    ]
+
+
+def image_error_words(case: CaseFindings) -> list[str]:
+    """What errors of the frames do to the intervals; empty where nothing is known of them."""
+    errors = case.image_errors
+    if errors is None:
+        return []
+    out = [
+        f"The valve was closed anew with {errors.samples} samples of the errors of its images: "
+        "of the open shape, annulus, tips and chordae as well as of the closed frame."
+    ]
+    if errors.failures:
+        out.append(
+            f"{len(errors.failures)} of them did not close and were left out: {errors.failures[0]}."
+        )
+    labels = {row.name: row.label for row in case.unknowns}
+    for name, share in (errors.share_of_variance or {}).items():
+        out.append(f"Of the variance of {labels.get(name, name)} they make {percent(share)}.")
+    return out
 
 
 def setting_rows(settings: Mapping[str, Any]) -> Rows:

@@ -1,7 +1,7 @@
 """Virtual patients in volumes: what is put together of both estimations, and what is kept."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import pandas as pd
@@ -19,6 +19,7 @@ from experiments.studies.imaged_patient.tables import (
     write_volume_tables,
 )
 from mvest.errors import InputError
+from mvest.reporting.case.findings import UnknownRow
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import an_outcome
 
@@ -27,20 +28,20 @@ TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
 
 def test_rows_put_volume_and_known_geometry_side_by_side():
     rows = volume_rows("one", an_outcome(5.0, 2.5), an_outcome(5.8, 2.1), TRUTH)
-    assert [(row.modulus, row.truth) for row in rows] == [
+    assert [(row.modulus.leaflet, row.modulus.truth) for row in rows] == [
         ("anterior", 6.0),
         ("posterior", 2.0),
     ]
-    assert rows[0] == Row(
-        patient="one", modulus="anterior", truth=6.0, generic=1.0, estimate=5.0, low=4.0, high=6.0,
-        known_geometry=5.8,
-    )  # fmt: skip
+    first = rows[0]
+    assert (first.patient, first.known_geometry) == ("one", 5.8)
+    assert (first.modulus.estimate, first.modulus.low, first.modulus.high) == (5.0, 4.0, 6.0)
+    assert first.modulus.inside
 
 
 @pytest.mark.parametrize("found", ["lost", an_outcome(5.0, 2.5, "failed")])
 def test_a_volume_without_an_estimate_keeps_its_rows(found):
     rows = volume_rows("one", found, an_outcome(5.8, 2.1), TRUTH)
-    assert [row.estimate for row in rows] == [None, None]
+    assert [row.modulus.estimate for row in rows] == [None, None]
     assert [row.known_geometry for row in rows] == [5.8, 2.1]
 
 
@@ -93,26 +94,52 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
 
     assert outcome.status == "converged"
     findings = outcome.findings
-    assert [row.estimate for row in findings.rows] == [5.0, 2.5]
+    assert [row.modulus.estimate for row in findings.rows] == [5.0, 2.5]
     assert [row.known_geometry for row in findings.rows] == [None, None]
     assert "MemoryError" in findings.known_geometry.reason
     assert findings.repeats[0].estimate == (5.0, 2.5)
     assert findings.repeats[0].seed == 1
 
 
+def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(monkeypatch, tmp_path):
+    place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
+    place.truth.mkdir(parents=True)
+    hidden = {"stated": {}, "values": TRUTH, "anatomies_drawn": 2}
+    (place.truth / "hidden.json").write_text(json.dumps(hidden))
+
+    def blindly(values, folder, case, sealed):
+        if case == place.volume:
+            raise InputError("the estimation left no result: MemoryError")
+        outcome = an_outcome(5.8, 2.1)
+        (folder / "estimate.json").write_text(json.dumps(asdict(outcome)))
+        return outcome
+
+    monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
+    monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
+    settings = SimpleNamespace(patient=PatientSettings(name="one", description=""), echo=None)
+    outcome = imaged_patient.run_imaged_patient(Job({"imaged": {}, "seed": 1}, settings, tmp_path))
+    assert (outcome.status, outcome.findings.repeats) == ("failed", ())
+    assert "MemoryError" in outcome.reason
+    assert [row.modulus.estimate for row in outcome.findings.rows] == [None, None]
+    assert [row.known_geometry for row in outcome.findings.rows] == [5.8, 2.1]
+    record = made_up(outcome.findings, row="one", reason=outcome.reason)
+    assert STUDY.words(record) == "one: the estimation left no result: MemoryError"
+    # Only what was left is written down, in the folder of its estimation.
+    assert STUDY.write_run(tmp_path, record) == [tmp_path / "known" / "unknowns.csv"]
+
+
+def modulus(leaflet, truth, estimate=None, low=None, high=None):
+    return UnknownRow(
+        name=f"E_f.{leaflet}", label="", unit="MPa", kind="modulus", treatment="estimated",
+        prior_mean=1.0, prior_std=1.0, estimate=estimate, low=low, high=high, truth=truth,
+    )  # fmt: skip
+
+
 MODULI = [
-    Row(
-        patient="normal_small", modulus="E_f.anterior", truth=5.0, generic=6.23, estimate=6.0,
-        low=4.5, high=7.5, known_geometry=5.2,
-    ),
-    Row(
-        patient="normal_small", modulus="E_f.posterior", truth=2.0, generic=2.09, estimate=1.5,
-        low=1.2, high=1.8, known_geometry=2.1,
-    ),
-    Row(
-        patient="prolapse", modulus="E_f.anterior", truth=4.0, generic=6.23, known_geometry=4.0
-    ),
-]  # fmt: skip
+    Row("normal_small", modulus("anterior", 5.0, 6.0, 4.5, 7.5), 5.2),
+    Row("normal_small", modulus("posterior", 2.0, 1.5, 1.2, 1.8), 2.1),
+    Row("prolapse", modulus("anterior", 4.0), 4.0),
+]
 
 
 def test_errors_of_moduli_add_up():
@@ -125,7 +152,7 @@ def test_errors_of_moduli_add_up():
     assert pd.isna(table["error [%]"][2])
     words = volume_words(table)
     assert words[0] == "The 95 % interval contains the truth for 1 of 2 moduli."
-    assert words[1] == "For 1 of 3 moduli no estimate was found."
+    assert words[1] == "For 1 of 3 moduli there is no estimate."
     assert "from the volume 22.5 %" in words[2]
     assert "from the known geometry 4.0 %" in words[2]
 
@@ -147,7 +174,7 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     ("rows", "message"),
     [
         ([], "no rows"),
-        ([replace(MODULI[0], truth=0.0)], "truth 0.0 MPa"),
+        ([Row("a", modulus("anterior", 0.0, 6.0), 5.2)], "truth 0.0 MPa"),
     ],
 )
 def test_moduli_that_are_none_are_refused(rows, message):

@@ -144,7 +144,7 @@ def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
         assert "contains the truth for 2 of 2 moduli" in text
         assert "prolapse" not in (tmp_path / "table3.md").read_text()
     else:
-        assert "No estimation of these patients found moduli." in text
+        assert "No estimation of these patients ended with moduli." in text
 
 
 def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):

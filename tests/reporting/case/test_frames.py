@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mvest.reporting.case import frames as case_frames
+from mvest.reporting.case import figures as case_figures
 from mvest.reporting.case.frames import frame_fields, frames_figure
 from mvest.valve.anatomy.template import Template
 
@@ -67,7 +67,9 @@ def test_every_frame_is_drawn_from_two_sides_on_one_scale(n):
 
 def test_every_frame_has_its_own_tips_in_view(monkeypatch):
     seen = []
-    monkeypatch.setattr(case_frames, "same_scale", lambda panels, shapes, view: seen.append(shapes))
+    monkeypatch.setattr(
+        case_figures, "same_scale", lambda panels, shapes, view: seen.append(shapes)
+    )
     frames_figure({"one": fields(), "two": fields((5.0, 0.0, 0.0))}, ("anterior", "posterior"))
     from_above, from_the_side = seen
     assert len(from_above) == 2
