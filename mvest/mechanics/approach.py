@@ -22,6 +22,8 @@ __all__ = ["approach"]
 
 ITERATIONS = 15
 """Steps in which the neighbourhood of an equilibrium is reached or given up."""
+ASTRAY = 4
+"""Steps not shorter than the ones before them after which nothing comes of it."""
 FARTHEST, NEAR = 0.3, 1e-4
 """Moves over the body's size: how far one step may go, and what is left to Newton's method."""
 
@@ -59,6 +61,7 @@ def approach(
     size = float(np.ptp(solid.mesh.nodes, axis=0).max())
     enhanced, stress = solid.enhanced_parameters, None
     residuals: list[float] = []
+    last, astray = np.inf, 0
     for _ in range(ITERATIONS):
         try:
             current = evaluate(x, stress)
@@ -71,7 +74,12 @@ def approach(
         move = float(np.abs(d).max())
         if move <= NEAR * size:
             return x + d, residuals
-        d *= min(1.0, FARTHEST * size / move)
+        move, longest = min(move, FARTHEST * size), move
+        astray += move >= last
+        if astray == ASTRAY:
+            break
+        last = move
+        d *= move / longest
         stress = solid.extrapolated_stress(current.solid, d)
         x = x + d
         if not float(np.abs(x - start).max()) <= far:
