@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
+from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import REFERENCE, GateCase
 from mvest.errors import ConfigurationError, InputError
@@ -201,6 +202,7 @@ def build_twin(config: Values) -> Twin:
     )
     if config["guided"]:
         model.guide = guide_of(model, template, config["mesh"])
+        model.anchors = Anchors(Path(config["paths"]["outputs"]) / "anchors")
 
     element = config["mechanics"]["element"]
     changed = truth_mesh(config["mesh"], truth)

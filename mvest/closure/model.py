@@ -13,11 +13,12 @@ from itertools import accumulate
 
 import numpy as np
 
+from mvest.closure.anchors import NOT_FOUND, Anchors, Kept, content_digest
+from mvest.closure.coordinates import Coordinates
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Damping, Simulation, Step
@@ -116,8 +117,11 @@ class ClosureModel:
         Progress: called with (time, Newton iterations).
     ties : TiedPoints, optional
         Pairs of points that are held together while the valve closes, as by a clip.
+    anchors : Anchors, optional
+        Where closed states of this and other models are kept. With ``continuation``, a closure that
+        would start from the open valve is continued from the one that belongs to its parameters.
     closures : int
-        How many closed states have been looked for, those between others included.
+        How many closed states have been looked for, those between others included, anchors not.
     """
 
     valve: Valve
@@ -133,6 +137,7 @@ class ClosureModel:
     largest_change: float = np.inf
     on_step: Callable[[float, int], None] | None = None
     ties: TiedPoints | None = None
+    anchors: Anchors | None = None
 
     closures: int = field(default=0, init=False)
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
@@ -179,61 +184,75 @@ class ClosureModel:
 
     def _near(self, m: FloatArray) -> bool:
         """Whether the last closed state is one to continue from to ``m``."""
-        if not self.continuation or self._closed is None:
-            return False
-        if np.isinf(self.reach):
-            return True
-        change = self._change(self._closed.at, m)
+        return self._closed is not None and self._within_reach(self._closed.at, m)
+
+    def _within_reach(self, start: FloatArray, m: FloatArray) -> bool:
+        if not self.continuation or np.isinf(self.reach):
+            return self.continuation
+        change = self._coordinates.change(start, m)
         return change is not None and bool(np.max(np.abs(change)) <= self.reach)
 
     @cached_property
-    def _units(self) -> FloatArray:
-        """What a coefficient of a field ``(p,)`` changes log E_f by; 0 for positive parameters."""
-        out = np.zeros(len(self.names))
-        for k, name in enumerate(self.names):
-            if not is_positive(name):
-                out[k] = self.settings.fields[Parameter(name, 0.0).region].std_log
-        return out
-
-    def _change(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
-        """Change ``(p,)`` of the parameters' logarithms; None where there is no logarithm."""
-        positive = self._units == 0
-        if np.any(start[positive] <= 0) or np.any(end[positive] <= 0):
-            return None
-        change = self._units * (end - start)
-        change[positive] = np.log(end[positive] / start[positive])
-        return change
+    def _coordinates(self) -> Coordinates:
+        return Coordinates.of(self.names, self.settings)
 
     def _expected_move(self, m: FloatArray) -> FloatArray | None:
-        """By how much ``(n, 3)`` mm the last closed state is expected to move; None if unknown.
-
-        Linear in the logarithms, by which the state changes more evenly than by the parameters.
-        """
-        closed = self._closed
+        """By how much ``(n, 3)`` mm the last closed state is expected to move; None if unknown."""
+        closed, coordinates = self._closed, self._coordinates
         if closed is None or closed.slopes is None:
             return None
-        change = self._change(closed.at, m)
+        change = coordinates.change(closed.at, m)
         if change is None:
             return None
-        # dx/dlog m = m dx/dm; a field's coefficient changes by its change over its unit.
-        positive = self._units == 0
-        by_change = np.where(positive, closed.at, 1 / np.where(positive, 1.0, self._units))
-        return np.tensordot(by_change * change, closed.slopes, 1)
+        return np.tensordot(coordinates.rates(closed.at) * change, closed.slopes, 1)
 
     def _way_to(self, m: FloatArray) -> list[FloatArray]:
         """Parameters between the last closed state and ``m``, where that is continued from."""
         if np.isinf(self.largest_change) or self._closed is None or not self._near(m):
             return []
-        start = self._closed.at
-        change = self._change(start, m)
-        if change is None:
+        start, end = self._coordinates(self._closed.at), self._coordinates(m)
+        if start is None or end is None:
             return []
-        n = int(np.ceil(float(np.abs(change).max()) / self.largest_change))
-        positive = self._units == 0
-        return [
-            np.where(positive, start * np.exp(change * k / n), start + (m - start) * k / n)
-            for k in range(1, n)
-        ]
+        n = int(np.ceil(float(np.abs(end - start).max()) / self.largest_change))
+        return [self._coordinates.parameters(start + (end - start) * k / n) for k in range(1, n)]
+
+    def _begin_at_anchor(self, m: FloatArray) -> bool:
+        """Go to the kept closed state that belongs to ``m``, if there is none to continue from."""
+        anchors = self.anchors
+        if anchors is None or not self.settings.protocol.equilibrium or self._near(m):
+            return False
+        self.tuned(m)  # refuses what is inadmissible before anything is closed
+        at = self._coordinates(m)
+        if at is None:
+            return False
+        place = np.round(at / anchors.spacing)
+        anchor = self._coordinates.parameters(place * anchors.spacing)
+        if not self._within_reach(anchor, m):
+            return False
+        kept = anchors.get_or_make(self._digest(), place, lambda: self._anchor(anchor))
+        found = len(kept.positions) > 0
+        # In any case as if it had been read: what follows does not depend on who has made it.
+        self.restart(ClosedState(anchor, kept.positions, slopes=kept.slopes) if found else None)
+        return found
+
+    def _anchor(self, at: FloatArray) -> Kept:
+        """The closed state at ``at (p,)``, from the open valve and with nothing remembered."""
+        self.restart(None)
+        try:
+            simulation = self._close(at).simulation
+        except MaterialError:
+            return NOT_FOUND
+        if not simulation.converged:
+            return NOT_FOUND
+        return Kept(simulation.frames[-1], simulation.sensitivities[-1])
+
+    def _digest(self) -> str:
+        """Of all that decides a closed state besides the parameters."""
+        guide = "" if self.guide is None else self.guide._digest()
+        return content_digest(
+            self.valve, self.contact_valve, self.mesh, self.settings, self.names, self.fixed,
+            self.ties, self.repeat, guide,
+        )  # fmt: skip
 
     def close(
         self, m: FloatArray, *, sensitivities: bool = True, every_frame: bool = False
@@ -254,12 +273,31 @@ class ClosureModel:
         MaterialError
             If a modulus is inadmissible.
         """
-        if not every_frame:
-            for between in self._way_to(m):
-                result = self.close(between)
-                if not result.simulation.converged:
-                    return result
+        if every_frame:
+            return self._counted(m, sensitivities, every_frame=True)
+        anchored = self._begin_at_anchor(m)
+        for between in self._way_to(m):
+            result = self._counted(between)
+            if not result.simulation.converged:
+                break
+        else:
+            result = self._counted(m, sensitivities)
+        if anchored and not result.simulation.converged:
+            # As if nothing had been kept.
+            self.restart(None)
+            result = self._counted(m, sensitivities)
+        return result
+
+    def _counted(
+        self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False
+    ) -> ClosureResult:
         self.closures += 1
+        return self._close(m, sensitivities, every_frame=every_frame)
+
+    def _close(
+        self, m: FloatArray, sensitivities: bool = True, *, every_frame: bool = False
+    ) -> ClosureResult:
+        """One closure, from the last closed state or from the open valve."""
         system, parameters = self.tuned(m)
         steps = self.settings.protocol.steps()
         loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)

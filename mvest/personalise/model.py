@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mvest.cases.case import Role, ValveCase
+from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.valve_system import check_parameters
@@ -31,7 +32,7 @@ def build_model(
     case : ValveCase
     settings : PersonaliseSettings
     store : Path, optional
-        Where an unstructured mesh is kept.
+        Where an unstructured mesh and closed states are kept.
 
     Raises
     ------
@@ -42,11 +43,12 @@ def build_model(
     """
     _check_unknowns(case, settings)
     band = _band(case)
-    if band is None:
-        return build_coarse(case, settings, store)
-    solid = _solid(case.valve, band, settings.mesh, store)
     coarse = build_coarse(case, settings, store)
-    return replace(coarse, mesh=solid, guide=coarse)
+    anchors = None if store is None else Anchors(store)
+    if band is None:
+        return replace(coarse, anchors=anchors)
+    solid = _solid(case.valve, band, settings.mesh, store)
+    return replace(coarse, mesh=solid, guide=coarse, anchors=anchors)
 
 
 def build_coarse(

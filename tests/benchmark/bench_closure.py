@@ -1,8 +1,11 @@
 """Kernels at the closed state, time steps and whole closures, in three sizes and two elements."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from mvest.closure.anchors import Anchors
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Step
@@ -115,6 +118,16 @@ def test_continued_closure(case, measure):
     model.continuation, start = True, model.closed
     about = about | {"rounds": 3, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}
     result = measure(lambda: model.close(FARTHER), setup=lambda: model.restart(start), **about)
+    assert result.simulation.converged
+    assert len(result.simulation.times) == 2
+
+
+def test_anchored_closure(case, measure, tmp_path):
+    c, about = case
+    model = replace(c.model.fresh(), continuation=True, anchors=Anchors(tmp_path))
+    assert model.close(FARTHER).simulation.converged  # builds the mechanics and makes the anchor
+    about = about | {"rounds": 3, "warmup": 0, "parameters": 2, "peak_mb": c.peak_mb}
+    result = measure(lambda: model.close(FARTHER), setup=lambda: model.restart(None), **about)
     assert result.simulation.converged
     assert len(result.simulation.times) == 2
 

@@ -1,0 +1,152 @@
+"""Closed states that are kept: where closures of one valve begin that have none nearer.
+
+Most of a closure from the open valve is the way to its first contact, and it is much the same for
+all moduli. So the closed state, with its derivatives, is kept at the points of a lattice of the
+parameters' logarithms, made once by whoever comes first, from the open valve. Which point a closure
+begins at follows from its own parameters and from nothing else: what it gives does not depend on
+what was closed before, by itself or by others, nor on whether the state was there or had to be
+made. The closed state is the one that would have been found from the open valve, as far as there is
+one only, which the gate (:mod:`mvest.closure.robustness`) examines.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.kept import Entry
+from mvest.typing import FloatArray
+
+__all__ = ["NOT_FOUND", "Anchors", "Kept", "content_digest"]
+
+CODE = ("closure/**/*.py", "elements.py", "mechanics/**/*.py", "valve/**/*.py")
+"""What of the library decides a closed state."""
+DIGITS = 32
+"""Of a name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """A closed state; without positions one that was not found.
+
+    Attributes
+    ----------
+    positions : (n, 3) mm
+        Of the mesh's nodes.
+    slopes : (p, n, 3) mm
+        Derivatives by the parameters.
+    """
+
+    positions: FloatArray
+    slopes: FloatArray
+
+
+NOT_FOUND = Kept(np.zeros((0, 3)), np.zeros((0, 0, 3)))
+"""What is kept of a valve that does not close."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """A folder of closed states, and the lattice of their parameters.
+
+    Attributes
+    ----------
+    folder : Path
+        Made when something is kept. Several processes may share it.
+    spacing : float
+        Of the lattice, in the logarithm of each parameter (of a field's coefficient: times its
+        standard deviation of log E_f).
+    """
+
+    folder: Path
+    spacing: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not self.spacing > 0:
+            raise InputError(f"spacing of the anchors = {self.spacing}, expected > 0")
+
+    def get_or_make(self, key: str, place: FloatArray, make: Callable[[], Kept]) -> Kept:
+        """The state that is kept at a point of the lattice, or is made and kept now.
+
+        Parameters
+        ----------
+        key : str
+            Of all that decides the state but its parameters, by :func:`content_digest`.
+        place : (p,)
+            Whole numbers, the point over the spacing.
+        make : callable
+            Of several processes that need the state, one makes it and the others wait.
+        """
+        at = ",".join(f"{k:.0f}" for k in place)
+        about = f"{key} {self.spacing!r} {at} {_code()}"
+        name = hashlib.sha256(about.encode()).hexdigest()[:DIGITS]
+        return Entry(self.folder / f"closed-{name}.npz", _read).get_or_make(make, _write)
+
+
+def content_digest(*values: Any) -> str:
+    """SHA-256 of what values say: arrays, dataclasses, mappings, sequences, numbers and texts.
+
+    Raises
+    ------
+    InputError
+        If something is none of these.
+    """
+    digest = hashlib.sha256()
+    for value in values:
+        _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest: hashlib._Hash, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(f"array {value.dtype.str} {value.shape} ".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__}(".encode())
+        for each in fields(value):
+            digest.update(f"{each.name}=".encode())
+            _feed(digest, getattr(value, each.name))
+        digest.update(b")")
+    elif isinstance(value, Mapping):
+        _feed(digest, sorted(value.items()))
+    elif isinstance(value, tuple | list):
+        digest.update(f"sequence {len(value)} ".encode())
+        for item in value:
+            _feed(digest, item)
+    elif value is None or isinstance(value, str | bool | int | float | np.generic):
+        plain = value.item() if isinstance(value, np.generic) else value
+        digest.update(f"{plain!r};".encode())
+    else:
+        raise InputError(f"no digest of a {type(value).__name__}")
+
+
+@cache
+def _code() -> str:
+    """Digest of the modules that decide a closed state."""
+    root = Path(__file__).parents[1]
+    files = [file for part in CODE for file in sorted(root.glob(part))]
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.relative_to(root).as_posix()} ".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _write(path: Path, kept: Kept) -> None:
+    digest = content_digest(kept)
+    np.savez(path, positions=kept.positions, slopes=kept.slopes, sha256=digest)
+
+
+def _read(path: Path) -> Kept:
+    # Opened here: NumPy leaves what it cannot read to the garbage collector.
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+        kept = Kept(stored["positions"], stored["slopes"])
+        if content_digest(kept) != str(stored["sha256"]):
+            raise ValueError(f"{path}: the contents are not those that were written")
+    return kept
