@@ -276,6 +276,7 @@ STUDY = Study(
                 "imaging_std": "Standard deviation that the image step states of each point. "
                 "Simulated.",
             },
+            "Valves detected in simulated volumes",
             answer=answer_of_main(imaging_answer),
         ),
     ),

@@ -16,6 +16,7 @@ from mvest.reporting.case.findings import UnknownRow
 
 __all__ = [
     "arrays_of_patient",
+    "distances_answer",
     "kept_of_patient",
     "moduli_of_patients",
     "patients_answer",
@@ -52,6 +53,31 @@ def patients_answer(records: Mapping[str, Record[Findings]]) -> str:
     """How good the moduli of the patients are, in one line."""
     words = skill_words(moduli_of_patients(records.values()))
     return f"{len(records)} simulated patients, known geometry: {words}"
+
+
+def distances_answer(records: Mapping[str, Record[Findings]]) -> str:
+    """How near fitted valves come to observed ones, seen and held out, beside the generic."""
+    words = []
+    for seen, label in ((True, "shown to the filter"), (False, "held out")):
+        frames = [
+            frame
+            for record in records.values()
+            for frame in record.findings.case.distances
+            if frame.seen is seen
+        ]
+        if frames:
+            own, generic = (
+                float(np.mean([spread.mean for spread in spreads]))
+                for spreads in (
+                    [frame.personalised for frame in frames],
+                    [frame.generic for frame in frames],
+                )
+            )
+            words.append(f"{own:.2f} mm in frames {label} (generic {generic:.2f} mm)")
+    return (
+        f"{len(records)} simulated patients: personalised valves close {', '.join(words)} from "
+        "the observed ones, on average."
+    )
 
 
 def kept_of_patient(record: Record[Findings]) -> Record[Findings]:

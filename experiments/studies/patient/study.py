@@ -28,6 +28,7 @@ from experiments.common.virtual_patients import (
 )
 from experiments.studies.patient.report import (
     arrays_of_patient,
+    distances_answer,
     kept_of_patient,
     patients_answer,
     write_patients,
@@ -223,7 +224,13 @@ STUDY = Study(
     keeps_failures=True,
     checks=lambda: (expect_patient,),
     sections=(
-        Section("table2", title="Table 2: moduli of five virtual patients (simulated)"),
+        Section(
+            "table2",
+            title="Table 2: moduli of five virtual patients (simulated)",
+            table=PATIENTS,
+            answer=patients_answer,
+            headline=True,
+        ),
         Section(
             "table3",
             {
@@ -235,7 +242,7 @@ STUDY = Study(
             },
             "Table 3: distances of their closed valves (simulated)",
             table=PATIENTS,
-            answer=patients_answer,
+            answer=distances_answer,
             headline=True,
             opens="figure3",
         ),
