@@ -277,7 +277,7 @@ def stamp(
 
 def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
     """The provenance of what is written by this process."""
-    source = provenance()
+    source = _source()
     return Provenance(
         **{**source, "git": GitState(**source["git"])},
         config_hash=config_hash,
@@ -285,6 +285,12 @@ def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
         seed=seed,
         finished=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     )
+
+
+@cache
+def _source() -> dict[str, Any]:
+    """Asked for once: a process computes by what it has imported, whatever is checked out since."""
+    return provenance()
 
 
 def write_record(path: Path, record: Record[Any]) -> None:

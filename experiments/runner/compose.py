@@ -159,22 +159,24 @@ class _Composer:
 
     def __init__(self, config: DictConfig, loader: ConfigLoader) -> None:
         self._config, self._loader = config, loader
-        self._parser = OverridesParser.create(config_loader=loader)
+        parser = OverridesParser.create(config_loader=loader)
+        self._parse = cache(lambda line: parser.parse_overrides([line])[0])
         self._merged: dict[tuple[str, ...], DictConfig] = {}
         self._is_group = cache(lambda key: bool(loader.get_group_options(key)))
 
     def __call__(self, overrides: Sequence[str]) -> DictConfig:
-        parsed = self._parser.parse_overrides(list(overrides))
+        """A job's configuration, which the next one may overwrite."""
+        parsed = [self._parse(line) for line in overrides]
         values = [override for override in parsed if self._sets_value(override)]
         kind = tuple(str(one.key_or_group if one in values else one.input_line) for one in parsed)
         composed = self._merged.get(kind)
         if composed is None:
             composed = self._loader.load_sweep_config(self._config, list(overrides))
+            HydraConfig.instance().set_config(composed)
             self._merged[kind] = composed
         else:
             for override in values:
                 OmegaConf.update(composed, override.key_or_group, override.value())
-        HydraConfig.instance().set_config(composed)
         return composed
 
     def _sets_value(self, override: Override) -> bool:
