@@ -93,8 +93,8 @@ class SweepBar:
             looked = time.monotonic()
             self.look()
             self._bar.set_postfix_str(self.said())
-            # Many folders on a slow disk are looked at less often.
-            pause = max(LOOK, 10.0 * (time.monotonic() - looked))
+            # Many folders, or a slow disk, are looked at less often.
+            pause = max(LOOK, 50.0 * (time.monotonic() - looked))
             going_on = 0 < self._done + self._failed < self._total
             if self._bar.disable and going_on and looked - (self._said or -SAY) > SAY:
                 self._said = looked

@@ -74,10 +74,11 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
 def table(sweep: Sweep) -> DataFrame:
     """All jobs of a sweep, a row for each of their seeds; one without numbers for a lost job."""
     from pandas import DataFrame
+    from pandas.api.types import is_object_dtype
 
     frame = DataFrame(list(_rows(sweep)))
-    for name in frame.select_dtypes("object"):
-        # What is varied may be a number in one job and a text in another; a column has one type.
+    # What is varied may be a number in one job and a list in another; a column has one type.
+    for name in filter(lambda name: is_object_dtype(frame[name]), frame):
         frame[name] = [value if value is None else str(value) for value in frame[name]]
     return frame
 

@@ -15,7 +15,7 @@ from experiments.common.config import hash_of, register
 from experiments.common.estimates import SeedRun
 from experiments.common.record import Outcome
 from experiments.common.study import Job
-from experiments.runner.compose import expand, grids
+from experiments.runner.compose import expand, grids, make_plan
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin.findings import Findings
 from experiments.studies.twin.settings import Settings
@@ -90,6 +90,21 @@ def test_every_job_composes_and_is_told_apart(configuration, name: str, size: st
     assert len(hashes) == len(chosen)
     rows = {json.dumps(overrides) for overrides in planned}
     assert len(rows) == len(planned)
+
+
+@pytest.mark.parametrize(("name", "step"), [("covariance", 9), ("discrepancy", 4), ("filter", 5)])
+def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, step) -> None:
+    config = compose("config", [f"sweep={name}"], return_hydra_config=True)
+    loader = GlobalHydra.instance().config_loader()
+    # Groups, values within what a group chose, and values on the command line.
+    said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
+    plan = make_plan(config, loader, said)
+    assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
+    for job in plan.jobs[::step]:
+        config_hash, values = composed(*job.overrides)
+        assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
+        assert job.config_hash == config_hash
+        assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
 
 
 @pytest.mark.parametrize("size", ["small", "full"])

@@ -9,19 +9,21 @@ import subprocess
 import sys
 import time
 import urllib.request
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
+from pandas import read_parquet
 
-from experiments.common.record import SCHEMA, Record
-from experiments.runner import comparison, sync, tracking
+from experiments.common.record import SCHEMA, Record, here_and_now
+from experiments.runner import comparison, summary, sync, tracking
 from experiments.runner.compared import Compared, compared
 from experiments.runner.dashboard import last_comparison
 from experiments.runner.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
 from mvest.errors import ConfigurationError, InputError
+from mvest.provenance import write_json
 
 NAMES = ["E_f.anterior", "E_f.posterior"]
 
@@ -375,6 +377,93 @@ def test_a_sweep_is_logged_at_its_end(tmp_path) -> None:
     assert all(run in page for run in compared.runs)
     many = replace(compared, runs=("r",) * 200).page("http://127.0.0.1")
     assert many.endswith(f"/runs?searchFilter=tags.sweep_id%20%3D%20%22{sweep_id}%22")
+
+
+def swept(names: str, **changes) -> dict:
+    """What ``sweep.json`` says of jobs of these names, the last of which was lost."""
+    run = {"seed": 1, "status": "converged", "reason": "tolerance", "seconds": 2.0}
+    numbers = {"estimate": [6.0, 2.0], "std": [0.1, 0.05], "relative_error": [-0.04, 0.02]}
+    jobs = [
+        {
+            "hash": (name * 64)[:16],
+            "row": name,
+            "factors": {"noise": 0.5 * number, "R": 0.01 if number else [0.1, 0.2]},
+            "seed": 1,
+            "status": "converged",
+            "reason": "tolerance",
+            "runs": [run | numbers, run | {"seed": 2, "status": "failed", "reason": "it buckled"}],
+        }
+        for number, name in enumerate(names)
+    ]
+    jobs[-1] |= {"status": "failed", "reason": "killed by signal 9", "runs": []}
+    found = {
+        "schema": 2,
+        "sweep": {"name": "debug", "size": "small", "kind": "noise"},
+        "title": "A quick check",
+        "parameters": NAMES,
+        "provenance": asdict(here_and_now("c" * 64, "none", 1)),
+        "jobs": jobs,
+        "cost": [
+            {"hash": job["hash"], "seconds": 2.0, "seconds_total": 3.0, "overhead": 0.5}
+            for job in jobs
+        ],
+    }
+    return found | changes
+
+
+def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> None:
+    for name in "abc":
+        make_job(tmp_path, name)
+    plan = make_plan(tmp_path, a={}, b={}, c={})
+    write_json(plan.folder / summary.SWEEP, swept("abc"))
+    sync.log_sweep(asked(tmp_path), plan, None)
+
+    def kinds() -> list[str | None]:
+        return sorted(str(run.data.tags.get("kind")) for run in stored(tmp_path))
+
+    assert kinds() == ["None", "None", "None", "sweep"]
+    assert len(last_comparison(tmp_path).runs) == 3, "the whole is not compared with its parts"
+    (whole,) = [run for run in stored(tmp_path) if run.data.tags.get("kind") == "sweep"]
+    assert whole.info.run_name == "all 3 jobs"
+    assert whole.data.metrics == {
+        "jobs": 3.0, "failed": 1.0, "seconds": 9.0, "error.mean": pytest.approx(3.0),
+        "overhead": 0.5,
+    }  # fmt: skip
+    kept = Path(whole.info.artifact_uri.removeprefix("file://"))
+    table = read_parquet(kept / "jobs.parquet")
+    assert list(table["hash"]) == ["a" * 16] * 2 + ["b" * 16] * 2 + ["c" * 16]
+    assert list(table["status"]) == ["converged", "failed"] * 2 + ["failed"]
+    assert list(table["reason"][3:]) == ["it buckled", "killed by signal 9"]
+    assert list(table["estimate.anterior"].dropna()) == [6.0, 6.0]
+    assert list(table["factor.noise"]) == [0.0, 0.0, 0.5, 0.5, 1.0]
+    assert list(table["factor.R"][1:3]) == ["[0.1, 0.2]", "0.01"], "numbers and lists are texts"
+    assert (kept / "sweep.json").read_text() == (plan.folder / "sweep.json").read_text()
+
+    # Once for each state of the sweep.
+    sync.log_sweep(asked(tmp_path), plan, None)
+    assert whole.info.run_id in {run.info.run_id for run in stored(tmp_path)}
+    write_json(plan.folder / summary.SWEEP, swept("abc", title="Anew"))
+    sync.log_sweep(asked(tmp_path), plan, None)
+    assert kinds() == ["None", "None", "None", "sweep"]
+    assert whole.info.run_id not in {run.info.run_id for run in stored(tmp_path)}
+
+
+def test_of_very_many_jobs_only_the_whole_is_a_run_unless_asked(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sync, "MANY", 2)
+    for name in "abc":
+        make_job(tmp_path, name)
+    plan = make_plan(tmp_path, a={}, b={}, c={})
+    write_json(plan.folder / summary.SWEEP, swept("abc"))
+    config = asked(tmp_path)
+    sync.log_sweep(config, plan, None)
+    assert sync.main([str(tmp_path)]) == 0
+    (whole,) = stored(tmp_path)
+    assert whole.data.tags["kind"] == "sweep"
+    page = last_comparison(tmp_path).page("http://127.0.0.1")
+    assert page.endswith(f"/runs/{whole.info.run_id}")
+    config.tracking.runs = True
+    sync.log_sweep(config, plan, None)
+    assert len(stored(tmp_path)) == 4
 
 
 def test_a_sweep_that_goes_on_is_the_same_one(tmp_path) -> None:
