@@ -70,6 +70,39 @@ def until(condition) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
+def test_an_interrupted_sweep_stops_at_once_and_records_nothing_of_what_ran(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("wait-4").touch()
+    Path("wait-5").touch()
+    sweep = mvest("run", *PLAN[:3], PLAN[4], "hydra.launcher.n_jobs=2", stdin=subprocess.DEVNULL)
+    until(lambda: {4, 5} <= set(runs()))
+    os.kill(sweep.pid, signal.SIGINT)
+    out, _ = sweep.communicate(timeout=60)
+    assert sweep.returncode == 130, out
+    assert "4 of 12 jobs done, 0 without an estimate, 8 not finished" in out
+    assert runs() == list(range(6)), "nothing begins after that"
+    here = [place for place in Path("/proc").glob("[0-9]*") if is_in(place, tmp_path)]
+    assert not here, "a process was left behind"
+
+    Path("wait-4").unlink()
+    Path("wait-5").unlink()
+    again = mvest("run", *PLAN[:3], PLAN[4], "hydra.launcher.n_jobs=2")
+    out, _ = again.communicate(timeout=120)
+    assert again.returncode == 0, out
+    assert "12 of 12 jobs done (4 before)" in out
+    assert runs() == sorted([*range(12), 4, 5])
+
+
+def is_in(process: Path, folder: Path) -> bool:
+    """Whether a process that lives, not this one, works in a folder."""
+    try:
+        lives = (process / "stat").read_text().rsplit(") ", 1)[1][0] != "Z"
+        return lives and int(process.name) != os.getpid() and (process / "cwd").readlink() == folder
+    except OSError:
+        return False
+
+
 @pytest.mark.parametrize("text", ["0/4", "5/4", "2", "2/0", "a/b", "-1/4"])
 def test_what_is_no_shard_is_refused(text):
     with pytest.raises(ConfigurationError, match="shard"):

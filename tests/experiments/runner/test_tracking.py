@@ -11,6 +11,7 @@ import time
 import urllib.request
 from dataclasses import asdict, fields, replace
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
@@ -429,7 +430,7 @@ def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> N
         "jobs": 3.0, "failed": 1.0, "seconds": 9.0, "error.mean": pytest.approx(3.0),
         "overhead": 0.5,
     }  # fmt: skip
-    kept = Path(whole.info.artifact_uri.removeprefix("file://"))
+    kept = Path(unquote(urlsplit(whole.info.artifact_uri).path))
     table = read_parquet(kept / "jobs.parquet")
     assert list(table["hash"]) == ["a" * 16] * 2 + ["b" * 16] * 2 + ["c" * 16]
     assert list(table["status"]) == ["converged", "failed"] * 2 + ["failed"]
