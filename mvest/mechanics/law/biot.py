@@ -42,6 +42,18 @@ from mvest.typing import FloatArray, IntArray
 
 __all__ = ["BiotLaw", "PoissonReading", "TransverselyIsotropic"]
 
+ONE, OTHER = np.array([1, 0, 0]), np.array([2, 2, 1])
+"""The axes of each shear."""
+ROOT = np.sqrt(2.0)
+TINY = 1e-200
+CONTRACT = {"contract"}
+LANES = 64
+"""Points that are worked on together, so that each operation is one on vectors: a quarter of the
+time that one point after the other takes."""
+SCALE = np.array([1.0, 1.0, 1.0, ROOT, ROOT, ROOT])
+"""What the six components of a stress are multiplied by, and those of a strain divided, so that
+their norm is the tensor's."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiotLaw:
@@ -146,254 +158,264 @@ class BiotLaw:
             raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
         out = np.zeros_like(stress)
         by = self.moduli[which].stiffness_by(parameter.kind)
-        out[here] = _linear_stress(green[here], by, previous[here], rate)
+        strain = (1 + rate) * _biot_strain(green[here]) - rate * previous[here]
+        out[here] = _linear(green[here], strain @ by.T, 1)
         return out
 
     def history_stress(
         self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
     ) -> FloatArray:
         """Change of S ``(e, q, 6)`` for a change of the previous Biot strain: ``-rate L^T C d``."""
-        return _history_stress(green, region, self.stiffness, d_previous, rate)
+        stress = np.einsum("eij,eqj->eqi", self.stiffness[region], d_previous)
+        return -rate * _linear(green, stress, 1)
 
     def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
         """Change of the Biot strain ``L dE`` ``(e, q, 6)``."""
-        return _strain_change(green, d_green)
+        return _linear(green, np.ascontiguousarray(d_green), -1)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, error_model="numpy")
 def _eigen(a: FloatArray, q: FloatArray) -> None:
-    """Diagonalise the symmetric 3x3 ``a`` in place (cyclic Jacobi); ``q`` gets the eigenvectors."""
+    """Diagonalise symmetric matrices ``a (6, LANES)`` in place; ``q (3, 3, LANES)`` their vectors.
+
+    Cyclic Jacobi, in which a rotation of nothing is as good as another.
+    """
     for i in range(3):
         for j in range(3):
-            q[i, j] = 1.0 if i == j else 0.0
+            for lane in range(LANES):
+                q[i, j, lane] = 1.0 if i == j else 0.0
     for _ in range(30):
-        off = a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2
-        if off < 1e-32:
+        largest = 0.0
+        for lane in range(LANES):
+            largest = max(largest, a[3, lane] ** 2 + a[4, lane] ** 2 + a[5, lane] ** 2)
+        if not largest >= 1e-32:
             break
-        for p in range(2):
-            for r in range(p + 1, 3):
-                if abs(a[p, r]) < 1e-300:
-                    continue
-                theta = (a[r, r] - a[p, p]) / (2.0 * a[p, r])
-                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                if theta < 0:
-                    t = -t
+        for k in range(3):
+            i, j = ONE[k], OTHER[k]
+            for lane in range(LANES):
+                off = a[3 + k, lane]
+                theta = 0.5 * (a[j, lane] - a[i, lane]) / (off + TINY)
+                t = np.copysign(1.0, theta) / (abs(theta) + np.sqrt(theta * theta + 1.0))
                 c = 1.0 / np.sqrt(t * t + 1.0)
                 s = t * c
-                for k in range(3):
-                    akp, akr = a[k, p], a[k, r]
-                    a[k, p], a[k, r] = c * akp - s * akr, s * akp + c * akr
-                for k in range(3):
-                    apk, ark = a[p, k], a[r, k]
-                    a[p, k], a[r, k] = c * apk - s * ark, s * apk + c * ark
-                for k in range(3):
-                    qkp, qkr = q[k, p], q[k, r]
-                    q[k, p], q[k, r] = c * qkp - s * qkr, s * qkp + c * qkr
+                a[i, lane] -= t * off
+                a[j, lane] += t * off
+                a[3 + k, lane] = 0.0
+                one, other = a[3 + j, lane], a[3 + i, lane]
+                a[3 + j, lane], a[3 + i, lane] = c * one - s * other, s * one + c * other
+                for m in range(3):
+                    one, other = q[m, i, lane], q[m, j, lane]
+                    q[m, i, lane], q[m, j, lane] = c * one - s * other, s * one + c * other
 
 
-@nb.njit(cache=True)
-def _stretch(green: FloatArray, q: FloatArray, lam: FloatArray, u: FloatArray) -> None:
-    """Eigenvectors ``q``, stretches ``lam`` and U of a Green strain (engineering six-vector)."""
-    a = u
-    a[0, 0] = 1.0 + 2.0 * green[0]
-    a[1, 1] = 1.0 + 2.0 * green[1]
-    a[2, 2] = 1.0 + 2.0 * green[2]
-    a[1, 2] = a[2, 1] = green[3]
-    a[0, 2] = a[2, 0] = green[4]
-    a[0, 1] = a[1, 0] = green[5]
+@nb.njit(cache=True, error_model="numpy")
+def _spectral(
+    green: FloatArray,
+    start: int,
+    a: FloatArray,
+    q: FloatArray,
+    stretch: FloatArray,
+    g: FloatArray,
+    r: FloatArray,
+) -> None:
+    """What is needed of the points ``start`` to ``start + LANES`` of strains ``green (n, 6)``.
+
+    Written are ``l_i - 1`` (``stretch``, six components in the eigenbasis, of which three are 0),
+    the factors ``g = 2 / (l_i + l_j)`` of the six components there, and the rotations
+    ``r (6, 6, LANES)`` into it, which are orthogonal for six-vectors scaled by ``SCALE``.
+    """
+    for lane in range(LANES):
+        point = green[min(start + lane, len(green) - 1)]
+        for k in range(3):
+            a[k, lane] = 1.0 + 2.0 * point[k]
+            a[3 + k, lane] = point[3 + k]
     _eigen(a, q)
-    for i in range(3):
-        # An enhanced strain can leave the admissible set during a Newton iteration; a positive
-        # floor keeps the numbers finite, and the line search rejects such a state by its residual.
-        lam[i] = np.sqrt(max(a[i, i], 1e-6))
-    for i in range(3):
-        for j in range(3):
-            u[i, j] = (
-                q[i, 0] * lam[0] * q[j, 0] + q[i, 1] * lam[1] * q[j, 1] + q[i, 2] * lam[2] * q[j, 2]
+    for k in range(3):
+        for lane in range(LANES):
+            # An enhanced strain can leave the admissible set during a Newton iteration; a positive
+            # floor keeps the numbers finite, and the line search rejects such a state.
+            stretch[k, lane] = np.sqrt(max(a[k, lane], 1e-6)) - 1.0
+            g[k, lane] = 1.0 / (1.0 + stretch[k, lane])
+    for k in range(3):
+        i, j = ONE[k], OTHER[k]
+        for lane in range(LANES):
+            stretch[3 + k, lane] = 0.0
+            g[3 + k, lane] = 2.0 / (2.0 + stretch[i, lane] + stretch[j, lane])
+        for m in range(3):
+            b, c = ONE[m], OTHER[m]
+            for lane in range(LANES):
+                r[k, m, lane] = q[m, k, lane] * q[m, k, lane]
+                r[k, 3 + m, lane] = ROOT * q[b, k, lane] * q[c, k, lane]
+                r[3 + k, m, lane] = ROOT * q[m, i, lane] * q[m, j, lane]
+                one, other = q[b, i, lane] * q[c, j, lane], q[c, i, lane] * q[b, j, lane]
+                r[3 + k, 3 + m, lane] = one + other
+
+
+@nb.njit(cache=True, fastmath=CONTRACT)
+def _times(m: FloatArray, v: FloatArray, out: FloatArray) -> None:
+    for i in range(6):
+        for z in range(LANES):
+            out[i, z] = (
+                m[i, 0, z] * v[0, z]
+                + m[i, 1, z] * v[1, z]
+                + m[i, 2, z] * v[2, z]
+                + m[i, 3, z] * v[3, z]
+                + m[i, 4, z] * v[4, z]
+                + m[i, 5, z] * v[5, z]
+            )
+
+
+@nb.njit(cache=True, fastmath=CONTRACT)
+def _transposed_times(m: FloatArray, v: FloatArray, out: FloatArray) -> None:
+    for i in range(6):
+        for z in range(LANES):
+            out[i, z] = (
+                m[0, i, z] * v[0, z]
+                + m[1, i, z] * v[1, z]
+                + m[2, i, z] * v[2, z]
+                + m[3, i, z] * v[3, z]
+                + m[4, i, z] * v[4, z]
+                + m[5, i, z] * v[5, z]
             )
 
 
 @nb.njit(cache=True)
-def _linear_map(q: FloatArray, lam: FloatArray, big_l: FloatArray, du: FloatArray) -> None:
-    """``L = d eps / dE`` (6, 6) and its columns as tensors ``du (6, 3, 3)``."""
-    for k in range(6):
-        if k < 3:
-            i, j = k, k
-        elif k == 3:
-            i, j = 1, 2
-        elif k == 4:
-            i, j = 0, 2
-        else:
-            i, j = 0, 1
-        # Tensor dC = 2 dE of a unit engineering component: dC_ii = 2, or dC_ij = dC_ji = 1.
-        for m in range(3):
-            for n in range(3):
-                hat = q[i, m] * q[j, n] + q[j, m] * q[i, n]
-                du[k, m, n] = hat / (lam[m] + lam[n])
-        _rotate_back(q, du[k])
-        big_l[0, k] = du[k, 0, 0]
-        big_l[1, k] = du[k, 1, 1]
-        big_l[2, k] = du[k, 2, 2]
-        big_l[3, k] = 2.0 * du[k, 1, 2]
-        big_l[4, k] = 2.0 * du[k, 0, 2]
-        big_l[5, k] = 2.0 * du[k, 0, 1]
+def _scaled(values: FloatArray, start: int, power: int, out: FloatArray) -> None:
+    """The points of ``values (n, 6)`` times ``SCALE``, or over it (``power = -1``)."""
+    for lane in range(LANES):
+        for k in range(6):
+            factor = SCALE[k] if power > 0 else 1.0 / SCALE[k]
+            out[k, lane] = factor * values[min(start + lane, len(values) - 1), k]
 
 
 @nb.njit(cache=True)
-def _rotate_back(q: FloatArray, a: FloatArray) -> None:
-    """``a <- q a q^T`` for 3x3."""
-    t00 = q[0, 0] * a[0, 0] + q[0, 1] * a[1, 0] + q[0, 2] * a[2, 0]
-    t01 = q[0, 0] * a[0, 1] + q[0, 1] * a[1, 1] + q[0, 2] * a[2, 1]
-    t02 = q[0, 0] * a[0, 2] + q[0, 1] * a[1, 2] + q[0, 2] * a[2, 2]
-    t10 = q[1, 0] * a[0, 0] + q[1, 1] * a[1, 0] + q[1, 2] * a[2, 0]
-    t11 = q[1, 0] * a[0, 1] + q[1, 1] * a[1, 1] + q[1, 2] * a[2, 1]
-    t12 = q[1, 0] * a[0, 2] + q[1, 1] * a[1, 2] + q[1, 2] * a[2, 2]
-    t20 = q[2, 0] * a[0, 0] + q[2, 1] * a[1, 0] + q[2, 2] * a[2, 0]
-    t21 = q[2, 0] * a[0, 1] + q[2, 1] * a[1, 1] + q[2, 2] * a[2, 1]
-    t22 = q[2, 0] * a[0, 2] + q[2, 1] * a[1, 2] + q[2, 2] * a[2, 2]
-    for j in range(3):
-        a[0, j] = t00 * q[j, 0] + t01 * q[j, 1] + t02 * q[j, 2]
-        a[1, j] = t10 * q[j, 0] + t11 * q[j, 1] + t12 * q[j, 2]
-        a[2, j] = t20 * q[j, 0] + t21 * q[j, 1] + t22 * q[j, 2]
+def _unscaled(values: FloatArray, start: int, power: int, out: FloatArray) -> None:
+    """Undo `_scaled`, writing into ``out (n, 6)``."""
+    for lane in range(min(LANES, len(out) - start)):
+        for k in range(6):
+            factor = 1.0 / SCALE[k] if power > 0 else SCALE[k]
+            out[start + lane, k] = factor * values[k, lane]
 
 
 @nb.njit(cache=True)
-def _voigt_biot(u: FloatArray, out: FloatArray) -> None:
-    out[0] = u[0, 0] - 1.0
-    out[1] = u[1, 1] - 1.0
-    out[2] = u[2, 2] - 1.0
-    out[3] = 2.0 * u[1, 2]
-    out[4] = 2.0 * u[0, 2]
-    out[5] = 2.0 * u[0, 1]
+def _room() -> tuple[FloatArray, ...]:
+    """Where `_spectral` works and writes."""
+    return (
+        np.empty((6, LANES)),
+        np.empty((3, 3, LANES)),
+        np.empty((6, LANES)),
+        np.empty((6, LANES)),
+        np.empty((6, 6, LANES)),
+    )
 
 
 @nb.njit(cache=True)
 def _biot_strain(green: FloatArray) -> FloatArray:
-    n_e, n_q, _ = green.shape
-    out = np.empty((n_e, n_q, 6))
-    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    for e in range(n_e):
-        for p in range(n_q):
-            _stretch(green[e, p], q, lam, u)
-            _voigt_biot(u, out[e, p])
+    out, points = np.empty(green.shape), green.reshape(-1, 6)
+    flat = out.reshape(-1, 6)
+    a, q, stretch, g, r = _room()
+    eps = np.empty((6, LANES))
+    for start in range(0, len(points), LANES):
+        _spectral(points, start, a, q, stretch, g, r)
+        _transposed_times(r, stretch, eps)
+        _unscaled(eps, start, -1, flat)
     return out
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, error_model="numpy")
 def _response(
     green: FloatArray, region: IntArray, stiffness: FloatArray, previous: FloatArray, rate: float
 ) -> tuple[FloatArray, FloatArray]:
-    n_e, n_q, _ = green.shape
-    stress = np.empty((n_e, n_q, 6))
-    tangent = np.empty((n_e, n_q, 6, 6))
-    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    big_l, du = np.empty((6, 6)), np.empty((6, 3, 3))
-    eps, t, cl, s3 = np.empty(6), np.empty(6), np.empty((6, 6)), np.empty((3, 3))
-    sdu = np.empty((3, 3))
-    for e in range(n_e):
-        c = stiffness[region[e]]
-        for p in range(n_q):
-            _stretch(green[e, p], q, lam, u)
-            _voigt_biot(u, eps)
-            _linear_map(q, lam, big_l, du)
-            for i in range(6):
-                eps[i] = (1.0 + rate) * eps[i] - rate * previous[e, p, i]
-            for i in range(6):
-                t[i] = 0.0
-                for j in range(6):
-                    t[i] += c[i, j] * eps[j]
-            s = stress[e, p]
-            for i in range(6):
-                s[i] = 0.0
-                for j in range(6):
-                    s[i] += big_l[j, i] * t[j]
+    n_q = green.shape[1]
+    stress, tangent = np.empty(green.shape), np.empty((*green.shape, 6))
+    points, before = green.reshape(-1, 6), previous.reshape(-1, 6)
+    flat, moduli = stress.reshape(-1, 6), tangent.reshape(-1, 6, 6)
+    a, q, stretch, g, r = _room()
+    eps, t, s = np.empty((6, LANES)), np.empty((6, LANES)), np.empty((6, LANES))
+    c, half, d = (
+        np.empty((6, 6, LANES)),
+        np.empty((6, 6, LANES)),
+        np.empty((6, 6, LANES)),
+    )
+    for start in range(0, len(points), LANES):
+        for lane in range(LANES):
+            own = stiffness[region[min(start + lane, len(points) - 1) // n_q]]
             for i in range(6):
                 for j in range(6):
-                    value = 0.0
-                    for k in range(6):
-                        value += c[i, k] * big_l[k, j]
-                    cl[i, j] = (1.0 + rate) * value
-            s3[0, 0], s3[1, 1], s3[2, 2] = s[0], s[1], s[2]
-            s3[1, 2] = s3[2, 1] = s[3]
-            s3[0, 2] = s3[2, 0] = s[4]
-            s3[0, 1] = s3[1, 0] = s[5]
+                    c[i, j, lane] = own[i, j] * SCALE[i] * SCALE[j]
+        _spectral(points, start, a, q, stretch, g, r)
+        _transposed_times(r, stretch, eps)
+        _scaled(before, start, -1, t)
+        for i in range(6):
+            for lane in range(LANES):
+                eps[i, lane] = (1.0 + rate) * eps[i, lane] - rate * t[i, lane]
+        _times(c, eps, t)
+        _times(r, t, s)
+        for i in range(6):
+            for lane in range(LANES):
+                s[i, lane] *= g[i, lane]
+        _transposed_times(r, s, t)
+        _unscaled(t, start, 1, flat)
+        # L^T C L in the eigenbasis, where L is diagonal.
+        for i in range(6):
+            _times(c, r[i], half[i])
+        for i in range(6):
+            _times(half, r[i], d[i])
             for j in range(6):
-                # sdu = S dU_j; the second-order term is -(S : dU_i dU_j) symmetrised.
-                for m in range(3):
-                    for n in range(3):
-                        sdu[m, n] = (
-                            s3[m, 0] * du[j, 0, n] + s3[m, 1] * du[j, 1, n] + s3[m, 2] * du[j, 2, n]
-                        )
-                for i in range(j + 1):
-                    value = 0.0
-                    for k in range(6):
-                        value += big_l[k, i] * cl[k, j]
-                    for m in range(3):
-                        for n in range(3):
-                            value -= du[i, m, n] * sdu[m, n]
-                    tangent[e, p, i, j] = value
-                    tangent[e, p, j, i] = value
+                for lane in range(LANES):
+                    d[i, j, lane] *= (1.0 + rate) * g[i, lane] * g[j, lane]
+        _add_curvature(s, g, d)
+        for i in range(6):
+            _transposed_times(r, d[i], half[i])
+        for j in range(6):
+            _transposed_times(half, r[:, j], d[j])
+        for lane in range(min(LANES, len(points) - start)):
+            for i in range(6):
+                for j in range(i + 1):
+                    value = d[i, j, lane] / (SCALE[i] * SCALE[j])
+                    moduli[start + lane, i, j] = value
+                    moduli[start + lane, j, i] = value
     return stress, tangent
 
 
 @nb.njit(cache=True)
-def _linear_stress(
-    green: FloatArray, stiffness: FloatArray, previous: FloatArray, rate: float
-) -> FloatArray:
-    """``L^T C (eps + rate (eps - eps_n))`` with one C ``(6, 6)`` for all points."""
-    n_e, n_q, _ = green.shape
-    out = np.zeros((n_e, n_q, 6))
-    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    big_l, du, eps = np.empty((6, 6)), np.empty((6, 3, 3)), np.empty(6)
-    for e in range(n_e):
-        for p in range(n_q):
-            _stretch(green[e, p], q, lam, u)
-            _voigt_biot(u, eps)
-            _linear_map(q, lam, big_l, du)
-            for i in range(6):
-                eps[i] = (1.0 + rate) * eps[i] - rate * previous[e, p, i]
-            for j in range(6):
-                t = 0.0
-                for k in range(6):
-                    t += stiffness[j, k] * eps[k]
-                for i in range(6):
-                    out[e, p, i] += big_l[j, i] * t
-    return out
+def _add_curvature(s: FloatArray, g: FloatArray, d: FloatArray) -> None:
+    """Add ``T : d2 eps = -S : (dU dU)`` twice polarised, in the eigenbasis."""
+    for k in range(3):
+        i, j = ONE[k], OTHER[k]
+        for lane in range(LANES):
+            d[k, k, lane] -= s[k, lane] * g[k, lane] * g[k, lane]
+            shear = 0.5 * (s[i, lane] + s[j, lane]) * g[3 + k, lane] * g[3 + k, lane]
+            d[3 + k, 3 + k, lane] -= shear
+            half = 0.5 * s[3 + k, lane]
+            one, other = half * g[i, lane] * g[3 + k, lane], half * g[j, lane] * g[3 + k, lane]
+            d[i, 3 + k, lane] -= one
+            d[3 + k, i, lane] -= one
+            d[j, 3 + k, lane] -= other
+            d[3 + k, j, lane] -= other
+            # The shears ki and kj have the axis k in common; left of them is the shear ij.
+            mixed = half / ROOT * g[3 + i, lane] * g[3 + j, lane]
+            d[3 + i, 3 + j, lane] -= mixed
+            d[3 + j, 3 + i, lane] -= mixed
 
 
 @nb.njit(cache=True)
-def _history_stress(
-    green: FloatArray, region: IntArray, stiffness: FloatArray, d_previous: FloatArray, rate: float
-) -> FloatArray:
-    n_e, n_q, _ = green.shape
-    out = np.zeros((n_e, n_q, 6))
-    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    big_l, du = np.empty((6, 6)), np.empty((6, 3, 3))
-    for e in range(n_e):
-        c = stiffness[region[e]]
-        for p in range(n_q):
-            _stretch(green[e, p], q, lam, u)
-            _linear_map(q, lam, big_l, du)
-            for j in range(6):
-                t = 0.0
-                for k in range(6):
-                    t += c[j, k] * d_previous[e, p, k]
-                for i in range(6):
-                    out[e, p, i] -= rate * big_l[j, i] * t
-    return out
+def _linear(green: FloatArray, values: FloatArray, power: int) -> FloatArray:
+    """``L^T T (e, q, 6)`` of stresses T (``power = 1``), ``L dE`` of strains dE (``-1``).
 
-
-@nb.njit(cache=True)
-def _strain_change(green: FloatArray, d_green: FloatArray) -> FloatArray:
-    n_e, n_q, _ = green.shape
-    out = np.zeros((n_e, n_q, 6))
-    q, lam, u = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    big_l, du = np.empty((6, 6)), np.empty((6, 3, 3))
-    for e in range(n_e):
-        for p in range(n_q):
-            _stretch(green[e, p], q, lam, u)
-            _linear_map(q, lam, big_l, du)
-            for i in range(6):
-                for j in range(6):
-                    out[e, p, i] += big_l[i, j] * d_green[e, p, j]
+    Scaled alike, L is its own transpose.
+    """
+    out, points, given = np.empty(values.shape), green.reshape(-1, 6), values.reshape(-1, 6)
+    flat = out.reshape(-1, 6)
+    a, q, stretch, g, r = _room()
+    v, w = np.empty((6, LANES)), np.empty((6, LANES))
+    for start in range(0, len(points), LANES):
+        _spectral(points, start, a, q, stretch, g, r)
+        _scaled(given, start, power, v)
+        _times(r, v, w)
+        for i in range(6):
+            for lane in range(LANES):
+                w[i, lane] *= g[i, lane]
+        _transposed_times(r, w, v)
+        _unscaled(v, start, power, flat)
     return out
