@@ -87,7 +87,11 @@ class SparsityPattern:
             return self
         columns = np.empty(len(self.columns) + len(pairs) * elements.shape[1] ** 2, dtype=np.int32)
         pointer = _coupled(self.pointer, self.columns, elements, pairs, *around, columns)
-        return SparsityPattern(pointer, columns[: pointer[-1]].copy(), self.skew)
+        columns = columns[: pointer[-1]]
+        stored = np.ones(len(columns), dtype=np.int8)
+        rows = sparse.csr_matrix((stored, columns, pointer), shape=(self.n, self.n), copy=True)
+        rows.sort_indices()
+        return SparsityPattern(pointer, rows.indices, self.skew)
 
     @property
     def n(self) -> int:
@@ -220,7 +224,7 @@ def _coupled(
     around: IntArray,
     out: Positions,
 ) -> Positions:
-    """Write the columns of each row with the nodes of coupled elements; where the rows start."""
+    """Write the columns of each row, unsorted, with the nodes of coupled elements; its pointer."""
     n = len(pointer) - 1
     first = np.zeros(len(elements) + 1, dtype=np.int64)
     for g in range(len(pairs)):
@@ -237,12 +241,10 @@ def _coupled(
     ends = np.zeros(n + 1, dtype=np.int32)
     count = 0
     for row in range(n):
-        begin = count
         for k in range(pointer[row], pointer[row + 1]):
             seen[columns[k]] = row
             out[count] = columns[k]
             count += 1
-        known = count
         for k in range(start[row], start[row + 1]):
             for p in range(first[around[k]], first[around[k] + 1]):
                 for node in elements[partners[p]]:
@@ -250,8 +252,6 @@ def _coupled(
                         seen[node] = row
                         out[count] = node
                         count += 1
-        if count > known:
-            out[begin:count].sort()
         ends[row + 1] = count
     return ends
 

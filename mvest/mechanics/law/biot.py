@@ -97,7 +97,7 @@ class BiotLaw:
 
     def strain(self, green: FloatArray) -> FloatArray:
         """Biot strain ``(e, q, 6)`` of Green-Lagrange strain ``(e, q, 6)``, both engineering."""
-        return _biot_strain(green)
+        return _linear(green, green, 0)
 
     def response(
         self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
@@ -158,7 +158,7 @@ class BiotLaw:
             raise InputError(f"parameter {parameter.name!r}: the law has a stiffness, no moduli")
         out = np.zeros_like(stress)
         by = self.moduli[which].stiffness_by(parameter.kind)
-        strain = (1 + rate) * _biot_strain(green[here]) - rate * previous[here]
+        strain = (1 + rate) * self.strain(green[here]) - rate * previous[here]
         out[here] = _linear(green[here], strain @ by.T, 1)
         return out
 
@@ -309,19 +309,6 @@ def _room() -> tuple[FloatArray, ...]:
     )
 
 
-@nb.njit(cache=True)
-def _biot_strain(green: FloatArray) -> FloatArray:
-    out, points = np.empty(green.shape), green.reshape(-1, 6)
-    flat = out.reshape(-1, 6)
-    a, q, stretch, g, r = _room()
-    eps = np.empty((6, LANES))
-    for start in range(0, len(points), LANES):
-        _spectral(points, start, a, q, stretch, g, r)
-        _transposed_times(r, stretch, eps)
-        _unscaled(eps, start, -1, flat)
-    return out
-
-
 @nb.njit(cache=True, error_model="numpy")
 def _response(
     green: FloatArray, region: IntArray, stiffness: FloatArray, previous: FloatArray, rate: float
@@ -368,7 +355,10 @@ def _response(
         for i in range(6):
             _transposed_times(r, d[i], half[i])
         for j in range(6):
-            _transposed_times(half, r[:, j], d[j])
+            for i in range(6):
+                for lane in range(LANES):
+                    t[i, lane] = r[i, j, lane]
+            _transposed_times(half, t, d[j])
         for lane in range(min(LANES, len(points) - start)):
             for i in range(6):
                 for j in range(i + 1):
@@ -403,7 +393,8 @@ def _add_curvature(s: FloatArray, g: FloatArray, d: FloatArray) -> None:
 def _linear(green: FloatArray, values: FloatArray, power: int) -> FloatArray:
     """``L^T T (e, q, 6)`` of stresses T (``power = 1``), ``L dE`` of strains dE (``-1``).
 
-    Scaled alike, L is its own transpose.
+    Scaled alike, L is its own transpose. With ``power = 0`` it is the Biot strain itself: one
+    kernel, for compiling it takes longer than it ever runs.
     """
     out, points, given = np.empty(values.shape), green.reshape(-1, 6), values.reshape(-1, 6)
     flat = out.reshape(-1, 6)
@@ -415,7 +406,7 @@ def _linear(green: FloatArray, values: FloatArray, power: int) -> FloatArray:
         _times(r, v, w)
         for i in range(6):
             for lane in range(LANES):
-                w[i, lane] *= g[i, lane]
+                w[i, lane] = g[i, lane] * w[i, lane] if power != 0 else stretch[i, lane]
         _transposed_times(r, w, v)
         _unscaled(v, start, power, flat)
     return out
