@@ -24,12 +24,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from mvest.elements import Element
 from mvest.errors import InputError
+from mvest.mechanics.element import (
+    add_tangents,
+    alpha_change,
+    enhanced_strain,
+    internal_forces,
+    strain_derivative,
+    strains,
+)
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
@@ -42,10 +49,6 @@ ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
 LINEAR = 1e-9
 """Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
-
-
-VOIGT = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
-"""Component of a six-vector that an entry of a symmetric tensor is."""
 
 
 @runtime_checkable
@@ -170,7 +173,7 @@ class Solid:
     def evaluate(self, x: FloatArray, previous: FloatArray, rate: float) -> SolidState:
         """Strain, stress and tangent at nodal positions ``x (n, 3)`` mm."""
         elements, region = self.mesh.elements, self.mesh.region
-        green_u, f = _strains(x, elements, self.gradients)
+        green_u, f = strains(x, elements, self.gradients)
         if self.sampling is not None:
             green_u = self.sampling.strain(green_u)
         if self.n_modes == 0:
@@ -178,7 +181,7 @@ class Solid:
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
         alpha = self.enhanced_parameters
         for _ in range(ENHANCED_ITERATIONS):
-            green = _enhanced(green_u, self.direction, self.polynomials, alpha)
+            green = enhanced_strain(green_u, self.direction, self.polynomials, alpha)
             stress, tangent = self.law.response(green, region, previous, rate)
             step = self._alpha_change(stress, tangent)
             size = float(np.abs(step).max(initial=0.0))
@@ -187,7 +190,7 @@ class Solid:
             # An enhanced strain beyond +-0.2 per iteration is far outside the law's small strains.
             alpha = alpha + np.clip(step, -0.2, 0.2)
             if size < LINEAR:
-                more = _enhanced(np.zeros_like(green), self.direction, self.polynomials, step)
+                more = enhanced_strain(np.zeros_like(green), self.direction, self.polynomials, step)
                 green += more
                 stress += np.einsum("eqij,eqj->eqi", tangent, more)
                 break
@@ -219,7 +222,7 @@ class Solid:
             stress = self.sampling.stress(state.stress, self.volumes)
             self.sampling.add_tangents(*at, stress, state.tangent, modes, positions, blocks)
             return
-        _add_tangents(
+        add_tangents(
             *at,
             state.stress,
             state.tangent,
@@ -232,7 +235,7 @@ class Solid:
     def _forces(self, state: SolidState, stress: FloatArray) -> FloatArray:
         if self.sampling is not None:
             stress = self.sampling.stress(stress, self.volumes)
-        return _forces(self.gradients, self.volumes, state.deformation, stress)
+        return internal_forces(self.gradients, self.volumes, state.deformation, stress)
 
     def extrapolated_stress(self, state: SolidState, dx: FloatArray) -> FloatArray:
         """Stress S ``(e, q, 6)`` MPa that a move by ``dx (n, 3)`` mm leads to, to first order."""
@@ -262,7 +265,7 @@ class Solid:
         d_stress : ndarray
             ``(e, q, 6)`` partial derivative of S at fixed strain.
         """
-        d_green = _strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
+        d_green = strain_derivative(dx, self.mesh.elements, self.gradients, state.deformation)
         if self.sampling is not None:
             d_green = self.sampling.strain(d_green)
         if self.n_modes:
@@ -273,17 +276,17 @@ class Solid:
     def _enhanced_change(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
         """Change of the enhanced strain ``(e, q, 6)`` that balances a change of the stress."""
         change = self._alpha_change(d_stress, state.tangent)
-        return _enhanced(np.zeros_like(d_stress), self.direction, self.polynomials, change)
+        return enhanced_strain(np.zeros_like(d_stress), self.direction, self.polynomials, change)
 
     def _alpha_change(self, stress: FloatArray, tangent: FloatArray) -> FloatArray:
         """Step ``(e, n_modes)`` of Newton's method for ``int M^T S dV = 0``."""
-        return _alpha_change(self.direction, self.polynomials, self.volumes, stress, tangent)
+        return alpha_change(self.direction, self.polynomials, self.volumes, stress, tangent)
 
 
 def kernels_are_compiled() -> bool:
     """Whether the machine code of the kernels lies in numba's cache; if not, first use makes it."""
-    place = _add_tangents.stats.cache_path
-    return place is not None and any(Path(place).glob("solid._add_tangents-*.nbi"))
+    place = add_tangents.stats.cache_path
+    return place is not None and any(Path(place).glob("element.add_tangents-*.nbi"))
 
 
 def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, FloatArray]:
@@ -358,264 +361,3 @@ def _lumped_volume(mesh: SolidMesh, reference: Element, volumes: FloatArray) -> 
     share = diagonal / diagonal.sum(axis=1, keepdims=True) * volumes.sum(axis=1, keepdims=True)
     mass = np.bincount(mesh.elements.ravel(), share.ravel(), minlength=len(mesh.nodes))
     return np.asarray(mass, dtype=np.float64)
-
-
-@nb.njit(cache=True)
-def _strains(
-    x: FloatArray, elements: IntArray, gradients: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    n_e, n_q, n_a, _ = gradients.shape
-    green = np.empty((n_e, n_q, 6))
-    deformation = np.zeros((n_e, n_q, 3, 3))
-    for e in range(n_e):
-        for q in range(n_q):
-            f = deformation[e, q]
-            for a in range(n_a):
-                node = elements[e, a]
-                for i in range(3):
-                    for m in range(3):
-                        f[i, m] += x[node, i] * gradients[e, q, a, m]
-            g = green[e, q]
-            for m in range(3):
-                g[m] = 0.5 * (f[0, m] ** 2 + f[1, m] ** 2 + f[2, m] ** 2 - 1.0)
-            g[3] = f[0, 1] * f[0, 2] + f[1, 1] * f[1, 2] + f[2, 1] * f[2, 2]
-            g[4] = f[0, 0] * f[0, 2] + f[1, 0] * f[1, 2] + f[2, 0] * f[2, 2]
-            g[5] = f[0, 0] * f[0, 1] + f[1, 0] * f[1, 1] + f[2, 0] * f[2, 1]
-    return green, deformation
-
-
-@nb.njit(cache=True)
-def _strain_derivative(
-    dx: FloatArray, elements: IntArray, gradients: FloatArray, deformation: FloatArray
-) -> FloatArray:
-    n_e, n_q, n_a, _ = gradients.shape
-    out = np.zeros((n_e, n_q, 6))
-    df = np.empty((3, 3))
-    for e in range(n_e):
-        for q in range(n_q):
-            f = deformation[e, q]
-            df[:, :] = 0.0
-            for a in range(n_a):
-                node = elements[e, a]
-                for i in range(3):
-                    for m in range(3):
-                        df[i, m] += dx[node, i] * gradients[e, q, a, m]
-            g = out[e, q]
-            for i in range(3):
-                g[0] += f[i, 0] * df[i, 0]
-                g[1] += f[i, 1] * df[i, 1]
-                g[2] += f[i, 2] * df[i, 2]
-                g[3] += f[i, 1] * df[i, 2] + df[i, 1] * f[i, 2]
-                g[4] += f[i, 0] * df[i, 2] + df[i, 0] * f[i, 2]
-                g[5] += f[i, 0] * df[i, 1] + df[i, 0] * f[i, 1]
-    return out
-
-
-@nb.njit(cache=True)
-def _enhanced(
-    green: FloatArray, direction: FloatArray, polynomials: FloatArray, alpha: FloatArray
-) -> FloatArray:
-    """Green-Lagrange strain ``(e, q, 6)`` with the enhanced part added."""
-    out = np.empty_like(green)
-    for e in range(green.shape[0]):
-        for q in range(green.shape[1]):
-            amplitude = 0.0
-            for m in range(alpha.shape[1]):
-                amplitude += polynomials[q, m] * alpha[e, m]
-            for i in range(6):
-                out[e, q, i] = green[e, q, i] + amplitude * direction[e, q, i]
-    return out
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _alpha_change(
-    direction: FloatArray,
-    polynomials: FloatArray,
-    volumes: FloatArray,
-    stress: FloatArray,
-    tangent: FloatArray,
-) -> FloatArray:
-    n_q, n_m = polynomials.shape
-    out = np.zeros((len(volumes), n_m))
-    matrix = np.empty((n_m, n_m))
-    for e in range(len(volumes)):
-        matrix[:] = 0.0
-        for q in range(n_q):
-            d, force, stiffness = direction[e, q], 0.0, 0.0
-            for i in range(6):
-                force += d[i] * stress[e, q, i]
-                row = 0.0
-                for j in range(6):
-                    row += tangent[e, q, i, j] * d[j]
-                stiffness += d[i] * row
-            for k in range(n_m):
-                p = volumes[e, q] * polynomials[q, k]
-                out[e, k] -= p * force
-                for m in range(n_m):
-                    matrix[k, m] += p * polynomials[q, m] * stiffness
-        _solve_small(matrix, out[e].reshape(n_m, 1))
-    return out
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _solve_small(matrix: FloatArray, right: FloatArray) -> None:
-    """Overwrite ``right (m, c)`` by the solution; the matrix ``(m, m)`` is overwritten too."""
-    m = len(matrix)
-    for k in range(m):
-        pivot = k
-        for r in range(k + 1, m):
-            if abs(matrix[r, k]) > abs(matrix[pivot, k]):
-                pivot = r
-        if pivot != k:
-            for c in range(m):
-                matrix[k, c], matrix[pivot, c] = matrix[pivot, c], matrix[k, c]
-            for c in range(right.shape[1]):
-                right[k, c], right[pivot, c] = right[pivot, c], right[k, c]
-        for r in range(k + 1, m):
-            factor = matrix[r, k] / matrix[k, k]
-            for c in range(k + 1, m):
-                matrix[r, c] -= factor * matrix[k, c]
-            for c in range(right.shape[1]):
-                right[r, c] -= factor * right[k, c]
-    for k in range(m - 1, -1, -1):
-        for c in range(right.shape[1]):
-            for r in range(k + 1, m):
-                right[k, c] -= matrix[k, r] * right[r, c]
-            right[k, c] /= matrix[k, k]
-
-
-@nb.njit(cache=True)
-def _forces(
-    gradients: FloatArray, volumes: FloatArray, deformation: FloatArray, stress: FloatArray
-) -> FloatArray:
-    n_e, n_q, n_a, _ = gradients.shape
-    out = np.zeros((n_e, n_a, 3))
-    fs = np.empty((3, 3))
-    for e in range(n_e):
-        for q in range(n_q):
-            f, s, w = deformation[e, q], stress[e, q], volumes[e, q]
-            for i in range(3):
-                fs[i, 0] = w * (f[i, 0] * s[0] + f[i, 1] * s[5] + f[i, 2] * s[4])
-                fs[i, 1] = w * (f[i, 0] * s[5] + f[i, 1] * s[1] + f[i, 2] * s[3])
-                fs[i, 2] = w * (f[i, 0] * s[4] + f[i, 1] * s[3] + f[i, 2] * s[2])
-            for a in range(n_a):
-                g = gradients[e, q, a]
-                for i in range(3):
-                    out[e, a, i] += fs[i, 0] * g[0] + fs[i, 1] * g[1] + fs[i, 2] * g[2]
-    return out
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _moduli(
-    f: FloatArray,
-    stress: FloatArray,
-    tangent: FloatArray,
-    w: float,
-    half: FloatArray,
-    a: FloatArray,
-) -> None:
-    """``w dP/dF`` as ``a (9, 9)``, rows and columns ``3 i + J``, of one quadrature point."""
-    for i in range(3):
-        for j in range(3):
-            r0, r1, r2 = tangent[VOIGT[0, j]], tangent[VOIGT[1, j]], tangent[VOIGT[2, j]]
-            f0, f1, f2 = w * f[i, 0], w * f[i, 1], w * f[i, 2]
-            for v in range(6):
-                half[3 * i + j, v] = f0 * r0[v] + f1 * r1[v] + f2 * r2[v]
-    for r in range(9):
-        h = half[r]
-        for k in range(3):
-            f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
-            a[r, 3 * k] = f0 * h[0] + f1 * h[5] + f2 * h[4]
-            a[r, 3 * k + 1] = f0 * h[5] + f1 * h[1] + f2 * h[3]
-            a[r, 3 * k + 2] = f0 * h[4] + f1 * h[3] + f2 * h[2]
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                a[3 * i + j, 3 * i + k] += w * stress[VOIGT[j, k]]
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _add_tangents(
-    gradients: FloatArray,
-    volumes: FloatArray,
-    deformation: FloatArray,
-    stress: FloatArray,
-    tangent: FloatArray,
-    direction: FloatArray,
-    polynomials: FloatArray,
-    positions: NDArray[np.int32],
-    blocks: FloatArray,
-) -> None:
-    """``K_ab = sum_q w g_a (dP/dF) g_b``, less what the enhanced strains take away."""
-    n_e, n_q, n_a, _ = gradients.shape
-    n_m = polynomials.shape[1]
-    half, a = np.empty((9, 6)), np.empty((9, 9))
-    # Components come first and nodes last, so that the innermost loops run along the nodes: the
-    # block of nodes a and b is k[a, :, :, b].
-    g, g_t = np.empty((3 * n_q, n_a)), np.empty((n_a, 3 * n_q))
-    t, k = np.empty((3 * n_q, 9 * n_a)), np.empty((n_a, 9 * n_a))
-    row, d_d, p_d = np.empty((3, n_a)), np.empty(6), np.empty((3, 3))
-    k_am, k_mm = np.empty((n_m, 3 * n_a)), np.empty((n_m, n_m))
-    for e in range(n_e):
-        k_am[:] = 0.0
-        k_mm[:] = 0.0
-        for q in range(n_q):
-            f, w = deformation[e, q], volumes[e, q]
-            for j in range(3):
-                for b in range(n_a):
-                    g[3 * q + j, b] = g_t[b, 3 * q + j] = gradients[e, q, b, j]
-            g0, g1, g2 = g[3 * q], g[3 * q + 1], g[3 * q + 2]
-            _moduli(f, stress[e, q], tangent[e, q], w, half, a)
-            for j in range(3):
-                for i in range(3):
-                    for c in range(3):
-                        a0, a1, a2 = a[3 * i + j, 3 * c : 3 * c + 3]
-                        at = (3 * i + c) * n_a
-                        for b in range(n_a):
-                            t[3 * q + j, at + b] = a0 * g0[b] + a1 * g1[b] + a2 * g2[b]
-            if n_m > 0:
-                stiffness, d = 0.0, direction[e, q]
-                for i in range(6):
-                    d_d[i] = 0.0
-                    for j in range(6):
-                        d_d[i] += w * tangent[e, q, i, j] * d[j]
-                    stiffness += d[i] * d_d[i]
-                for i in range(3):
-                    for j in range(3):
-                        p_d[i, j] = (
-                            f[i, 0] * d_d[VOIGT[0, j]]
-                            + f[i, 1] * d_d[VOIGT[1, j]]
-                            + f[i, 2] * d_d[VOIGT[2, j]]
-                        )
-                    for b in range(n_a):
-                        row[i, b] = p_d[i, 0] * g0[b] + p_d[i, 1] * g1[b] + p_d[i, 2] * g2[b]
-                for m in range(n_m):
-                    p = polynomials[q, m]
-                    for c in range(n_m):
-                        k_mm[m, c] += p * polynomials[q, c] * stiffness
-                    for i in range(3):
-                        for b in range(n_a):
-                            k_am[m, i * n_a + b] += p * row[i, b]
-        if n_q == 1:  # a call would take longer than the product
-            for b in range(n_a):
-                for c in range(9 * n_a):
-                    k[b, c] = g_t[b, 0] * t[0, c] + g_t[b, 1] * t[1, c] + g_t[b, 2] * t[2, c]
-        else:
-            np.dot(g_t, t, k)
-        if n_m > 0:
-            change = k_am.copy()
-            _solve_small(k_mm, change)
-            for m in range(n_m):
-                for i in range(3):
-                    for b in range(n_a):
-                        factor = k_am[m, i * n_a + b]
-                        for c in range(3 * n_a):
-                            k[b, 3 * i * n_a + c] -= factor * change[m, c]
-        for b in range(n_a):
-            for c in range(n_a):
-                if positions[e, b, c] < 0:
-                    continue
-                block = blocks[positions[e, b, c]]
-                for i in range(3):
-                    for j in range(3):
-                        block[i, j] += k[b, (3 * i + j) * n_a + c]
