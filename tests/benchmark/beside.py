@@ -63,12 +63,12 @@ def _seconds(run: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def command(*overrides: str, first: tuple[str, ...] = ()) -> float:
-    """A command from its start to its end, after one that fills the caches."""
+def command(*overrides: str) -> float:
+    """A command from its start to its end, after one like it that fills caches and stores."""
     with tempfile.TemporaryDirectory() as folder:
         call = [sys.executable, "-m", "experiments.run", f"paths.outputs={folder}/outputs"]
         call.append(f"paths.results={folder}/results")
-        subprocess.run([*call, *(first or overrides)], check=True, capture_output=True)
+        subprocess.run([*call, *overrides], check=True, capture_output=True)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run([*call, *overrides, "force=true"], check=True, capture_output=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -86,7 +86,6 @@ MEASURED: dict[str, Callable[[], float]] = {
         *OF_A_SWEEP,
         "filter=iterated",
         "filter.initial=[4.1,2.7]",
-        first=("experiment=table1", *OF_A_SWEEP),
     ),
 }
 
