@@ -47,7 +47,7 @@ __all__ = ["Law", "Solid", "SolidState", "kernels_are_compiled"]
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""
-LINEAR = 1e-9
+LINEAR = 1e-7
 """Size of an alpha correction that the stress follows linearly, and the tangent not noticeably."""
 
 
