@@ -26,7 +26,10 @@ PLAN = (
 FOLDER = Path("outputs/sweep_debug")
 
 WORKER = """
+import signal
 import sys
+# Tests run in the background of a shell inherit that an interrupt is ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from experiments import cli
 from experiments.runner import guard
 guard.WORKER = (sys.executable, sys.argv.pop(1))
