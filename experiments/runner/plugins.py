@@ -59,8 +59,11 @@ class PlannedSweeper(Sweeper):
 
 def register_plugins() -> None:
     """Make them known to Hydra; may be called again."""
+    plugins = Plugins.instance()  # imports the package of plugins, if any other is installed
+    package, _, name = PLACE.rpartition(".")
     place = ModuleType(PLACE)
     sys.modules[PLACE] = place
+    setattr(sys.modules.setdefault(package, ModuleType(package)), name, place)
     PlannedSweeper.__module__ = PLACE
     place.__dict__[PlannedSweeper.__name__] = PlannedSweeper
-    Plugins.instance().register(PlannedSweeper)
+    plugins.register(PlannedSweeper)
