@@ -17,7 +17,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 DEVELOP := .venv/.develop
 
-.PHONY: help install reproduce tables test test-all docs bench lint format dashboard sync screenshot slurm-check lock clean
+.PHONY: help install reproduce tables test test-all fuzz docs bench lint format dashboard sync screenshot slurm-check lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -54,6 +54,9 @@ test: $(DEVELOP) ## the tests that finish in minutes
 
 test-all: $(DEVELOP) ## every test
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
+
+fuzz: $(DEVELOP) ## damaged files for every reader, and a table of how they ended (FUZZ_SECONDS=3600)
+	$(BIN)/python -m tests.fuzz --seconds $(or $(FUZZ_SECONDS),3600)
 
 docs: $(DEVELOP) ## the documentation site, in docs/_build/html; warnings are errors
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

@@ -1,0 +1,176 @@
+"""Readers of surfaces, leaflets and solid meshes."""
+
+import base64
+from pathlib import Path
+
+import numpy as np
+
+from mvest.cases.surface_files import read_regions
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.io.leaflet_surfaces import read_leaflets, read_surface, write_leaflets
+from mvest.valve.io.solid_meshes import read_solid, write_solid
+from tests.fuzz.trial import Reader
+from tests.valve.io import test_io
+
+__all__ = ["READERS"]
+
+POINTS = np.array([[0.0, 0, 0], [20, 0, 0], [0, 20, 0.5], [20, 20, 0.25], [40, 0, 1]])
+TRIANGLES = np.array([[0, 1, 2], [2, 1, 3], [1, 4, 3]])
+REGIONS = {1: "anterior", 2: "posterior"}
+
+
+def regions(path: Path) -> object:
+    return read_regions(path, REGIONS)
+
+
+def text_stl(folder: Path) -> Path:
+    facets = "".join(
+        "facet normal 0 0 1\n outer loop\n"
+        + "".join(f"  vertex {x!r} {y!r} {z!r}\n" for x, y, z in corners.tolist())
+        + " endloop\nendfacet\n"
+        for corners in POINTS[TRIANGLES]
+    )
+    (folder / "a.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    return folder / "a.stl"
+
+
+def binary_stl(folder: Path) -> Path:
+    records = np.zeros(len(TRIANGLES), [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    records["v"] = POINTS[TRIANGLES]
+    count = len(TRIANGLES).to_bytes(4, "little")
+    (folder / "a.stl").write_bytes(bytes(80) + count + records.tobytes())
+    return folder / "a.stl"
+
+
+def obj(folder: Path) -> Path:
+    lines = [f"v {x} {y} {z}" for x, y, z in POINTS]
+    faces = [f"f {a + 1}/1/1 {b + 1}//2 {c + 1}" for a, b, c in TRIANGLES]
+    groups = ["g anterior", faces[0], "g posterior", *faces[1:]]
+    (folder / "a.obj").write_text("\n".join(["# made up", "o valve", *lines, *groups]) + "\n")
+    return folder / "a.obj"
+
+
+PLY = """ply
+format {form} 1.0
+comment made up
+element vertex 5
+property float x
+property float y
+property double z
+property int region
+element face 3
+property list uchar int vertex_indices
+end_header
+"""
+
+
+def text_ply(folder: Path) -> Path:
+    points = "".join(f"{x} {y} {z} {1 + (k > 2)}\n" for k, (x, y, z) in enumerate(POINTS))
+    faces = "".join(f"3 {a} {b} {c}\n" for a, b, c in TRIANGLES)
+    (folder / "a.ply").write_text(PLY.format(form="ascii") + points + faces)
+    return folder / "a.ply"
+
+
+def binary_ply(folder: Path) -> Path:
+    points = np.zeros(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("region", "<i4")])
+    for name, values in zip("xyz", POINTS.T, strict=True):
+        points[name] = values
+    points["region"] = [1, 1, 1, 2, 2]
+    faces = np.zeros(3, [("n", "u1"), ("v", "<i4", 3)])
+    faces["n"], faces["v"] = 3, TRIANGLES
+    head = PLY.format(form="binary_little_endian").encode()
+    (folder / "a.ply").write_bytes(head + points.tobytes() + faces.tobytes())
+    return folder / "a.ply"
+
+
+ARRAYS = {
+    "points": ("Float64", POINTS),
+    "connectivity": ("Int64", TRIANGLES),
+    "offsets": ("Int64", np.array([3, 6, 9])),
+    "types": ("UInt8", np.full(3, 5, dtype=np.uint8)),
+    "region": ("Int64", np.array([1, 2, 2])),
+}
+
+
+def vtk_text(kind: str, form: str) -> bytes:
+    """A VTK XML file with its numbers in it, as text or base64, or raw at its end."""
+    appended = b""
+
+    def array(name: str) -> str:
+        nonlocal appended
+        of, values = ARRAYS[name]
+        raw = len(values.tobytes()).to_bytes(8, "little") + values.tobytes()
+        parts = 3 if name == "points" else 1
+        head = f'<DataArray type="{of}" Name="{name}" NumberOfComponents="{parts}"'
+        if form == "appended":
+            head += f' format="appended" offset="{len(appended)}"/>\n'
+            appended += raw
+            return head
+        text = " ".join(map(str, values.ravel()))
+        if form == "binary":
+            text = base64.b64encode(raw).decode()
+        return f'{head} format="{form}">{text}</DataArray>\n'
+
+    cells, shape = ("Cells", "UnstructuredGrid") if kind == "vtu" else ("Polys", "PolyData")
+    names = ["connectivity", "offsets", *(["types"] if kind == "vtu" else [])]
+    text = (
+        f'<?xml version="1.0"?>\n<VTKFile type="{shape}" version="1.0" byte_order="LittleEndian" '
+        f'header_type="UInt64">\n<{shape}>\n<Piece NumberOfPoints="5" NumberOf{cells}="3">\n'
+        f"<Points>{array('points')}</Points>\n"
+        f"<{cells}>{''.join(map(array, names))}</{cells}>\n"
+        f"<CellData>{array('region')}</CellData>\n</Piece>\n</{shape}>\n"
+    ).encode()
+    if form == "appended":
+        text += b'<AppendedData encoding="raw">\n_' + appended + b"</AppendedData>\n"
+    return text + b"</VTKFile>\n"
+
+
+def vtk(path: Path, form: str) -> Path:
+    path.write_bytes(vtk_text(path.suffix[1:], form))
+    return path
+
+
+def leaflets(path: Path) -> Path:
+    names = ("anterior", "posterior")
+    fibre = np.tile([1.0, 0.0, 0.0], (5, 1))
+    labels = np.array([0, 1, 1])
+    return write_leaflets(
+        path, LeafletSurface(POINTS, TRIANGLES, labels, names, fibre, np.full(5, 1.0))
+    )
+
+
+def solid(name: str, folder: Path) -> Path:
+    return write_solid(folder / "a.vtu", test_io.one_element(name))
+
+
+READERS = (
+    Reader("surface.stl", read_surface, (text_stl, binary_stl)),
+    Reader("surface.obj", regions, (obj,)),
+    Reader("surface.ply", regions, (text_ply, binary_ply)),
+    Reader(
+        "surface.vtp",
+        regions,
+        tuple(
+            lambda folder, form=form: vtk(folder / "a.vtp", form)
+            for form in ("ascii", "binary", "appended")
+        ),
+    ),
+    Reader(
+        "surface.vtu",
+        regions,
+        tuple(
+            lambda folder, form=form: vtk(folder / "a.vtu", form)
+            for form in ("ascii", "binary", "appended")
+        ),
+    ),
+    Reader(
+        "leaflets",
+        read_leaflets,
+        (lambda folder: leaflets(folder / "a.vtp"), lambda folder: leaflets(folder / "a.vtu")),
+    ),
+    Reader(
+        "solid",
+        read_solid,
+        (lambda folder: solid("tet4", folder), lambda folder: solid("hex18", folder)),
+    ),
+)
