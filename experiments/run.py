@@ -14,6 +14,7 @@ from itertools import takewhile
 from pathlib import Path
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -94,8 +95,8 @@ def run_alone(config: DictConfig) -> None:
     from experiments.runner.compose import plan_run
     from experiments.runner.job import run_job
 
-    request = Request.of(config)
-    with nothing_empty(request.folder, Path(config.paths.outputs)):
+    with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
+        request = Request.of(config)
         if config.dry_run:
             plan = plan_run(request)
             require_admissible(request.values)

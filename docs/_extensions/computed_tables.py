@@ -1,7 +1,7 @@
 """Directives whose tables are computed from the code, the configuration and ``results/``.
 
-``{parameter-table}``, ``{setting-groups}``, ``{sweep-list}`` and ``{guess-comparison}`` take no
-options and no content.
+``{parameter-table}``, ``{setting-groups}``, ``{setting-ranges}``, ``{sweep-list}`` and
+``{guess-comparison}`` take no options and no content.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from study_pages import comment_of
 
 from experiments.common.cases.findings import Findings as OfPatients
 from experiments.common.cases.skill import median_errors
+from experiments.common.ranges import ANY, RANGES
 from experiments.results.keep import records_of
 from experiments.studies.imaged_patient.findings import Findings as OfVolumes
 from experiments.studies.imaged_patient.report import moduli_of_volumes
@@ -61,6 +62,23 @@ def setting_groups() -> str:
         if names and folder.name not in NOT_SETTINGS:
             rows.append([f"`{folder.name}=`", ", ".join(f"`{name}`" for name in names)])
     return markdown(["group", "known names"], rows)
+
+
+def setting_ranges() -> str:
+    """What every setting may be."""
+    return markdown(
+        ["from", "to", "unit", "why", "settings"],
+        [
+            [
+                f"{row.low:.10g}",
+                f"{row.high:.10g}",
+                row.unit,
+                row.why,
+                ", ".join(f"`{name}`" for name in row.names.split()),
+            ]
+            for row in (*RANGES, ANY)
+        ],
+    )
 
 
 def sweep_list() -> str:
@@ -108,6 +126,6 @@ def directive(table: Callable[[], str]) -> type[SphinxDirective]:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Make the directives known."""
-    for table in (parameter_table, setting_groups, sweep_list, guess_comparison):
+    for table in (parameter_table, setting_groups, setting_ranges, sweep_list, guess_comparison):
         app.add_directive(table.__name__.replace("_", "-"), directive(table))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

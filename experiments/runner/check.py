@@ -8,7 +8,6 @@ from typing import Any
 from experiments.common.build import mechanics_of
 from experiments.common.study import load_study
 from experiments.runner.tracking import require_no_password
-from mvest.errors import ConfigurationError
 
 __all__ = ["require_admissible"]
 
@@ -23,8 +22,5 @@ def require_admissible(values: Mapping[str, Any]) -> None:
     """
     study = load_study(values["study"])
     require_no_password(values["tracking"]["uri"])
-    for name in ("repeats", "time_limit_s"):
-        if values.get(name) is not None and not values[name] > 0:
-            raise ConfigurationError(f"{name} = {values[name]}, expected > 0")
     mechanics_of(values)
     study.require(values)

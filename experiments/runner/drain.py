@@ -46,7 +46,7 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> Shard:
         """The shard that a text like 2/8 names."""
-        found = re.fullmatch(r"(\d+)/(\d+)", text)
+        found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if found is None:
             raise ConfigurationError(f"shard {text!r}, expected I/N, for example 2/8")
         return cls(int(found[1]), int(found[2]))

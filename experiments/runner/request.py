@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from experiments.common.config import NOT_THE_RESULT, hash_of, plain
+from experiments.common.ranges import require_in_range
 
 __all__ = ["Request", "as_published", "publish_as"]
 
@@ -30,12 +31,20 @@ class Request:
         Output folder of the job.
     publish_as : str or None
         Name of its record in the results; None where they are not to be touched.
+
+    Raises
+    ------
+    ConfigurationError
+        If a setting is outside its range (`experiments.common.ranges`).
     """
 
     values: dict[str, Any]
     config_hash: str
     folder: Path
     publish_as: str | None = None
+
+    def __post_init__(self) -> None:
+        require_in_range(self.values)
 
     @classmethod
     def of(cls, config: DictConfig) -> Request:

@@ -105,8 +105,6 @@ def submit(plan: Plan, settings: Mapping[str, Any]) -> list[Submission]:
     """
     assert plan.written_ns is not None
     each = settings["jobs_per_task"]
-    if not each >= 1:
-        raise ConfigurationError(f"hydra.launcher.jobs_per_task = {each}, expected >= 1")
     count = math.ceil(len(plan.jobs) / each)
     left = {job.config_hash for job in plan.to_run}
     shards = [

@@ -13,6 +13,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
+from experiments.common.ranges import require_in_range
 from experiments.common.study import load_study
 from experiments.results.page import write_report
 from experiments.runner import slurm
@@ -61,6 +62,8 @@ def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str
     MvestError, HydraException, OmegaConfBaseException
         If the request is wrong.
     """
+    launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+    require_in_range({"hydra": {"launcher": launcher}})
     plan = make_plan(config, context.config_loader, arguments)
     for job in plan.jobs:
         _check(job.values, job.overrides)
