@@ -24,6 +24,7 @@ from pathlib import Path
 from types import FrameType
 from urllib.parse import quote
 
+from experiments.common.ranges import range_of
 from experiments.common.record import read_data
 from experiments.runner.plan import PLAN
 from experiments.runner.summary import IS_SWEEP
@@ -31,7 +32,7 @@ from experiments.runner.sync import jobs_in
 from experiments.runner.tracking import open_store
 from mvest.errors import InputError, MvestError
 
-__all__ = ["Comparison", "last_comparison", "main", "serving"]
+__all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
 
 MAX_COMPARED = 100
 """Runs that MLflow's comparison of runs can show: it reads them one by one."""
@@ -41,6 +42,15 @@ PATIENCE = 600.0
 
 SAY = 10.0
 """Seconds between two lines about a server that does not answer yet."""
+
+HOSTS = ("127.0.0.1", "localhost", "[::1]")
+"""This machine, in a browser's words."""
+
+HTTP_PORT = 80
+"""The port that browsers leave out."""
+
+WIDER = "MLFLOW_SERVER_"
+"""Beginning of the environment variables that change whom MLflow's server answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--port", default=5000, type=int)
     given = parser.parse_args(arguments)
     try:
+        range_of("port").require("--port", given.port)
         comparison = last_comparison(given.outputs)
         with serving(comparison.place, given.outputs, given.port) as (address, server):
             page = comparison.page(address)
@@ -161,12 +172,15 @@ def serving(
     command = [
         sys.executable, "-m", "mlflow", "server", "--backend-store-uri", place,
         "--default-artifact-root", (outputs.resolve() / "mlartifacts").as_uri(),
-        "--host", "127.0.0.1", "--port", str(port), "--workers", "1",
+        "--host", HOSTS[0], "--port", str(port), "--workers", "1",
+        "--allowed-hosts", ",".join(allowed_hosts(port)),
     ]  # fmt: skip
+    # Whatever the login shell has set: nobody else is let in.
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(WIDER)}
     out = subprocess.DEVNULL if quiet else None
     before = {name: signal.signal(name, _interrupt) for name in (signal.SIGTERM, signal.SIGHUP)}
     # A group of its own: the server starts workers, which are to end with it.
-    server = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+    server = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True, env=kept)
     try:
         _await(f"http://127.0.0.1:{port}", server)
         yield f"http://127.0.0.1:{port}", server
@@ -178,6 +192,14 @@ def serving(
                 server.wait(5.0)
         for name, handler in before.items():
             signal.signal(name, handler)
+
+
+def allowed_hosts(port: int) -> list[str]:
+    """The hosts that a request may name: a page of any other, led here by its name, reads nothing.
+
+    MLflow's own list lets names like 192.168.evil.com in.
+    """
+    return [f"{host}:{port}" for host in HOSTS] + (list(HOSTS) if port == HTTP_PORT else [])
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:

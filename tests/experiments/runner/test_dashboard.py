@@ -8,6 +8,9 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -68,6 +71,52 @@ def test_its_axes_are_settings_that_differ_and_the_error(shown) -> None:
 def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
     assert screenshot.main([str(outputs), "--to", str(tmp_path / "page.png")]) == 0
     assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture(scope="module")
+def address(outputs) -> Iterator[str]:
+    """Of a server on the sweep, whatever the login shell says of whom to answer."""
+    place = dashboard.last_comparison(outputs).place
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MLFLOW_SERVER_ALLOWED_HOSTS", "*")
+        patch.setenv("MLFLOW_SERVER_CORS_ALLOWED_ORIGINS", "*")
+        patch.setenv("MLFLOW_SERVER_DISABLE_SECURITY_MIDDLEWARE", "true")
+        with dashboard.serving(place, outputs, 0, quiet=True) as (at, _):
+            yield at
+
+
+def asked(address: str, *, host: str, origin: str = "", path: str = "experiments/search") -> int:
+    """Status of the answer to a request for data, as a page of another origin would send it."""
+    headers = {"Host": host, "Content-Type": "application/json"}
+    headers |= {"Origin": origin} if origin else {}
+    body = b'{"max_results": 1}'
+    wanted = urllib.request.Request(f"{address}/api/2.0/mlflow/{path}", body, headers)
+    try:
+        with urllib.request.urlopen(wanted, timeout=30.0) as answer:
+            return answer.status
+    except urllib.error.HTTPError as refused:
+        return refused.code
+
+
+@pytest.mark.parametrize("name", dashboard.HOSTS)
+def test_its_own_page_is_answered(address, name) -> None:
+    own = f"{name}:{address.rpartition(':')[2]}"
+    assert asked(address, host=own) == 200
+    assert asked(address, host=own, origin="http://" + own) == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["192.168.evil.com", "10.0.0.1", "evil.com", "localhost", "0.0.0.0:{port}"]
+)
+def test_no_name_that_leads_there_is(address, host) -> None:
+    host = host.format(port=address.rpartition(":")[2])
+    assert asked(address, host=host) == 403
+    assert asked(address, host=host, origin="http://" + host) == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.com", "http://192.168.evil.com", "null"])
+def test_no_page_from_elsewhere_changes_anything(address, origin) -> None:
+    assert asked(address, host=address.removeprefix("http://"), origin=origin) == 403
 
 
 def listening(port: int) -> bool:
