@@ -1,16 +1,20 @@
-"""Files and folders that appear under their names only once they are whole."""
+"""Files and folders that appear under their names only once they are whole, and their digests."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
+import stat
+import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 
-from mvest.errors import cannot_write
+from mvest.errors import InputError, cannot_write
 
-__all__ = ["remove_parts", "write_atomically"]
+__all__ = ["remove_parts", "sha256_of", "write_atomically"]
 
 PREFIX = ".part-"
 """With which every temporary name begins."""
@@ -63,6 +67,63 @@ def write_atomically(
     except OSError as error:
         raise cannot_write(target, error) from error
     return target
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 (64 hexadecimal digits) of the bytes of a file, or of all that lies in a folder.
+
+    Of a folder names count as well as contents; links are followed.
+
+    Raises
+    ------
+    InputError
+        If something in it cannot be read.
+    """
+    try:
+        if not path.is_dir():
+            return _sha256(path)
+        digest = hashlib.sha256()
+        for name, file in sorted((file.relative_to(path).as_posix(), file) for file in _tree(path)):
+            digest.update(f"{len(name.encode())} {name} {_sha256(file)} ".encode())
+        return digest.hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot read {error.filename or path}: {error.strerror}") from error
+
+
+def _tree(folder: Path) -> Iterator[Path]:
+    for place, inner, names in os.walk(folder, followlinks=True):
+        here = Path(place)
+        real = here.resolve()
+        # A link to a folder above it would never end.
+        above = {real, *real.parents}
+        inner[:] = [name for name in inner if (here / name).resolve() not in above]
+        yield from (here / name for name in names if (here / name).is_file())
+
+
+SETTLED_NS = 2_000_000_000
+"""Age from which on another change of a file is sure to change its times, on any file system."""
+
+
+def _sha256(file: Path) -> str:
+    about = file.stat()
+    if not stat.S_ISREG(about.st_mode):
+        # A pipe would be waited for.
+        raise InputError(f"cannot read {file}: no file")
+    key = (about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
+    if abs(time.time_ns() - max(about.st_mtime_ns, about.st_ctime_ns)) < SETTLED_NS:
+        return _digest(file)
+    return _remembered(file, key)
+
+
+@lru_cache(maxsize=4096)
+def _remembered(file: Path, key: tuple[int, ...]) -> str:
+    """A large volume is read once, however often it is asked whether it has changed."""
+    return _digest(file)
+
+
+def _digest(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def remove_parts(folder: Path, name: str = "") -> None:

@@ -1,7 +1,12 @@
-"""What takes long to make is made once: entries of a store on disk."""
+"""What takes long to make is made once: entries of a store on disk.
+
+Beside each entry lies its digest, ``.NAME.sha256``. An entry that does not match it, or that has
+none, is not what was written under this name, whatever its reader thinks of it, and is made again.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import sys
 import zipfile
 import zlib
@@ -14,7 +19,7 @@ from typing import Any, Generic, TypeVar
 from filelock import FileLock
 
 from mvest.errors import cannot_write
-from mvest.files import remove_parts, write_atomically
+from mvest.files import remove_parts, sha256_of, write_atomically
 
 __all__ = ["Counts", "Entry", "get_or_make"]
 
@@ -57,11 +62,23 @@ class Entry(Generic[T]):
         if not self.path.exists():
             return None
         try:
+            # What cannot be made again has its digest within, which its reader checks.
+            if self.remake and self._digest(self.path) != self._seal.read_text(encoding="utf-8"):
+                return None
             return self.read(self.path)
         except DAMAGE:
             if not self.remake:
                 raise
             return None
+
+    @property
+    def _seal(self) -> Path:
+        return self.path.with_name(f".{self.path.name}.sha256")
+
+    def _digest(self, path: Path) -> str:
+        """Of what lies at a path as the content of this entry: one that was moved is another."""
+        about = f"{self.path.parent.name}/{self.path.name} {sha256_of(path)}"
+        return hashlib.sha256(about.encode()).hexdigest()
 
     def get_or_make(
         self,
@@ -75,6 +92,8 @@ class Entry(Generic[T]):
     def keep(self, value: Any, write: Callable[[Path, Any], object]) -> T:
         """Keep a value; what others will read."""
         write_atomically(self.path, lambda part: write(part, value), sync=True)
+        # Who dies in between leaves an entry without its digest, which is made again.
+        write_atomically(self._seal, self._digest(self.path))
         return self.read(self.path)
 
     @contextmanager

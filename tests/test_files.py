@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import mvest.files
 from mvest.errors import InputError
-from mvest.files import remove_parts, write_atomically
+from mvest.files import remove_parts, sha256_of, write_atomically
 
 
 @pytest.mark.parametrize("sync", [False, True])
@@ -96,3 +97,66 @@ def test_leftovers_are_taken_away_and_nothing_else(tmp_path):
     remove_parts(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a.npz", ".lock"}
     remove_parts(tmp_path / "absent")
+
+
+def test_a_digest_is_that_of_the_bytes_and_follows_every_change(tmp_path):
+    file = tmp_path / "volume.nrrd"
+    file.write_bytes(b"abc")
+    # NIST's example for SHA-256.
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert sha256_of(file) == known
+    about = file.stat()
+    file.write_bytes(b"abd")
+    os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert sha256_of(file) != known
+
+
+def test_an_old_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
+    file, reads = tmp_path / "volume.nrrd", []
+    file.write_bytes(b"abc")
+    true = mvest.files._digest
+    monkeypatch.setattr(mvest.files, "_digest", lambda path: (reads.append(path), true(path))[1])
+    monkeypatch.setattr(mvest.files, "SETTLED_NS", 0)
+    first = sha256_of(file)
+    assert sha256_of(file) == first
+    assert len(reads) == 1
+    file.write_bytes(b"abcd")
+    assert sha256_of(file) != first
+    monkeypatch.setattr(mvest.files, "SETTLED_NS", 10**12)
+    reads.clear()
+    assert sha256_of(file) == sha256_of(file)
+    assert len(reads) == 2
+
+
+def test_of_a_folder_names_contents_and_what_links_lead_to_count(tmp_path):
+    folder = tmp_path / "case"
+    (folder / "frames").mkdir(parents=True)
+    (folder / "frames" / "a").write_text("1")
+    seen = [sha256_of(folder)]
+
+    def changed() -> bool:
+        seen.append(sha256_of(folder))
+        return seen[-1] not in seen[:-1]
+
+    (folder / "frames" / "a").write_text("2")
+    assert changed()
+    (folder / "frames" / "a").rename(folder / "frames" / "b")
+    assert changed()
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "x").write_text(name)
+    (folder / "link").symlink_to(tmp_path / "one")
+    assert changed()
+    (folder / "link").unlink()
+    (folder / "link").symlink_to(tmp_path / "two")
+    assert changed()
+    # One that leads back ends.
+    (folder / "loop").symlink_to(folder)
+    assert sha256_of(folder) == seen[-1]
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("pipe", "nothing"):
+        with pytest.raises(InputError, match=f"cannot read .*{name}"):
+            sha256_of(tmp_path / name)

@@ -81,6 +81,46 @@ def test_a_damaged_entry_is_made_again_with_a_note(tmp_path, how, capsys):
         assert [path.name for path in entry.path.iterdir()] == ["text"]
 
 
+def other_numbers(entry):
+    write(entry.path, "b")
+
+
+def no_digest(entry):
+    (entry.path.parent / ".entry.sha256").unlink()
+
+
+def taken_from_another(entry):
+    other = Entry(entry.path.with_name("other"), read)
+    other.keep("b", write)
+    other.path.replace(entry.path)
+    entry.path.with_name(".other.sha256").replace(entry.path.with_name(".entry.sha256"))
+
+
+def one_more_file(entry):
+    (entry.path / "more").touch()
+
+
+@pytest.mark.parametrize(
+    ("how", "harm"),
+    [
+        (write, other_numbers),
+        (write, no_digest),
+        (write, taken_from_another),
+        (write_folder, one_more_file),
+    ],
+)
+def test_a_readable_entry_that_was_not_written_as_it_is_is_made_again(tmp_path, how, harm, capsys):
+    make, entry = made("a"), Entry(tmp_path / "entry", read)
+    entry.get_or_make(make, how)
+    harm(entry)
+    assert entry.found() is None
+    assert entry.get_or_make(make, how) == "a"
+    assert make.calls == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"note: {entry.path} is damaged and is made again"
+    assert entry.found() == "a"
+
+
 def test_what_would_not_be_the_same_again_is_refused(tmp_path):
     def refuse(path):
         raise MeshingError(f"{path} is damaged")
@@ -105,12 +145,14 @@ def test_an_interruption_leaves_no_entry_and_lets_the_next_one_in(tmp_path):
     (tmp_path / ".part-killed-entry").touch()
     entry.path.unlink()
     entry.get_or_make(made("a"), write)
-    assert {path.name for path in tmp_path.iterdir()} == {"entry", ".entry.lock"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "entry", ".entry.lock", ".entry.sha256"
+    }  # fmt: skip
 
 
 def test_of_several_entries_the_missing_ones_are_made_together_and_each_kept_as_it_comes(tmp_path):
     entries = [Entry(tmp_path / str(k), read) for k in range(4)]
-    write(entries[1].path, "old")
+    entries[1].keep("old", write)
     asked = []
 
     def make(missing):
@@ -198,7 +240,7 @@ def test_after_a_process_was_killed_while_it_wrote_one_of_those_that_wait_makes_
     assert len(said) == 1
     assert said <= {"second", "third"}
     assert {path.name for path in tmp_path.iterdir()} == {
-        "entry", ".entry.lock", "killed writes", f"{said.pop()} writes",
+        "entry", ".entry.lock", ".entry.sha256", "killed writes", f"{said.pop()} writes",
     }  # fmt: skip
 
 

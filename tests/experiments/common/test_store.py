@@ -149,6 +149,16 @@ def test_a_damaged_entry_is_made_again(tmp_path, capsys):
     assert "damaged" in capsys.readouterr().err
 
 
+def test_a_truth_with_other_numbers_in_a_sound_file_is_made_again(tmp_path, capsys):
+    y = StoredModel(Model(), tmp_path, "key")(AT).y
+    (entry,) = tmp_path.glob("*.npz")
+    np.savez(entry, y=y + 1.0)
+    again = StoredModel(Model(), tmp_path, "key")
+    np.testing.assert_array_equal(again(AT).y, y)
+    assert again.counts.misses == 1
+    assert capsys.readouterr().err.splitlines() == [f"note: {entry} is damaged and is made again"]
+
+
 def test_a_full_disk_leaves_no_half_entry(tmp_path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")

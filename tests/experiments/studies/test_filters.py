@@ -31,6 +31,7 @@ from mvest.estimation import (
     SamplerSettings,
     UnscentedFilter,
 )
+from mvest.kept import Entry
 from tests.experiments.studies.test_gate_study import CONF, SMALL
 
 SHORT = "{chains: 2, walkers: 8, steps: 60}"
@@ -187,7 +188,8 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     store = next((tmp_path / "outputs" / "filter_store").glob("moduli_iterated_*.json"))
     changed = json.loads(store.read_text())
     changed["detail"] = "from the store"
-    store.write_text(json.dumps(changed))
+    entry = Entry(store, lambda path: json.loads(path.read_text()))
+    entry.keep(changed, lambda path, value: path.write_text(json.dumps(value)))
     monkeypatch.setattr(sys, "argv", [*arguments, "force=true"])
     assert main() == 0
     again = read_record(folder / "result.json", Findings).findings
