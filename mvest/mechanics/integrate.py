@@ -488,7 +488,10 @@ def _largest_step(
 ) -> float:
     """Share of the displacement ``dy`` that is free of collisions; a failed step where none is."""
     try:
-        return contact.largest_step(pairs, y, dy, detect=detect)
+        factor = contact.largest_step(pairs, y, dy, detect=detect)
     except MemoryError as error:
         # What iterates that have run away sweep over is more than there is room for.
         raise _StepError(StepReason.NO_CONVERGENCE) from error
+    if factor == 0.0:
+        raise _StepError(StepReason.NO_CONVERGENCE)
+    return factor

@@ -324,6 +324,37 @@ def test_edges_are_as_long_as_they_get_on_the_way():
     np.testing.assert_allclose(_longest_edges(y, move, triangles), expected, rtol=1e-14)
 
 
+def test_sheets_that_touch_are_no_start_of_a_step(capfd):
+    """Detection from a distance of nearly zero does not end and takes gigabytes: two edges 8e-15 mm
+    apart, of a leaflet of 1 MPa that had rolled up."""
+    rest = FAR * np.eye(6, 3) + FAR * np.eye(6, 3, -3) * [[2.0]]
+    contact = contact_of(rest, triangles=np.array([[0, 1, 4], [2, 3, 5]]))
+    edges = np.array(
+        [
+            [-16.051336303482632, 4.644382933368503, -3.6001434736602302],
+            [-15.93223538855475, 4.618859321040644, -4.0436619334687],
+            [-15.880946106567379, 4.912033664899875, -3.3915170813866813],
+            [-16.060619502794605, 4.568738949182942, -3.780771842361751],
+        ]
+    )
+    moved = np.array(
+        [
+            [-16.05867107133735, 4.608830319870311, -3.612349697076018],
+            [-15.94821851984567, 4.568444516842367, -4.035590697163797],
+            [-15.910823777859619, 4.897769255752416, -3.3974812906940786],
+            [-16.10180529753734, 4.5218273498250525, -3.796768158761757],
+        ]
+    )
+    y, dy = np.zeros((6, 3)), np.zeros((6, 3))
+    y[:4], dy[:4] = edges, moved - edges
+    y[4], y[5] = edges[0] - [0, 0, 9.0], edges[2] + [0, 9.0, 0]
+    pairs = contact.search(y)
+    assert contact.largest_step(pairs, y, dy) == 0.0
+    apart = y - np.outer([1, 1, 0, 0, 1, 0], [0.0, 0.0, 1.0])
+    assert contact.largest_step(pairs, apart, dy, detect=True) == 1.0
+    assert capfd.readouterr().out == ""
+
+
 def test_what_is_proved_apart_is_free_of_collisions():
     # Random states and moves; where distances prove that nothing meets, detection agrees. The
     # points of a third are neighbours at rest but not in the sheet, as at a commissure.
