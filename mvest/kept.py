@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import sys
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -25,7 +23,7 @@ __all__ = ["Counts", "Entry", "get_or_make"]
 
 T = TypeVar("T")
 
-DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+DAMAGE = (OSError, ValueError, LookupError, TypeError)
 """What readers raise of a file that a broken disk or a user has changed."""
 
 

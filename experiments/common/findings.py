@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-__all__ = ["Rows", "Vector", "finite", "rows", "stored_arrays", "vector"]
+__all__ = ["Rows", "Vector", "finite", "rows", "vector"]
 
 Vector = tuple[float, ...]
 Rows = tuple[Vector, ...]
@@ -28,9 +26,3 @@ def rows(values: ArrayLike) -> Rows:
 def finite(value: float) -> float | None:
     """None for a number that is infinite or not known."""
     return float(value) if math.isfinite(value) else None
-
-
-def stored_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in an ``.npz`` file."""
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}

@@ -5,7 +5,6 @@ A study computes its findings; everything else that a record says is stamped onc
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from mvest.errors import InputError
 from mvest.provenance import provenance, write_json
+from mvest.reading.json_file import read_mapping
 
 __all__ = [
     "SCHEMA",
@@ -30,7 +30,6 @@ __all__ = [
     "Status",
     "here_and_now",
     "model_of_values",
-    "read_data",
     "read_record",
     "record_from",
     "stamp",
@@ -333,23 +332,4 @@ def read_record(path: Path, findings: type[F]) -> Record[F]:
     InputError
         If it cannot be read or is no such record.
     """
-    return record_from(read_data(path), findings, str(path))
-
-
-def read_data(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or holds something else.
-    """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"{path} is not JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path} holds a {type(data).__name__}, expected a mapping")
-    return data
+    return record_from(read_mapping(path), findings, str(path))

@@ -16,6 +16,7 @@ from experiments.common.source import source_key
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.kept import Counts, Entry
 from mvest.provenance import config_hash
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
 __all__ = ["Store", "StoredModel", "key_of"]
@@ -130,11 +131,8 @@ class StoredModel:
         """
 
         def read(path: Path) -> Prediction:
-            # Opened here: NumPy leaves what it cannot read to the garbage collector.
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-                y = stored["y"]
-                jacobian = stored["jacobian"] if self._jacobian else np.zeros((len(y), len(m)))
-            return Prediction(y, jacobian)
+            y, *rest = read_npz(path, ["y", "jacobian"] if self._jacobian else ["y"]).values()
+            return Prediction(y, rest[0] if rest else np.zeros((len(y), len(m))))
 
         def write(path: Path, prediction: Prediction) -> None:
             arrays: dict[str, Any] = {"y": prediction.y}

@@ -9,7 +9,6 @@ time over a calibration kernel that ran in the same process, and its ratio to th
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from mvest.errors import InputError, MvestError
 from mvest.files import write_atomically
+from mvest.reading.json_file import read_mapping
 
 __all__ = ["benchmark_figure", "benchmark_table", "fitted_orders", "main"]
 
@@ -153,7 +153,7 @@ def main(arguments: Sequence[str] | None = None, results: Path = Path("results")
         print("usage: python -m experiments.results.benchmark RUN.json ...", file=sys.stderr)
         return 2
     try:
-        contents = [_read(path) for path in given]
+        contents = [read_mapping(path) for path in given]
         runs = [c for c in contents if "benchmarks" in c]
         peers = [row for c in contents if "rows" in c for row in c["rows"]]
         if not runs:
@@ -227,16 +227,6 @@ def _profile(entry: Mapping[str, Any]) -> str:
             _readable(bounds),
         ]
     )
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        contents = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}") from error
-    if not isinstance(contents, dict):
-        raise InputError(f"{path}: expected a report in JSON")
-    return contents
 
 
 if __name__ == "__main__":

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from experiments.common.record import Record, read_data, record_from, write_record
+from experiments.common.record import Record, record_from, write_record
 from experiments.common.study import Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
+from mvest.reading.json_file import read_mapping
 
 __all__ = ["FIELDS", "RECORDS", "arrays_of", "publish", "records_of", "regenerate"]
 
@@ -87,7 +88,7 @@ def regenerate(results: Path) -> list[Path]:
     written: list[Path] = []
     for place in places:
         first = next(iter(sorted(place.glob("*.json"))))
-        study = load_study(str(read_data(first).get("study")))
+        study = load_study(str(read_mapping(first).get("study")))
         written += study.write(results, _read(place, study.findings), _arrays(place))
     return written
 
@@ -106,7 +107,7 @@ def records_of(results: Path, table: str, findings: type) -> dict[str, Record[An
 def _read(place: Path, findings: type) -> dict[str, Record[Any]]:
     """The records of a table by name; the one that has the table's name comes first."""
     paths = sorted(place.glob("*.json"), key=lambda path: (path.stem != place.name, path.stem))
-    return {path.stem: record_from(read_data(path), findings, str(path)) for path in paths}
+    return {path.stem: record_from(read_mapping(path), findings, str(path)) for path in paths}
 
 
 def _arrays(place: Path) -> dict[str, Path]:

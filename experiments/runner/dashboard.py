@@ -25,12 +25,12 @@ from types import FrameType
 from urllib.parse import quote
 
 from experiments.common.ranges import range_of
-from experiments.common.record import read_data
 from experiments.runner.plan import PLAN
 from experiments.runner.summary import IS_SWEEP
 from experiments.runner.sync import jobs_in
 from experiments.runner.tracking import open_store
 from mvest.errors import InputError, MvestError
+from mvest.reading.json_file import read_mapping
 
 __all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
 
@@ -122,13 +122,13 @@ def last_comparison(outputs: Path) -> Comparison:
     TrackingError
         If the store cannot be read.
     """
-    plans = [(read_data(path), path.parent) for path in outputs.glob(f"*/{PLAN}")]
+    plans = [(read_mapping(path), path.parent) for path in outputs.glob(f"*/{PLAN}")]
     for plan, folder in sorted(plans, key=lambda one: str(one[0]["created"]), reverse=True):
         names = {Path(job["folder"]).name for job in plan["jobs"]}
         jobs = [job for job in jobs_in(folder) if job.name in names]
         if not jobs:
             continue
-        config = read_data(jobs[0] / "config.json")
+        config = read_mapping(jobs[0] / "config.json")
         store = open_store(config["tracking"]["uri"], outputs, str(config["name"]))
         of_sweep = [
             run

@@ -6,7 +6,6 @@ is made last, after everything else is on disk.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,11 +13,12 @@ from typing import Any
 
 from filelock import FileLock
 
-from experiments.common.record import SCHEMA, Outcome, read_data, stamp, write_record
+from experiments.common.record import SCHEMA, Outcome, record_from, stamp, write_record
 from experiments.runner.request import Request
 from mvest.errors import InputError
 from mvest.files import remove_parts
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
 
 __all__ = [
     "CONFIG",
@@ -62,12 +62,12 @@ def lock(folder: Path) -> FileLock:
 def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
     """The record in a folder if it is there, of this version, and of the configuration."""
     try:
-        record = json.loads((folder / RESULT).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = read_mapping(folder / RESULT)
+        record = record_from(data, Any, str(folder / RESULT))
+    except InputError:
         return None
-    if not isinstance(record, dict) or record.get("schema") != SCHEMA:
-        return None
-    return record if record["provenance"]["config_hash"] == config_hash else None
+    same = record.schema == SCHEMA and record.provenance.config_hash == config_hash
+    return data if same else None
 
 
 def is_done(folder: Path) -> bool:
@@ -180,4 +180,4 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
     )
     write_json(request.folder / CONFIG, request.values)
     write_record(request.folder / RESULT, record)
-    return read_data(request.folder / RESULT)
+    return read_mapping(request.folder / RESULT)

@@ -16,12 +16,14 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from experiments.common.record import model_of_values, read_data
+from experiments.common.record import model_of_values
 from experiments.runner.compared import compared
 from experiments.runner.folder import RESULT
 from experiments.runner.request import Request
 from mvest.errors import InputError
 from mvest.provenance import git_state, write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.text import one_line
 
 __all__ = ["PLAN", "Plan", "PlannedJob"]
 
@@ -146,11 +148,11 @@ class Plan:
         ]
         sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
         try:
-            before = json.loads((self.folder / PLAN).read_text(encoding="utf-8"))
+            before = read_mapping(self.folder / PLAN)
             # The same jobs, perhaps with more of them, are the same sweep that goes on.
             if {job["hash"] for job in before["jobs"]} <= {job["hash"] for job in jobs}:
                 sweep_id = before["sweep_id"]
-        except (OSError, ValueError, KeyError):
+        except (InputError, KeyError, TypeError):
             # The first sweep here.
             pass
         write_json(
@@ -183,8 +185,10 @@ class Plan:
             If there is none, or it was written by another version or on another machine.
         """
         place = folder.resolve() / PLAN
+        if not place.is_file():
+            raise InputError(f"no sweep is planned in {folder}")
         try:
-            data = json.loads(place.read_text(encoding="utf-8"))
+            data = read_mapping(place)
             os.chdir(data["directory"])
             first = data["values"]
             jobs = tuple(
@@ -204,8 +208,9 @@ class Plan:
             return cls(data["name"], place.parent, settings, jobs, 1, publish, written)
         except OSError as error:
             raise InputError(f"no sweep is planned in {folder}: {error}") from error
-        except (ValueError, KeyError) as error:
-            raise InputError(f"{place} is no plan of this version: {error}") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            why = one_line(error, 160)
+            raise InputError(f"{place} is no plan of this version: {why}") from error
 
     def names(self) -> list[str]:
         """What sets each job apart from all others, in a few words."""
@@ -272,7 +277,7 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
     )
     for place in places[:MAX_READ]:
         try:
-            record = compared(read_data(place), str(place))
+            record = compared(read_mapping(place), str(place))
         except InputError:
             # Not a result of this version: it tells no time.
             continue

@@ -6,7 +6,6 @@ for or asked about later, and what died with a task is recorded, with Slurm's wo
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shlex
@@ -23,8 +22,9 @@ import experiments
 from experiments.runner.drain import Shard
 from experiments.runner.folder import is_done, require_writable, result_time, write_failure
 from experiments.runner.plan import Plan, PlannedJob
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_json
 
 __all__ = ["Submission", "record_dead", "submit", "submitted", "under_way", "wait_for"]
 
@@ -155,10 +155,10 @@ def submit(plan: Plan, settings: Mapping[str, Any]) -> list[Submission]:
 def submitted(folder: Path) -> list[Submission]:
     """The arrays that were submitted last for the sweep in a folder; none if there were none."""
     try:
-        data = json.loads((folder / FOLDER / SUBMITTED).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = read_json(folder / FOLDER / SUBMITTED)
+        return [Submission(**{**one, "tasks": tuple(one["tasks"])}) for one in data]
+    except (InputError, TypeError, KeyError):
         return []
-    return [Submission(**{**one, "tasks": tuple(one["tasks"])}) for one in data]
 
 
 def wait_for(arrays: Sequence[Submission], poll_s: float) -> None:

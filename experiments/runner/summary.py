@@ -9,11 +9,11 @@ from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
 from experiments.common.estimates import SeedRun
-from experiments.common.record import read_data
 from experiments.runner.comparison import short_names
 from experiments.runner.tracking import Store, telling
 from experiments.sweeps.collected import Sweep, check_sweep
 from mvest.files import write_atomically
+from mvest.reading.json_file import read_mapping
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -39,7 +39,7 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
     """
     from mlflow.entities import Metric
 
-    sweep = check_sweep(read_data(folder / SWEEP), str(folder / SWEEP))
+    sweep = check_sweep(read_mapping(folder / SWEEP), str(folder / SWEEP))
     result_hash = hashlib.sha256((folder / SWEEP).read_bytes()).hexdigest()
     with telling(store.place):
         chosen = f"tags.kind = '{IS_SWEEP}' and tags.sweep_id = '{sweep_id}'"

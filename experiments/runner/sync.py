@@ -14,7 +14,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from experiments.common.record import read_data
 from experiments.runner.plan import PLAN, Plan
 from experiments.runner.summary import SWEEP, log_summary
 from experiments.runner.tracking import (
@@ -27,6 +26,7 @@ from experiments.runner.tracking import (
     upload,
 )
 from mvest.errors import InputError, MvestError
+from mvest.reading.json_file import read_mapping
 
 __all__ = ["jobs_in", "log_sweep", "main", "open_early"]
 
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         groups: dict[tuple[str | None, str, bool | None], list[Path]] = {}
         for job in jobs_in(folder):
             try:
-                config = read_data(job / "config.json")
+                config = read_mapping(job / "config.json")
                 if config["tracking"]["enabled"] and is_complete(job):
                     tracking = config["tracking"]
                     key = tracking["uri"], str(config["name"]), tracking.get("runs")
@@ -145,7 +145,7 @@ def _sweep_in(folder: Path) -> tuple[str | None, dict[str, str]]:
     """The sweep that a folder was last used for: its id, and folder -> name of its jobs."""
     if not (folder / PLAN).is_file():
         return None, {}
-    plan = read_data(folder / PLAN)
+    plan = read_mapping(folder / PLAN)
     names = {Path(job["folder"]).name: str(job.get("name", "")) for job in plan["jobs"]}
     return plan.get("sweep_id"), names
 

@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from experiments.common.record import SCHEMA, Record, read_data
+from experiments.common.record import SCHEMA, Record
 from experiments.runner.compared import Compared, compared
 from experiments.runner.comparison import inputs, metrics, parameters
 from experiments.runner.folder import is_done
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -198,7 +199,7 @@ def track_job(folder: Path, config: Mapping[str, Any]) -> None:
 
 def is_complete(job: Path) -> bool:
     """Whether a job has ended: it has failed, or its marker says that everything is on disk."""
-    return is_done(job) or read_data(job / "result.json").get("status") != "converged"
+    return is_done(job) or read_mapping(job / "result.json").get("status") != "converged"
 
 
 def is_tracked(folder: Path) -> bool:
@@ -206,7 +207,7 @@ def is_tracked(folder: Path) -> bool:
     receipt = folder / RECEIPT
     if not receipt.is_file():
         return False
-    return bool(read_data(receipt).get("result_hash") == _digest(folder / "result.json"))
+    return bool(read_mapping(receipt).get("result_hash") == _digest(folder / "result.json"))
 
 
 def upload(
@@ -235,12 +236,12 @@ def upload(
         If a file of the job cannot be read.
     """
     place = folder / "result.json"
-    data, config = read_data(place), read_data(folder / "config.json")
+    data, config = read_mapping(place), read_mapping(folder / "config.json")
     if data.get("schema") != SCHEMA:
         raise InputError(f"{place} was written by another version")
     record = compared(data, str(place))
     result_hash = _digest(place)
-    receipt = read_data(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
+    receipt = read_mapping(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
     config_hash = record.provenance.config_hash
     present = None
     for run in store.runs(config_hash):

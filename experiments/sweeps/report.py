@@ -13,7 +13,6 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from experiments.common.record import read_data
 from experiments.sweeps.collected import Sweep, check_sweep
 from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.noise_figures import calibration_figure, noise_figure
@@ -36,6 +35,7 @@ from experiments.sweeps.start_figures import basin_figure, paths_figure
 from experiments.sweeps.tables import summary, table_note
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.reading.json_file import read_mapping
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import latex_rows, latex_text, markdown_rows, markdown_text
 
@@ -109,7 +109,7 @@ def read_sweeps(results: Path) -> list[Sweep]:
     """
     found = []
     for path in sorted((results / SWEEPS).glob("*.json")):
-        found.append(check_sweep(read_data(path), str(path)))
+        found.append(check_sweep(read_mapping(path), str(path)))
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,12 +9,12 @@ import numpy as np
 
 from mvest.cases.case import ErrorSamples
 from mvest.errors import InputError
+from mvest.reading.npz import read_npz
+from mvest.reading.text import one_line
 
 __all__ = ["ARRAYS", "read_error_samples", "write_error_samples"]
 
 ARRAYS = ("frames", "vertices", "tips")
-MAX_FILE_SIZE = 2**29
-"""Bytes of all arrays."""
 
 
 def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
@@ -32,27 +31,15 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     """
     if file.suffix.lower() != ".npz":
         raise InputError(f"{file.name}: extension {file.suffix!r}, expected .npz")
-    try:
-        with zipfile.ZipFile(file) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > MAX_FILE_SIZE:
-            raise InputError(
-                f"{file.name}: {size} bytes of arrays, expected at most {MAX_FILE_SIZE}"
-            )
-        with np.load(file, allow_pickle=False) as stored:
-            if sorted(stored.files) != sorted(ARRAYS):
-                raise InputError(
-                    f"{file.name}: arrays {', '.join(stored.files) or 'none'}, expected "
-                    f"{', '.join(ARRAYS)}"
-                )
-            names, vertices, tips = (stored[name] for name in ARRAYS)
-    except (OSError, zipfile.BadZipFile, EOFError, ValueError) as fault:
-        if isinstance(fault, InputError):
-            raise
-        raise InputError(f"{file.name}: cannot be read as .npz without pickles: {fault}") from fault
+    stored = read_npz(file, ARRAYS, exact=True, where=file.name)
+    names, vertices, tips = (stored[name] for name in ARRAYS)
     if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
-        shown = names.tolist() if names.dtype.kind == "U" else f"an array of {names.dtype}"
-        raise InputError(f"{file.name}: frames {shown}, expected {list(frames)}")
+        shown = (
+            one_line(names.tolist(), 80)
+            if names.dtype.kind == "U"
+            else f"an array of {names.dtype}"
+        )
+        raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
     return ErrorSamples(vertices, tips)
 
 

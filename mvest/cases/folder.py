@@ -10,7 +10,6 @@ from pathlib import Path
 
 from mvest.cases.case import ErrorSamples, Frame, Role, Uncertainty, ValveCase
 from mvest.cases.checks import at, check_closing_pressure, check_frames, check_regions
-from mvest.cases.csv_files import read_numbers
 from mvest.cases.error_file import read_error_samples
 from mvest.cases.frames import SECONDS_PER, SeenFrame, check_reference, place_frame, read_frame
 from mvest.cases.paths import CASE_FILE, CaseFolder
@@ -24,6 +23,7 @@ from mvest.cases.schema import (
 )
 from mvest.cases.tissue import point_data, read_chordae, read_leaflets
 from mvest.errors import InputError
+from mvest.reading.table import read_numbers
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
 
 __all__ = ["read_case"]

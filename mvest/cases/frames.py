@@ -19,13 +19,13 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.csv_files import read_numbers, read_vertices
 from mvest.cases.ears import without_ears
 from mvest.cases.paths import CaseFolder
 from mvest.cases.rims import Rims, find_rims, match_annulus, two_loops
 from mvest.cases.schema import CaseFile, FrameEntry, wrong
 from mvest.cases.surface_files import RegionSurface, read_regions
 from mvest.errors import InputError
+from mvest.reading.table import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [

@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
-from mvest.cases.yaml_file import read_yaml
 from mvest.errors import InputError
+from mvest.reading.text import MAX_NUMBER, one_line
+from mvest.reading.yaml_file import read_yaml
 
 __all__ = [
-    "MAX_NUMBER",
     "VERSION",
     "CaseFile",
     "ChordaeEntry",
@@ -32,10 +32,6 @@ __all__ = [
 
 VERSION = 1
 """The version of the format that is read and written."""
-MAX_NUMBER = 1e9
-"""Of any number in a case, whatever its unit: far beyond sense, and far from overflow."""
-MAX_FAULT_LENGTH = 800
-"""Characters; what other libraries say of a damaged file may quote much of it."""
 
 
 def _kind(value: Any) -> str:
@@ -218,10 +214,7 @@ def case_schema() -> dict[str, Any]:
 
 def wrong(file: Path, field: str, what: str, kind: type[InputError] = InputError) -> InputError:
     """The error for one field of a case: file, field, and what is wrong with it, in one line."""
-    line = " ".join(what.split())
-    return kind(
-        f"{file}: {field}: {line if len(line) <= MAX_FAULT_LENGTH else line[:MAX_FAULT_LENGTH]}"
-    )
+    return kind(f"{file}: {one_line(field, 80)}: {one_line(what)}")
 
 
 def read_case_file(file: Path) -> CaseFile:

@@ -19,8 +19,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mvest.cases.schema import MAX_NUMBER
 from mvest.errors import GeometryError, InputError
+from mvest.reading.text import MAX_NUMBER
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
 

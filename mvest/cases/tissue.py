@@ -10,12 +10,12 @@ import numpy as np
 from mvest.cases.case import Frame, Role
 from mvest.cases.checks import at, check_chordae, check_thickness
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
-from mvest.cases.csv_files import indices, numbers, read_columns
 from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
 from mvest.cases.paths import CaseFolder
 from mvest.cases.rims import Rims
 from mvest.cases.schema import CaseFile, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
+from mvest.reading.table import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates

@@ -9,13 +9,13 @@ import numpy as np
 import yaml
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.csv_files import write_columns
 from mvest.cases.error_file import write_error_samples
 from mvest.cases.paths import CASE_FILE
 from mvest.cases.schema import VERSION
 from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.reading.table import write_columns
 from mvest.valve.io.leaflet_surfaces import write_surface
 
 __all__ = ["write_case"]

@@ -22,6 +22,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.kept import Entry
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
 __all__ = ["NOT_FOUND", "Anchors", "Kept", "content_digest"]
@@ -143,6 +144,5 @@ def _write(path: Path, kept: Kept) -> None:
 
 
 def _read(path: Path) -> Kept:
-    # Opened here: NumPy leaves what it cannot read to the garbage collector.
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-        return Kept(stored["positions"], stored["slopes"])
+    positions, slopes = read_npz(path, ["positions", "slopes"]).values()
+    return Kept(positions, slopes)

@@ -14,19 +14,20 @@ Reading is strict: what is not exactly that is refused with the file and the row
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from mvest.errors import InputError, cannot_write
+from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.table import read_numbers, write_columns
+from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -164,8 +165,8 @@ def read_request(file: Path) -> RunRequest:
             bool(data["jacobian"]),
             dict(data["settings"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{file}: no request: {error!r}") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{file}: no request: {one_line(repr(error), 120)}") from error
 
 
 def write_answer(folder: Path, prediction: Prediction, names: Sequence[str] | None = None) -> None:
@@ -200,7 +201,8 @@ def read_answer(folder: Path, request: RunRequest) -> Answer:
     status, reason = data.get("status"), data.get("reason", "")
     if status not in ("converged", "failed") or not isinstance(reason, str):
         raise InputError(
-            f"{file.name}: status {status!r}, expected 'converged' or 'failed' with a reason"
+            f"{file.name}: status {one_line(repr(status), 60)}, expected 'converged' or 'failed' "
+            "with a reason"
         )
     if status == "failed":
         return Answer(reason.strip() or "the program gives no reason", np.empty(0))
@@ -234,85 +236,20 @@ def write_points(file: Path, points: FloatArray) -> None:
 
 def _read_json(file: Path) -> dict[str, Any]:
     """A mapping of this format and version."""
-    try:
-        with file.open("rb") as stream:
-            text = stream.read(MAX_JSON_SIZE + 1)
-        if len(text) > MAX_JSON_SIZE:
-            raise InputError(f"{file.name}: more than {MAX_JSON_SIZE} bytes")
-        data = json.loads(text, parse_constant=_refuse)
-    except FileNotFoundError as error:
-        raise InputError(f"{file.name} is missing") from error
-    except OSError as error:
-        raise InputError(f"{file.name} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file.name} is not JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{file.name} holds a {type(data).__name__}, expected a mapping")
+    data = read_mapping(file, MAX_JSON_SIZE, file.name)
     found = (data.get("format"), data.get("version"))
     if found != (FORMAT, VERSION):
-        raise InputError(f"{file.name}: format and version {found}, expected {(FORMAT, VERSION)}")
+        raise InputError(
+            f"{file.name}: format and version {one_line(found, 80)}, expected {(FORMAT, VERSION)}"
+        )
     return data
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no number of JSON")
 
 
 def _read_table(file: Path, header: Sequence[str], count: int | None) -> FloatArray:
     """Finite numbers ``(count, columns)`` below a header; nothing is read beyond what is asked."""
-    rows: list[list[float]] = []
-    try:
-        with file.open(encoding="utf-8", newline="") as stream:
-            reader = csv.reader(stream, strict=True)
-            found = next(reader, [])
-            if found != list(header):
-                raise InputError(
-                    f"{file.name}: columns {','.join(found)[:80] or 'none'}, expected "
-                    f"{','.join(header)}"
-                )
-            for row in reader:
-                if len(rows) == count:
-                    raise InputError(f"{file.name}: more than the {count} rows asked for")
-                rows.append(_numbers(file, row, len(rows), header))
-    except FileNotFoundError as error:
-        raise InputError(f"{file.name} is missing") from error
-    except OSError as error:
-        raise InputError(f"{file.name} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file.name}: byte {error.start} is no UTF-8 text") from error
-    except csv.Error as error:
-        raise InputError(f"{file.name}: no comma-separated text: {error}") from error
-    if not rows or (count is not None and len(rows) != count):
-        raise InputError(f"{file.name}: {len(rows)} rows, expected {count or 'at least one'}")
-    return np.array(rows, dtype=np.float64)
-
-
-def _numbers(file: Path, row: Sequence[str], number: int, header: Sequence[str]) -> list[float]:
-    if len(row) != len(header):
-        raise InputError(f"{file.name}: row {number} has {len(row)} cells, expected {len(header)}")
-    values = []
-    for name, cell in zip(header, row, strict=True):
-        try:
-            # Python alone reads 1_000 as a number.
-            value = math.nan if "_" in cell else float(cell)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(
-                f"{file.name}: {name} of row {number} is {cell[:40]!r}, expected a finite number"
-            )
-        values.append(value)
-    return values
+    return read_numbers(file, header, strict=True, count=count, max_abs=math.inf, where=file.name)
 
 
 def _write_table(file: Path, header: Sequence[str], rows: Iterable[Iterable[float]]) -> None:
     """Numbers with all their digits."""
-    try:
-        with file.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(header)
-            writer.writerows([repr(float(value)) for value in row] for row in rows)
-    except OSError as error:
-        raise cannot_write(file, error) from error
+    write_columns(file, header, ([repr(float(value)) for value in row] for row in rows))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +19,7 @@ from mvest.external.contract import ANSWERS, Answer, RunRequest, read_answer, wr
 from mvest.external.differences import Differences
 from mvest.external.process import Command
 from mvest.provenance import config_hash, write_json
+from mvest.reading.json_file import read_mapping
 from mvest.typing import FloatArray
 
 __all__ = ["ProcessModel"]
@@ -217,10 +217,10 @@ class ProcessModel:
     def _finished(self, folder: Path, request: RunRequest) -> Answer | None:
         """The answer of a finished run; None if there is none, or its files were changed since."""
         try:
-            marker = json.loads((folder / FINISHED).read_text(encoding="utf-8"))
-            if marker["sha256"] == _answers(folder):
+            marker = read_mapping(folder / FINISHED)
+            if marker.get("sha256") == _answers(folder):
                 return read_answer(folder, request)
-        except (OSError, ValueError, KeyError, TypeError):
+        except InputError:
             pass
         return None
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -105,11 +106,11 @@ def valve_figure(fields: Path) -> Figure:
         the closed frame last, ``rest (n, 3)`` mm and ``distance (n,)`` mm.
     """
     try:
-        with np.load(fields) as data:
-            triangles, region = data["triangles"], data["region"]
-            rest, closed = data["rest"].astype(float), data["fitted"][-1].astype(float)
-            distance = data["distance"]
-    except (OSError, KeyError, ValueError) as error:
+        data = read_npz(fields, ("triangles", "region", "rest", "fitted", "distance"))
+        triangles, region = data["triangles"], data["region"]
+        rest, closed = data["rest"].astype(float), data["fitted"][-1].astype(float)
+        distance = data["distance"]
+    except (LookupError, ValueError) as error:
         raise InputError(f"{fields}: no fields of a valve ({error})") from error
     figure = Figure(figsize=(8.4, 6.4), layout="constrained")
     tissue = LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)]

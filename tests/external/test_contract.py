@@ -58,7 +58,7 @@ ORDER = '{"format": "mvest-external", "version": 1, "status": "converged", "reas
         ("response.json", ORDER.replace('""', "NaN"), "NaN is no number"),
         ("response.json", ORDER.replace("1,", "2,"), "expected ('mvest-external', 1)"),
         ("response.json", ORDER.replace("converged", "ok"), "status 'ok'"),
-        ("response.json", ORDER + " " * 1_000_001, "more than"),
+        ("response.json", ORDER + " " * 1_000_001, "expected at most 1000000"),
         ("observation.csv", None, "observation.csv is missing"),
         ("observation.csv", "", "columns none, expected x,y,z"),
         ("observation.csv", "1,2,3\n4,5,6\n", "columns 1,2,3"),

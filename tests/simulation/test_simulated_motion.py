@@ -453,14 +453,14 @@ def test_a_file_that_cannot_be_written_is_said(drawn, tmp_path):
     [
         ({"version": np.array(99)}, "version: 99, expected 1"),
         ({"names": np.array(["a", "a"])}, "names: 2 names, expected different ones"),
-        ({"layout": np.array([32, 9, 1])}, r"layout: shape \(3,\)"),
+        ({"layout": np.array([32, 9, 1])}, r"layout is int64 of shape \(3,\)"),
         ({"frames": np.array([2, 3])}, r"times: shape \(6,\), expected \(5,\)"),
         ({"frames": np.array([7, -1])}, "frames: expected a number for each of 2 valves"),
         ({"chord_tip": np.array([0, 2, 1])}, "chord_tip: expected 0 and 1 only"),
         ({"thickness": np.ones(3, np.float32)}, r"thickness: shape \(3,\)"),
         ({"thickness": np.full(576, np.nan, np.float32)}, "thickness: not finite"),
         ({"times": np.zeros(6, np.float32)}, "moving valve first: times"),
-        ({"times": np.zeros(6, int)}, "times: numbers of kind int64, expected f"),
+        ({"times": np.zeros(6, int)}, "times is int64 of .*, expected finite numbers"),
         ({"more": np.zeros(1)}, "holds .*more"),
     ],
 )
@@ -477,18 +477,18 @@ def test_a_file_that_is_not_as_it_must_be_is_refused(drawn, tmp_path, change, me
 
 def test_a_file_of_something_else_is_refused(drawn, tmp_path):
     path = tmp_path / "p.npz"
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="is missing"):
         load_population(path)
     for content in (b"", b"nothing", pickle.dumps([1, 2])):
         path.write_bytes(content)
-        with pytest.raises(InputError, match="not a readable"):
+        with pytest.raises(InputError, match="cannot be read"):
             load_population(path)
     save_population(path, drawn)
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_population(path)
     np.savez(path, **{name: np.array([None]) for name in ("times",)})
-    with pytest.raises(InputError, match="holds times"):
+    with pytest.raises(InputError, match="settings_hash, .* are missing"):
         load_population(path)
 
 

@@ -26,10 +26,11 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.cases.volume import run_volume
-from experiments.common.record import Outcome, read_data
+from experiments.common.record import Outcome
 from experiments.common.schema import build
 from mvest.errors import InputError, MvestError
 from mvest.provenance import THREAD_VARIABLES, write_json
+from mvest.reading.json_file import read_mapping
 
 __all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "read_estimate", "seal"]
 
@@ -122,7 +123,7 @@ def read_estimate(folder: Path) -> Outcome[Findings]:
     InputError
         If it left nothing.
     """
-    return TypeAdapter(Outcome[Findings]).validate_python(read_data(folder / ESTIMATE))
+    return TypeAdapter(Outcome[Findings]).validate_python(read_mapping(folder / ESTIMATE))
 
 
 def main() -> int:

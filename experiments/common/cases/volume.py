@@ -17,7 +17,6 @@ from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.progress import PartBar
 from experiments.common.record import Outcome
 from mvest.cases.case import ValveCase
-from mvest.cases.csv_files import read_numbers
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
@@ -39,6 +38,7 @@ from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reading.table import read_numbers
 from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
 from mvest.typing import FloatArray, IntArray
 

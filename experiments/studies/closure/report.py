@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.findings import stored_arrays
 from experiments.common.record import Record
 from experiments.common.report import write_report
 from mvest.closure.measures import StepMeasures
 from mvest.errors import InputError
+from mvest.reading.npz import read_npz
 from mvest.reporting.case.drawing import (
     ATRIUM,
     View,
@@ -88,7 +88,7 @@ def closure_figure(record: Record[Findings], fields: Path) -> Figure:
         If the fields cannot be read.
     """
     try:
-        arrays = stored_arrays(fields)
+        arrays = read_npz(fields)
         # The ends of the chordae are points of no triangle.
         shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
         valve = _valve(arrays, shapes)

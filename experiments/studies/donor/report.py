@@ -16,6 +16,7 @@ from experiments.common.record import Record
 from experiments.common.report import write_drawn
 from experiments.studies.donor.findings import Distances, Findings
 from mvest.errors import InputError
+from mvest.reading.npz import read_npz
 from mvest.reporting.figures import DISTANCE_MAP, VIEWS
 from mvest.reporting.markup import MISSING
 from mvest.typing import FloatArray, IntArray
@@ -39,10 +40,10 @@ def donor_figure(fields: Path) -> Figure:
         ``(n, 3)`` mm, and ``annulus`` and ``free_edge`` vertices in loop order.
     """
     try:
-        with np.load(fields, allow_pickle=False) as data:
-            triangles, loops = data["triangles"], (data["annulus"], data["free_edge"])
-            shapes = {k: data[k].astype(float) for k in ("recorded", "generic", "fitted")}
-    except (OSError, KeyError, ValueError) as error:
+        data = read_npz(fields)
+        triangles, loops = data["triangles"], (data["annulus"], data["free_edge"])
+        shapes = {k: data[k].astype(float) for k in ("recorded", "generic", "fitted")}
+    except (KeyError, ValueError) as error:
         raise InputError(f"{fields}: no fields of a recorded valve ({error})") from error
     distance = {
         name: np.linalg.norm(points - shapes["recorded"], axis=1) for name, points in shapes.items()

@@ -26,6 +26,7 @@ from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.transform import Log, to_filter
 from mvest.kept import Entry
 from mvest.observation.vertices import observed_frames
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
 __all__ = ["ComparedProblem", "SurrogateModel", "TimedModel", "build_problem", "fit_to_prior"]
@@ -269,5 +270,5 @@ def _run_all(problem: ComparedProblem, points: FloatArray, store: Path) -> list[
 
 
 def _read(path: Path) -> _Run:
-    with np.load(path, allow_pickle=False) as stored:
-        return stored["y"], stored["by_x"]
+    y, by_x = read_npz(path, ["y", "by_x"]).values()
+    return y, by_x

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +42,7 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing.slicer import write_sequence_nrrd
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
 from mvest.reporting.case.findings import UnknownRow
 from mvest.simulation.motion.closing import MotionSettings
 from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
@@ -94,7 +94,7 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
     """
     values, folder = job.values, job.folder
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
-    hidden = json.loads((place.truth / HIDDEN).read_text(encoding="utf-8"))
+    hidden = read_mapping(place.truth / HIDDEN)
     stated = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
     volume = _estimated(stated, folder, place.volume, place.hidden)
     # Of the known shape nothing is in error but what the estimator cannot know.
@@ -200,7 +200,7 @@ def make_imaged_patient(
 
 def _place(root: Path) -> ImagedPlace:
     place = ImagedPlace.within(root)
-    json.loads((place.truth / HIDDEN).read_text(encoding="utf-8"))
+    read_mapping(place.truth / HIDDEN)
     return place
 
 

@@ -25,6 +25,8 @@ from experiments.studies.imaging.trials import (
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.moving_valve import MovingValve
 from mvest.kept import get_or_make
+from mvest.reading.json_file import parse_json
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
 __all__ = ["HeldOut", "hold_out"]
@@ -194,6 +196,5 @@ def _write(place: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def _read(place: Path) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    with np.load(place, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files if name != "row"}
-        return json.loads(str(stored["row"])), arrays
+    arrays = read_npz(place)
+    return parse_json(str(arrays.pop("row")), f"{place}: row"), arrays

@@ -6,7 +6,6 @@ all, and made once: an interrupted study goes on where it was.
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ from experiments.common.store import Store, key_of
 from experiments.studies.imaging.findings import Spent
 from experiments.studies.imaging.parallel import in_processes
 from experiments.studies.imaging.settings import ImagingSettings
+from mvest.errors import InputError
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters
@@ -38,6 +38,8 @@ from mvest.imaging.learning.training import (
 from mvest.imaging.moving_valve import MovingValve
 from mvest.kept import Entry, get_or_make
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.npz import read_npz
 from mvest.simulation.motion.files import load_population, save_population
 from mvest.simulation.motion.population import Population, draw_population
 
@@ -72,12 +74,11 @@ class StoredSamples(Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with np.load(path, allow_pickle=False) as stored:
-            self.cpu_s = float(stored["cpu_s"])
+        self.cpu_s = float(read_npz(path, ["cpu_s"])["cpu_s"])
 
     def __getitem__(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        with np.load(self._path, allow_pickle=False) as stored:
-            return stored[f"{name}.x"], stored[f"{name}.y"]
+        x, y = read_npz(self._path, [f"{name}.x", f"{name}.y"]).values()
+        return x, y
 
     def __iter__(self) -> Iterator[str]:
         return iter(STAGES)
@@ -312,6 +313,6 @@ def _write_samples(path: Path, made: tuple[Samples, float]) -> None:
 def _spent(path: Path) -> Spent:
     """What a part cost, from beside it; unknown where it was brought here without that."""
     try:
-        return Spent(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        return Spent(**read_mapping(path))
+    except (InputError, TypeError):
         return Spent(None, None)

@@ -12,6 +12,7 @@ import numpy as np
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
+from mvest.reading.npz import read_npz
 from mvest.reporting.case.findings import UnknownRow
 
 __all__ = [
@@ -96,8 +97,8 @@ def arrays_of_patient(record: Record[Findings], path: Path) -> dict[str, Any]:
 
     if record.table != PATIENTS:
         return {}
-    with np.load(path, allow_pickle=False) as stored:
-        return {key: _small(stored[key]) for key in KEPT_ARRAYS if key in stored}
+    stored = read_npz(path)
+    return {key: _small(stored[key]) for key in KEPT_ARRAYS if key in stored}
 
 
 def _small(array: Any) -> Any:

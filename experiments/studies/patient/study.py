@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +37,8 @@ from experiments.studies.patient.tables import PATIENTS
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.npz import read_npz
 from mvest.reporting.case.findings import FrameDistances, ModuliAlone, ToTruth, UnknownRow
 from mvest.reporting.findings import Spread
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
@@ -94,7 +95,7 @@ def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlac
 
 def _place(root: Path) -> PatientPlace:
     place = PatientPlace(root / "case", root / "hidden")
-    json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
+    read_mapping(place.hidden / HIDDEN)
     return place
 
 
@@ -142,10 +143,9 @@ def reveal(
         If the patient hides nothing.
     """
     try:
-        hidden = json.loads((place.hidden / HIDDEN).read_text(encoding="utf-8"))
-        with np.load(place.hidden / POSITIONS, allow_pickle=False) as stored:
-            positions = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError) as error:
+        hidden = read_mapping(place.hidden / HIDDEN)
+        positions = read_npz(place.hidden / POSITIONS)
+    except InputError as error:
         raise InputError(f"{place.hidden} does not hold what a patient hides: {error}") from error
     truth, case = hidden["values"], estimated.findings.case
     moduli = []
@@ -185,8 +185,7 @@ def _to_truth(
     """Distances to where the valve truly was, whose shape is put among the arrays."""
     if not fields.is_file():
         return distances
-    with np.load(fields, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    arrays: dict[str, Any] = read_npz(fields)
     frames = [str(name) for name in arrays["frames"]]
     arrays["truth"] = np.stack([positions[name] for name in frames]).astype(np.float32)
     np.savez_compressed(fields, **arrays)

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from experiments.common.findings import stored_arrays
 from experiments.studies.prediction.findings import Findings, Patient
 from mvest.errors import InputError
+from mvest.reading.npz import read_npz
 from mvest.reporting.case.drawing import (
     ATRIUM,
     BLOOD,
@@ -60,7 +60,7 @@ def prediction_figure(findings: Findings, fields: Path) -> Figure:
         If the fields cannot be read.
     """
     try:
-        arrays = stored_arrays(fields)
+        arrays = read_npz(fields)
         valve = _valve(arrays)
         shapes = arrays["shapes"].astype(float)
     except (OSError, KeyError, ValueError) as error:

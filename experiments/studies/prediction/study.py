@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
-from experiments.common.findings import Rows, rows, stored_arrays, vector
+from experiments.common.findings import Rows, rows, vector
 from experiments.common.forward import outcome_of
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.record import Outcome
@@ -39,6 +39,7 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
+from mvest.reading.npz import read_npz
 from mvest.scenarios import scenario as conditions
 from mvest.scenarios.measures import contact_reach, meaning_of
 from mvest.scenarios.posterior import posterior_samples
@@ -307,7 +308,7 @@ STUDY = Study(
     run=run_prediction,
     words=prediction_words,
     write=write_prediction,
-    keep_arrays=lambda record, path: stored_arrays(path),
+    keep_arrays=lambda record, path: read_npz(path),
     sections=(
         Section(
             "prediction",

@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
@@ -29,6 +26,9 @@ from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.boosting import Boosters
 from mvest.imaging.models import MODEL_FILE
+from mvest.reading.json_file import parse_json
+from mvest.reading.npz import read_npz
+from mvest.reading.text import one_line, read_bytes
 from mvest.typing import FloatArray
 
 __all__ = ["DetectionAccuracy", "DetectionModel", "default_model", "load_model", "save_model"]
@@ -51,20 +51,13 @@ OUTPUTS: Final = {
 STAGES: Final = tuple(OUTPUTS)
 """Names of all sets of trees."""
 
-UNREADABLE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    ValueError,
-    KeyError,
-    EOFError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-)
-"""What a file that is no model, or a damaged one, raises when it is read."""
+UNFIT = (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, RecursionError)
+"""What arrays that are no model raise when one is made of them."""
 
+MAX_FILE_SIZE = 2**28
+"""Bytes; the model that comes with the package has a few millions."""
 
-MAX_REASON = 200
+MAX_REASON = 120
 """Characters of another library's message that are passed on; some quote the file."""
 
 
@@ -186,22 +179,15 @@ def load_model(path: Path | str) -> DetectionModel:
         If the file is missing, is no such model, is of another version, or is incomplete.
     """
     source = Path(path)
+    raw = read_bytes(source, MAX_FILE_SIZE)
+    stored = read_npz(io.BytesIO(raw), where=str(source))
     try:
-        raw = source.read_bytes()
-    except OSError as fault:
-        raise InputError(
-            f"{source}: cannot be read ({fault.strerror}), expected a model"
-        ) from fault
-    try:
-        stored = np.load(io.BytesIO(raw), allow_pickle=False)
-        if not isinstance(stored, NpzFile):
-            raise ValueError("a single array")
-        with stored:
-            return _model(stored, source, hashlib.sha256(raw).hexdigest())
-    except UNREADABLE as fault:
+        return _model(stored, source, hashlib.sha256(raw).hexdigest())
+    except UNFIT as fault:
         if isinstance(fault, InputError) and str(fault).startswith(str(source)):
             raise
-        why = str(fault)[:MAX_REASON]
+        lacks = "lacks " if isinstance(fault, KeyError) else ""
+        why = lacks + one_line(fault, MAX_REASON)
         raise InputError(f"{source}: {why}; expected a {FORMAT} of version {VERSION}") from fault
 
 
@@ -221,8 +207,8 @@ def default_model() -> DetectionModel:
     return load_model(MODEL_FILE)
 
 
-def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
-    about = json.loads(_text(stored["about"]))
+def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> DetectionModel:
+    about = parse_json(_text(stored["about"]), "about")
     if not isinstance(about, dict):
         raise ValueError("says nothing about itself")
     if about.get("format") != FORMAT or about.get("version") != VERSION:
@@ -254,7 +240,7 @@ def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
         texts = tuple(_text(stored[f"trees.{name}.{i}"]) for i in range(outputs))
         boosters[name] = Boosters(texts, f"{source}, {name}")
     accuracy = None
-    if "accuracy.std_mm" in stored.files:
+    if "accuracy.std_mm" in stored:
         count = np.shape(stored["accuracy.samples"])[:2]
         accuracy = DetectionAccuracy(
             _numbers(stored, "accuracy.std_mm", (n,)),
@@ -265,7 +251,7 @@ def _model(stored: NpzFile, source: Path, sha256: str) -> DetectionModel:
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
 
 
-def _numbers(stored: NpzFile, name: str, shape: tuple[int, ...]) -> FloatArray:
+def _numbers(stored: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...]) -> FloatArray:
     values = np.asarray(stored[name])
     if values.shape != shape or values.dtype.kind != "f" or not np.isfinite(values).all():
         raise ValueError(f"{name} has shape {values.shape}, or is not finite; expected {shape}")

@@ -6,7 +6,6 @@ report can say so instead of drawing something else.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.reading.npz import read_npz
+from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["CaseFields", "read_case_fields", "turn_of"]
@@ -132,13 +133,12 @@ def read_case_fields(path: Path) -> CaseFields:
     InputError
         If the file cannot be read, lacks one of those, or arrays do not fit each other.
     """
+    arrays = read_npz(path)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = dict(stored)
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
         return _turned(_fields(arrays, points))
-    except (OSError, KeyError, ValueError, IndexError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: no fields of a case ({error})") from error
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise InputError(f"{path}: no fields of a case ({one_line(error, 200)})") from error
 
 
 def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> CaseFields:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
+from mvest.reading.npz import check_array, read_npz
 from mvest.simulation.motion.population import Population
 
 __all__ = ["VERSION", "load_population", "save_population"]
@@ -21,12 +21,14 @@ VERSION = 1
 """Of the format."""
 
 ARRAYS = {
-    "version": "i", "settings_hash": "U", "refused_reasons": "U", "refused_counts": "i",
-    "names": "U", "layout": "i", "frames": "i", "chordae": "i", "times": "f", "vertices": "f",
-    "tips": "f", "thickness": "f", "chord_phi": "f", "chord_s": "f", "chord_tip": "i",
+    "version": ("i", ()), "settings_hash": ("U", ()), "refused_reasons": ("U", (None,)),
+    "refused_counts": ("i", (None,)), "names": ("U", (None,)), "layout": ("i", (2,)),
+    "frames": ("i", (None,)), "chordae": ("i", (None,)), "times": ("f", (None,)),
+    "vertices": ("f", (None, None, 3)), "tips": ("f", (None, 2, 3)), "thickness": ("f", (None,)),
+    "chord_phi": ("f", (None,)), "chord_s": ("f", (None,)), "chord_tip": ("i", (None,)),
 }  # fmt: skip
-"""Array -> kind of its numbers. What differs in length from valve to valve is in one piece, with
-the number of ``frames`` or ``chordae`` of each."""
+"""Array -> kind and shape. What differs in length from valve to valve is in one piece, with the
+number of ``frames`` or ``chordae`` of each."""
 
 
 def save_population(path: Path, population: Population) -> None:
@@ -77,15 +79,17 @@ def load_population(path: Path) -> Population:
     InputError
         If the file is missing, is of another version, or anything in it is not as it must be.
     """
-    arrays = _read(path)
-    if int(arrays["version"]) != VERSION:
+    stored = read_npz(path, list(ARRAYS), exact=True)
+    arrays: dict[str, Any] = {
+        name: check_array(stored[name], f"{path}, {name}", kind, shape)
+        for name, (kind, shape) in ARRAYS.items()
+    }
+    if arrays["version"] != VERSION:
         raise InputError(f"{path}, version: {arrays['version']}, expected {VERSION}")
     names, layout_size = arrays["names"], arrays["layout"]
     count = len(names)
     if count == 0 or len(set(names.tolist())) != count:
         raise InputError(f"{path}, names: {count} names, expected different ones, at least one")
-    if layout_size.shape != (2,):
-        raise InputError(f"{path}, layout: shape {layout_size.shape}, expected (2,)")
     layout = ValveLayout(int(layout_size[0]), int(layout_size[1]))
     for name in ("frames", "chordae"):
         if arrays[name].shape != (count,) or np.any(arrays[name] < 0):
@@ -93,7 +97,6 @@ def load_population(path: Path) -> Population:
     frames, chordae = int(arrays["frames"].sum()), int(arrays["chordae"].sum())
     reasons, refused = arrays["refused_reasons"], arrays["refused_counts"]
     for name, shape in (
-        ("settings_hash", ()),
         ("refused_counts", reasons.shape),
         ("times", (frames,)),
         ("vertices", (frames, layout.size, 3)),
@@ -122,36 +125,3 @@ def load_population(path: Path) -> Population:
         raise InputError(f"{path}: {error}") from error
     counted = dict(zip(reasons.tolist(), refused.tolist(), strict=True))
     return Population(valves, counted, str(arrays["settings_hash"]))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """All arrays of the file, of the right kinds, numbers in double precision and finite."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a population of simulated valves")
-    arrays: dict[str, Any] = {}
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            names = set(file.files)
-            if names != set(ARRAYS):
-                raise InputError(
-                    f"{path}: holds {', '.join(sorted(names))}; expected "
-                    f"{', '.join(sorted(ARRAYS))}"
-                )
-            for name, kind in ARRAYS.items():
-                arrays[name] = file[name]
-                if arrays[name].dtype.kind != kind:
-                    raise InputError(
-                        f"{path}, {name}: numbers of kind {arrays[name].dtype}, expected {kind}"
-                    )
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise InputError(f"{path}: not a readable .npz file ({error})") from error
-    for name, kind in ARRAYS.items():
-        if kind == "f":
-            arrays[name] = arrays[name].astype(np.float64)
-            if not np.isfinite(arrays[name]).all():
-                raise InputError(f"{path}, {name}: not finite, expected finite numbers")
-        elif kind == "i":
-            arrays[name] = arrays[name].astype(np.int64)
-    return arrays

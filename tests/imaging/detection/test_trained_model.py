@@ -228,7 +228,7 @@ def test_damaged_files_are_refused(path, tmp_path, seed):
 
 
 def test_a_file_that_is_not_there_and_a_folder_are_refused(tmp_path):
-    refused(tmp_path / "none.npz", "cannot be read")
+    refused(tmp_path / "none.npz", "is missing")
     refused(tmp_path, "cannot be read")
 
 

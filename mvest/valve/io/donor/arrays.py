@@ -19,13 +19,14 @@ TriValve 1.1 and of its 21 ``.vtu`` frames, 0-based and in mm, with the arrays
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.reading.npz import check_array, read_npz
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["CITATION", "DATA_VARIABLE", "REGION_NAMES", "DonorArrays", "donor_file", "load_arrays"]
@@ -62,19 +63,18 @@ class DonorArrays:
     frames: FloatArray
 
 
-_REAL: dict[str, tuple[int | None, ...]] = {
-    "nodes_ref_mm": (None, 3),
-    "bc_displacement_mm": (None, 3),
-    "frames_xyz_mm": (None, None, 3),
+_FORMS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "nodes_ref_mm": ("f", (None, 3)),
+    "bc_displacement_mm": ("f", (None, 3)),
+    "frames_xyz_mm": ("f", (None, None, 3)),
+    **{f"quads_{name}": ("i", (None, 4)) for name in REGION_NAMES},
+    "chordae_edges": ("i", (None, 2)),
+    "annulus_nodes": ("i", (None,)),
+    "free_edge_nodes": ("i", (None,)),
+    "bc_nodes": ("i", (None,)),
+    "chordae_anchor_nodes": ("i", (None,)),
 }
-_INTEGER: dict[str, tuple[int | None, ...]] = {
-    **{f"quads_{name}": (None, 4) for name in REGION_NAMES},
-    "chordae_edges": (None, 2),
-    "annulus_nodes": (None,),
-    "free_edge_nodes": (None,),
-    "bc_nodes": (None,),
-    "chordae_anchor_nodes": (None,),
-}
+"""Kind and shape of each array, none of them empty."""
 
 
 def donor_file(data_dir: str | Path | None = None) -> Path:
@@ -103,23 +103,16 @@ def load_arrays(path: Path) -> DonorArrays:
     InputError
         If the file is unreadable, lacks an array, or its arrays contradict each other.
     """
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            missing = sorted({*_REAL, *_INTEGER} - set(archive.files))
-            if missing:
-                raise InputError(f"{path}: arrays {', '.join(missing)} are missing. {_ORIGIN}")
-            raw = {name: archive[name] for name in (*_REAL, *_INTEGER)}
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: not a readable .npz file of plain arrays ({error}). {_ORIGIN}"
-        ) from error
-    for name, array in raw.items():
-        _check_form(path, name, array)
+    stored = read_npz(path, list(_FORMS))
+    raw: dict[str, Any] = {
+        name: check_array(stored[name], f"{path}: {name}", kind, shape)
+        for name, (kind, shape) in _FORMS.items()
+    }
     n = len(raw["nodes_ref_mm"])
-    for name in _INTEGER:
-        if raw[name].min() < 0 or raw[name].max() >= n:
+    for name, array in raw.items():
+        if not array.size:
+            raise InputError(f"{path}: {name} is {array.dtype} of shape {array.shape}")
+        if _FORMS[name][0] == "i" and not 0 <= array.min() <= array.max() < n:
             raise InputError(f"{path}: {name} refers to nodes outside 0 to {n - 1}")
     if raw["frames_xyz_mm"].shape[1] != n or len(raw["frames_xyz_mm"]) < 2:
         raise InputError(
@@ -133,28 +126,14 @@ def load_arrays(path: Path) -> DonorArrays:
         )
     quads = [raw[f"quads_{name}"] for name in REGION_NAMES]
     return DonorArrays(
-        nodes=raw["nodes_ref_mm"].astype(np.float64),
-        quads=np.vstack(quads).astype(np.int64),
+        nodes=raw["nodes_ref_mm"],
+        quads=np.vstack(quads),
         quad_region=np.repeat(np.arange(len(quads)), [len(q) for q in quads]),
-        chord_edges=raw["chordae_edges"].astype(np.int64),
-        chord_anchors=raw["chordae_anchor_nodes"].astype(np.int64),
-        annulus=raw["annulus_nodes"].astype(np.int64),
-        free_edge=raw["free_edge_nodes"].astype(np.int64),
-        constrained=raw["bc_nodes"].astype(np.int64),
-        displacement=raw["bc_displacement_mm"].astype(np.float64),
-        frames=raw["frames_xyz_mm"].astype(np.float64),
+        chord_edges=raw["chordae_edges"],
+        chord_anchors=raw["chordae_anchor_nodes"],
+        annulus=raw["annulus_nodes"],
+        free_edge=raw["free_edge_nodes"],
+        constrained=raw["bc_nodes"],
+        displacement=raw["bc_displacement_mm"],
+        frames=raw["frames_xyz_mm"],
     )
-
-
-def _check_form(path: Path, name: str, array: FloatArray | IntArray) -> None:
-    kinds, shape = ("f", _REAL[name]) if name in _REAL else ("iu", _INTEGER[name])
-    fits = array.ndim == len(shape) and all(
-        want is None or want == got for want, got in zip(shape, array.shape, strict=True)
-    )
-    if not fits or array.dtype.kind not in kinds or array.size == 0:
-        raise InputError(
-            f"{path}: {name} is {array.dtype} of shape {array.shape}, expected "
-            f"{'real' if kinds == 'f' else 'integer'} of shape {shape} (None: any length > 0)"
-        )
-    if kinds == "f" and not np.isfinite(array).all():
-        raise InputError(f"{path}: {name} has values that are not finite")

@@ -19,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mvest.errors import ConfigurationError, GeometryError, MeshingError
+from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
 from mvest.kept import Entry
+from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
@@ -222,8 +223,8 @@ def _mesh(
             ) from None
         if done.returncode != 0 or not target.exists():
             raise MeshingError(f"pytetwild {_failure(done.returncode, done.stderr)}")
-        with np.load(target, allow_pickle=False) as data:
-            return data["nodes"], data["tetrahedra"]
+        nodes, tetrahedra = read_npz(target, ["nodes", "tetrahedra"]).values()
+        return nodes, tetrahedra
 
 
 def _failure(code: int, stderr: str) -> str:
@@ -298,10 +299,9 @@ def _save(path: Path, mesh: TetrahedralMesh) -> None:
 
 def _load(path: Path) -> tuple[FloatArray, IntArray]:
     try:
-        with np.load(path, allow_pickle=False) as data:
-            nodes, tetrahedra, stored = data["nodes"], data["tetrahedra"], str(data["sha256"])
-    except Exception as fault:
+        nodes, tetrahedra, stored = read_npz(path, ["nodes", "tetrahedra", "sha256"]).values()
+    except InputError as fault:
         raise MeshingError(f"{path}: stored mesh is unreadable ({fault}); delete it") from fault
-    if content_sha256(nodes, tetrahedra) != stored:
+    if content_sha256(nodes, tetrahedra) != str(stored):
         raise MeshingError(f"{path}: stored mesh does not match its hash {stored}; delete it")
     return nodes, tetrahedra
