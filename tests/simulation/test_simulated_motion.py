@@ -488,7 +488,7 @@ def test_a_file_of_something_else_is_refused(drawn, tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         load_population(path)
     np.savez(path, **{name: np.array([None]) for name in ("times",)})
-    with pytest.raises(InputError, match="settings_hash, .* are missing"):
+    with pytest.raises(InputError, match=r"settings_hash, .* are missing"):
         load_population(path)
 
 

@@ -133,8 +133,8 @@ def read_case_fields(path: Path) -> CaseFields:
     InputError
         If the file cannot be read, lacks one of those, or arrays do not fit each other.
     """
-    arrays = read_npz(path)
     try:
+        arrays = read_npz(path, where=path.name)
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
         return _turned(_fields(arrays, points))
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
