@@ -42,6 +42,7 @@ NOT_THE_RESULT = (
     "dry_run",
     "detach",
     "time_limit_s",
+    "memory_limit_gb",
     "isolate",
     "check",
     "imaging.processes",
@@ -201,6 +202,7 @@ class Config:
     dry_run: bool = False  # only say what would run, and how long it would take
     detach: bool = False  # of a sweep: submit its jobs, or only plan them, and leave
     time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
+    memory_limit_gb: float | None = None  # beyond which it fails; null: its part of the machine
     isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
     factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
     # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of

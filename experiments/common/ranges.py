@@ -54,6 +54,7 @@ RANGES = (
     # What runs.
     Range(0, 2**32 - 1, "", "what random generators take", "seed surrogate_seed"),
     Range(0.01, 2_592_000, "s", "up to 30 days; longer is no limit", "time_limit_s"),
+    Range(0.1, 100_000, "GB", "more than any machine has is no limit", "memory_limit_gb"),
     Range(0.01, 3600, "s", "an hour is too long to notice an end", "launcher.poll_s"),
     Range(1, 525_600, "min", "up to a year", "launcher.timeout_min"),
     Range(0.01, 100_000, "GB", "the memory of one task", "launcher.mem_gb"),

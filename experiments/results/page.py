@@ -44,7 +44,8 @@ ORDER = ("initial_guess", "noise", "covariance", "filter", "discrepancy")
 """Sweeps of these kinds come first, in this order."""
 
 NOT_SETTINGS = ("paths", "hydra", "sweep", "title", "paper", "parameters", "name", "row", "table",
-                "publish", "force", "dry_run", "detach", "time_limit_s", "factors")  # fmt: skip
+                "publish", "force", "dry_run", "detach", "time_limit_s", "memory_limit_gb",
+                "factors")  # fmt: skip
 """Parts of a configuration that say where and how it runs or what it is called."""
 
 OTHERS = (

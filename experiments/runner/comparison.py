@@ -22,7 +22,8 @@ Values = Mapping[str, Any]
 
 NOT_COMPARED = (
     "hydra", "paths", "tracking", "sweep", "factors", "paper", "name", "title", "table", "row",
-    "publish", "force", "dry_run", "detach", "time_limit_s", "figures", "isolate",
+    "publish", "force", "dry_run", "detach", "time_limit_s", "memory_limit_gb", "figures",
+    "isolate",
 )  # fmt: skip
 """Parts of a configuration that say nothing about a run beside another one."""
 

@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.config import hash_of, plain
 from experiments.runner.compared import last_compared
+from experiments.runner.limits import TIME_LIMIT_S
 from experiments.runner.plan import Attempt, Plan, PlannedJob
 from experiments.runner.request import Request, as_published, publish_as
 from mvest.errors import ConfigurationError
@@ -55,9 +56,13 @@ def make_plan(config: DictConfig, loader: ConfigLoader, arguments: Sequence[str]
     compose = _Composer(config, loader)
     jobs: list[PlannedJob] = []
     first: dict[str, Any] = {}
+    # Null takes the limit away; the default holds where nothing is said.
+    limited = any(line.partition("=")[0] == "time_limit_s" for line in arguments)
     for overrides in expand(grids(config), arguments, loader):
         composed = compose(overrides)
         values = plain(composed)
+        if not limited and values["time_limit_s"] is None:
+            values["time_limit_s"] = TIME_LIMIT_S
         config_hash = hash_of(values)
         # Ten thousand configurations fit into memory where they share what is alike in them.
         first = first or values

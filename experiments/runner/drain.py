@@ -133,7 +133,7 @@ def _drain(plan: Plan, jobs: Iterable[PlannedJob], worker: WorkerProcess, name: 
         for job in jobs:
             before = result_time(job.folder)
             try:
-                record = run_apart(job.request, worker, plan.written_ns)
+                record = run_apart(job.request, worker, plan.written_ns, plan.workers)
                 end = End.of(job, compared(record, str(job.folder)), process)
             except StoppedError:
                 break

@@ -30,7 +30,9 @@ from experiments.runner.folder import (
     result_time,
     write_failure,
 )
+from experiments.runner.limits import MEMORY_LIMIT, default_memory_gb
 from experiments.runner.request import Request
+from mvest.errors import ConfigurationError
 from mvest.provenance import THREAD_VARIABLES
 
 __all__ = ["StoppedError", "WorkerProcess", "new_worker", "run_apart"]
@@ -57,13 +59,24 @@ class WorkerProcess:
         self._stopped = False
         atexit.register(self.close)
 
-    def run(self, request: Request, time_limit_s: float | None = None) -> str | None:
+    def run(
+        self,
+        request: Request,
+        time_limit_s: float | None = None,
+        memory_limit_gb: float | None = None,
+        *,
+        aloud: bool = False,
+    ) -> str | None:
         """Run one job; None if it left its record, otherwise the reason why it did not.
+
+        ``aloud``: somebody waits for this one job, sees its progress, and is told if it is refused.
 
         Raises
         ------
         StoppedError
             If `stop` was called.
+        ConfigurationError
+            If a job that runs aloud is refused.
         """
         process = self._started()
         assert process.stdin is not None
@@ -79,7 +92,8 @@ class WorkerProcess:
         if time_limit_s is not None:
             timer.start()
         try:
-            process.stdin.write(json.dumps(request.to_json()) + "\n")
+            order = request.to_json() | {MEMORY_LIMIT: memory_limit_gb, "aloud": aloud}
+            process.stdin.write(json.dumps(order) + "\n")
             process.stdin.flush()
             line = process.stdout.readline()
         except BrokenPipeError:
@@ -94,13 +108,16 @@ class WorkerProcess:
             answered = json.loads(line)
             if not answered["healthy"]:
                 self.close()
+            if aloud and answered.get("refused"):
+                raise ConfigurationError(answered["reason"])
             return None if answered["reason"] is None else str(answered["reason"])
         self.close()
         if self._stopped:
             raise StoppedError
         if expired.is_set():
             return f"time limit of {time_limit_s:g} s"
-        return _end(process.returncode)
+        limit = "" if memory_limit_gb is None else f"; memory limit {memory_limit_gb:.3g} GB"
+        return _end(process.returncode) + limit
 
     def close(self) -> None:
         """End the process, and whatever it has started."""
@@ -154,7 +171,12 @@ def own_worker() -> WorkerProcess:
 
 
 def run_apart(
-    request: Request, worker: WorkerProcess | None = None, asked_ns: int | None = None
+    request: Request,
+    worker: WorkerProcess | None = None,
+    asked_ns: int | None = None,
+    at_a_time: int = 1,
+    *,
+    aloud: bool = False,
 ) -> dict[str, Any]:
     """Run a job in a process apart unless it is done already; its record, whatever happened.
 
@@ -166,11 +188,15 @@ def run_apart(
     asked_ns : int, optional
         When the job was asked for: one that is to be run again (``force``) need not be once more
         if it was done since.
+    at_a_time : int
+        Jobs that run on this machine beside each other and share its memory.
+    aloud : bool
+        As in `WorkerProcess.run`.
 
     Raises
     ------
     MvestError
-        If nothing can be recorded.
+        If nothing can be recorded, or a job that runs aloud is refused.
     """
     values, started = request.values, time.time()
     require_writable(request.folder)
@@ -181,7 +207,8 @@ def run_apart(
             if done is not None:
                 return done
         clear(request.folder)
-        reason = worker.run(request, values["time_limit_s"])
+        memory = values["memory_limit_gb"] or default_memory_gb(at_a_time)
+        reason = worker.run(request, values["time_limit_s"], memory, aloud=aloud)
         if reason is None:
             record = read_result(request.folder, request.config_hash)
             if record is not None:

@@ -20,8 +20,10 @@ from experiments.runner.folder import (
     lock,
     mark_done,
     require_writable,
+    write_failure,
 )
 from experiments.runner.guard import run_apart
+from experiments.runner.limits import MEMORY_LIMIT, default_memory_gb, held_memory
 from experiments.runner.request import Request
 from experiments.runner.tracking import require_no_password
 from mvest.errors import ConfigurationError
@@ -50,7 +52,7 @@ def run_job(request: Request) -> None:
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
-        data = run_apart(request)
+        data = run_apart(request, aloud=True)
         _raise_failure(data["status"], data["reason"], data["detail"], folder)
         print(study.words(record_from(data, study.findings, str(folder / RESULT))))
         print(f"Written to {folder}")
@@ -59,7 +61,7 @@ def run_job(request: Request) -> None:
         done = None if values["force"] else finished_record(folder, request.config_hash)
         if done is None:
             clear(folder)
-            compute(request)
+            _compute_here(request)
             return
     record = record_from(done, study.findings, str(folder / RESULT))
     print(study.words(record))
@@ -70,6 +72,18 @@ def run_job(request: Request) -> None:
     )
     _publish(study, request, record)
     study.finish(_job(study, request), record)
+
+
+def _compute_here(request: Request) -> None:
+    """Run a job in this process, which is held to its memory."""
+    started, held = time.time(), None
+    try:
+        with held_memory(request.values[MEMORY_LIMIT] or default_memory_gb()) as held:
+            compute(request)
+    except MemoryError as error:
+        reason = ": ".join(filter(None, [str(held), str(error)]))
+        data = write_failure(request, reason, started)
+        _raise_failure(data["status"], reason, "", request.folder)
 
 
 def compute(request: Request) -> None:

@@ -16,13 +16,15 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, TextIO
 
 from experiments.runner.folder import LOG
 from experiments.runner.job import FailedRunError, compute
+from experiments.runner.limits import MEMORY_LIMIT, held_memory
 from experiments.runner.request import Request
 from mvest.errors import MvestError
 
@@ -45,28 +47,37 @@ def main() -> None:
     waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
     while True:
-        request = Request.from_json(json.loads(waiting.get()))
-        with _output_to(request.folder / LOG):
-            answered = answer(request)
+        order = json.loads(waiting.get())
+        limit_gb, aloud = order.pop(MEMORY_LIMIT), order.pop("aloud")
+        request = Request.from_json(order)
+        # Whoever waits for one job sees its progress.
+        streams = (1,) if aloud else (1, 2)
+        with _output_to(request.folder / LOG, streams):
+            answered = answer(request, limit_gb)
         answers.write(json.dumps(answered) + "\n")
         answers.flush()
 
 
-def answer(request: Request) -> dict[str, Any]:
+def answer(request: Request, memory_limit_gb: float | None = None) -> dict[str, Any]:
     """Run one job: ``{"reason": None}`` if it left its record, otherwise why it did not.
 
-    ``healthy`` says whether another job may be run in this process.
+    ``healthy`` says whether another job may be run in this process, ``refused`` that nothing was
+    computed because what was asked for is wrong.
     """
+    memory = nullcontext() if memory_limit_gb is None else held_memory(memory_limit_gb)
+    held = None
     try:
-        compute(request)
+        with memory as held:
+            compute(request)
     except FailedRunError:
         return {"reason": None, "healthy": True}
     except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return {"reason": _line(error), "healthy": True}
+        print(f"error: {error}")
+        return {"reason": _line(error), "healthy": True, "refused": True}
     except MemoryError as error:
         _trace(error)
-        return {"reason": f"out of memory: {_line(error)}".rstrip(": "), "healthy": False}
+        reason = ["out of memory" if held is None else str(held), _line(error)]
+        return {"reason": ": ".join(filter(None, reason)), "healthy": False}
     except OSError as error:
         _trace(error)
         return {"reason": _line(error), "healthy": True}
@@ -84,7 +95,7 @@ def _line(error: BaseException) -> str:
 
 
 def _trace(error: BaseException) -> None:
-    sys.excepthook(type(error), error, error.__traceback__)
+    traceback.print_exception(error, file=sys.stdout)
 
 
 def _listen(requests: TextIO, waiting: queue.SimpleQueue[str]) -> None:
@@ -97,16 +108,16 @@ def _listen(requests: TextIO, waiting: queue.SimpleQueue[str]) -> None:
 
 
 @contextmanager
-def _output_to(path: Path) -> Iterator[None]:
-    """Standard output and error of this process go to a file."""
+def _output_to(path: Path, streams: Sequence[int]) -> Iterator[None]:
+    """Standard output (1) and error (2) of this process, or one of them, go to a file."""
     log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o644)
-    before = [os.dup(stream) for stream in (1, 2)]
+    before = [os.dup(stream) for stream in streams]
     try:
-        for stream in (1, 2):
+        for stream in streams:
             os.dup2(log, stream)
         yield
     finally:
-        for stream, usual in zip((1, 2), before, strict=True):
+        for stream, usual in zip(streams, before, strict=True):
             _flush()
             os.dup2(usual, stream)
             os.close(usual)

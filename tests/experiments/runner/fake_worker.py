@@ -1,7 +1,7 @@
 """The real worker with a study that takes no time and does what files in its folder say.
 
-``kill-SEED``, ``raise-SEED`` and ``full-SEED`` end the job of that seed, once; one with
-``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
+``kill-SEED``, ``raise-SEED``, ``hog-SEED`` and ``full-SEED`` end the job of that seed, once; one
+with ``wait-SEED`` goes on when that is gone. Every run leaves a line in ``runs``.
 """
 
 import os
@@ -23,7 +23,7 @@ def run(job):
         runs.write(f"{seed}\n")
     while Path(f"wait-{seed}").exists():
         time.sleep(0.02)
-    for name in ("kill", "raise", "full"):
+    for name in ("kill", "raise", "hog", "full"):
         order = Path(f"{name}-{seed}")
         if not order.exists():
             continue
@@ -33,6 +33,10 @@ def run(job):
                 os.kill(os.getpid(), signal.SIGKILL)
             case "raise":
                 raise RuntimeError("it broke")
+            case "hog":
+                kept = []
+                while True:
+                    kept.append(b"x" * 2**24)
             case "full":
                 raise OSError(28, "No space left on device", str(job.folder / "result.json"))
     print(f"seed {seed}")

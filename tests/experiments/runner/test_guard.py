@@ -59,6 +59,7 @@ def request(folder: Path, **order) -> Request:
         **{"mechanics": {"element": "hex18"}, "tracking": {"enabled": False}, "force": False},
         **{"mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured"}},
         "time_limit_s": order.pop("limit", None),
+        "memory_limit_gb": None,
         "order": order,
     }
     return Request(values, "0" * 64, folder)
@@ -238,4 +239,5 @@ def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, 
 
     monkeypatch.setattr(worker_module, "compute", fail)
     answered = worker_module.answer(request(tmp_path))
-    assert answered == {"reason": reason, "healthy": healthy}
+    refused = {"refused": True} if isinstance(error, ConfigurationError) else {}
+    assert answered == {"reason": reason, "healthy": healthy, **refused}

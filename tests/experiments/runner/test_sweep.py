@@ -4,6 +4,8 @@ import errno
 import io
 import json
 import os
+import re
+import resource
 import subprocess
 import sys
 import time
@@ -13,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from experiments.run import main
-from experiments.runner import guard, progress, sweep
+from experiments.runner import guard, limits, progress, sweep
 from experiments.runner.folder import mark_done, write_failure
 from experiments.runner.plan import Plan, PlannedJob
 from experiments.runner.progress import SweepBar
@@ -288,6 +290,48 @@ def test_an_interrupted_sweep_is_collected_as_far_as_it_went(run, monkeypatch):
     assert "2 of 4 jobs done (2 before), 0 without an estimate, 2 not finished" in out
     states = [job["status"] for job in collected()["jobs"]]
     assert states == ["converged", "converged", "failed", "failed"]
+
+
+def test_a_job_beyond_its_memory_costs_its_own_row(run):
+    Path("hog-1").touch()
+    status, _, err = run("sweep=debug", "memory_limit_gb=0.5")
+    assert status == 1
+    assert "seed=1: memory limit of 0.5 GB (used: up to " in err
+    jobs = collected()["jobs"]
+    # Its neighbours in the same process go on.
+    assert sum(job["status"] == "converged" for job in jobs) == 3
+    (reason,) = [job["reason"] for job in jobs if job["status"] == "failed"]
+    found = re.fullmatch(r"memory limit of 0.5 GB \(used: up to (0\.\d+) GB\)", reason)
+    assert 0.4 < float(found[1]) <= 0.5
+    status, _, _ = run("sweep=debug", "memory_limit_gb=0.5")
+    assert status == 0
+
+
+def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
+    def hog(job):
+        kept = []
+        while True:
+            kept.append(b"x" * 2**24)
+
+    monkeypatch.setattr(study, "STUDY", replace(study.STUDY, run=hog))
+    limit = limits.resident_gb() + 0.2
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    status, _, err = run("experiment=debug", f"memory_limit_gb={limit:.3f}")
+    assert status == 1
+    assert err.startswith(f"no estimate: memory limit of {limit:.3g} GB (used: up to ")
+    (record,) = Path("outputs/debug").glob("*/result.json")
+    assert json.loads(record.read_text())["reason"].startswith("memory limit of")
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+@pytest.mark.parametrize(
+    ("given", "limit"),
+    [((), 14_400.0), (("time_limit_s=60",), 60.0), (("time_limit_s=null",), None)],
+)
+def test_jobs_of_a_sweep_have_a_time_limit_unless_it_is_taken_away(run, given, limit):
+    status, _, err = run("sweep=debug", "detach=true", *given)
+    assert status == 0, err
+    assert {job.values["time_limit_s"] for job in Plan.read(DEBUG).jobs} == {limit}
 
 
 def test_a_run_by_itself_may_have_a_time_limit(run, monkeypatch):

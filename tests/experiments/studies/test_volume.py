@@ -65,6 +65,8 @@ def run(tmp_path, monkeypatch, capsys, volume):
 
     def call(*arguments, pressure=True):
         line = ["experiments.run", "experiment=volume", f"volume={volume}", *arguments]
+        # In this process, where the detectors are replaced.
+        line.append("time_limit_s=null")
         if pressure:
             line.append("imaged.pressure_mmHg=110")
         monkeypatch.setattr(sys, "argv", line)
