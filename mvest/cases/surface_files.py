@@ -9,7 +9,7 @@ triangles in the same order correspond.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
+from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
@@ -28,6 +29,9 @@ __all__ = ["MERGE_TOLERANCE", "RegionSurface", "read_regions"]
 
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
+
+MAX_NEIGHBOURS = 100
+"""Vertices that are one, on average; where triangles share none there are about six."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,14 +77,23 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
         A missing, damaged or empty file, unknown or missing labels, a region without triangles.
     """
     if isinstance(files, Path):
-        whole = _read(files)
-        region = _labels(files, whole, regions)
-        surface = RegionSurface(whole.vertices, whole.triangles, region, whole.point_data)
-        suffix = files.suffix.lower()
-        if suffix == ".stl" or (suffix == ".obj" and _apart(surface)):
-            surface = _merged(surface)
-    else:
-        surface = _merged(_joined(files, list(regions.values())))
+        with refusing(files, "surface"):
+            return _checked(_of_one_file(files, regions), regions)
+    return _checked(_merged(_joined(files, list(regions.values()))), regions)
+
+
+def _of_one_file(file: Path, regions: Mapping[int, str]) -> RegionSurface:
+    whole = _read(file)
+    surface = RegionSurface(
+        whole.vertices, whole.triangles, _labels(whole, regions), whole.point_data
+    )
+    suffix = file.suffix.lower()
+    return (
+        _merged(surface) if suffix == ".stl" or (suffix == ".obj" and _apart(surface)) else surface
+    )
+
+
+def _checked(surface: RegionSurface, regions: Mapping[int, str]) -> RegionSurface:
     if surface.region is not None:
         empty = [n for i, n in enumerate(regions.values()) if not (surface.region == i).any()]
         if empty:
@@ -95,13 +108,6 @@ def _read(file: Path) -> SurfaceFile:
         raise GeometryError(
             f"{file}: points {far[:5].tolist()} have coordinates beyond {MAX_NUMBER:g}"
         )
-    for data, rows in (
-        (surface.cell_data, len(surface.triangles)),
-        (surface.point_data, len(surface.vertices)),
-    ):
-        for name, values in data.items():
-            if len(values) != rows:
-                raise InputError(f"{file}: data {name!r} has {len(values)} rows, expected {rows}")
     return surface
 
 
@@ -135,7 +141,14 @@ def _merged(surface: RegionSurface) -> RegionSurface:
     """The surface with coincident vertices made one, numbered as the triangles name them."""
     n = len(surface.vertices)
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    pairs = cKDTree(surface.vertices).query_pairs(MERGE_TOLERANCE * diagonal, output_type="ndarray")
+    tree, near = cKDTree(surface.vertices), MERGE_TOLERANCE * diagonal
+    # Counted before they are listed, as a few points far away make all others near each other.
+    if tree.count_neighbors(tree, near) > MAX_NEIGHBOURS * n:
+        raise GeometryError(
+            f"vertices lie within {near:.2g} of each other, {MERGE_TOLERANCE:g} of the surface's "
+            "diagonal; are some far away?"
+        )
+    pairs = tree.query_pairs(near, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(n, n))
     _, group = connected_components(graph, directed=False)
     corners = group[surface.triangles.ravel()]
@@ -150,7 +163,7 @@ def _merged(surface: RegionSurface) -> RegionSurface:
     )
 
 
-def _labels(file: Path, surface: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
+def _labels(surface: SurfaceFile, regions: Mapping[int, str]) -> IntArray | None:
     if "region" in surface.cell_data:
         return _numbered(surface.cell_data["region"], regions, "triangles", "cell data region")
     if "region" in surface.point_data:
@@ -166,10 +179,9 @@ def _labels(file: Path, surface: SurfaceFile, regions: Mapping[int, str]) -> Int
             )
         # The middle one of three sorted labels is the one that occurs at least twice.
         return ordered[:, 1]
-    if file.suffix.lower() == ".obj":
-        groups = _groups(file)
-        if len(set(groups)) > 1 or (groups and groups[0] in regions.values()):
-            return _named(groups, list(regions.values()))
+    groups = surface.groups
+    if len(set(groups)) > 1 or (groups and groups[0] in regions.values()):
+        return _named(groups, list(regions.values()))
     return np.zeros(len(surface.triangles), dtype=np.int64) if len(regions) == 1 else None
 
 
@@ -194,22 +206,7 @@ def _numbered(
     return result
 
 
-def _groups(file: Path) -> list[str]:
-    """Name of the group of every face of an OBJ file, or of its object where it has no groups."""
-    group, obj, by_group, by_object = "", "", [], []
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-        word, _, rest = line.strip().partition(" ")
-        if word == "g":
-            group = rest.strip()
-        elif word == "o":
-            obj = rest.strip()
-        elif word == "f":
-            by_group.append(group)
-            by_object.append(obj)
-    return by_group if any(by_group) else by_object
-
-
-def _named(groups: list[str], names: list[str]) -> IntArray:
+def _named(groups: Sequence[str], names: list[str]) -> IntArray:
     unknown = sorted(set(groups) - set(names))
     if unknown:
         raise InputError(

@@ -18,6 +18,8 @@ from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.imaging.reading.stated import fault
 from mvest.imaging.writing.slicer import checked_path
+from mvest.reading.bounded import refusing
+from mvest.reading.text import MAX_NUMBER, read_bytes
 from mvest.typing import FloatArray
 
 __all__ = ["PointList", "read_markups", "write_markups"]
@@ -136,10 +138,13 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
     source = Path(path)
     if not source.is_file():
         raise InputError(f"{source}: no such file")
-    if source.stat().st_size > MAX_BYTES:
-        raise fault(source, "size", f"{source.stat().st_size} bytes", f"at most {MAX_BYTES}")
+    with refusing(source, "markups"):
+        return _read(source)
+
+
+def _read(source: Path) -> dict[str, PointList]:
     try:
-        content = json.loads(source.read_bytes())
+        content = json.loads(read_bytes(source, MAX_BYTES))
     except (ValueError, RecursionError) as error:
         raise fault(source, "content", error, "JSON as Slicer writes it") from error
     content = _member(source, "content", content, dict)
@@ -186,8 +191,9 @@ def _read_list(path: Path, where: str, item: Any, number: int) -> tuple[str, Poi
         if status != "defined":
             raise fault(path, f"{field}.positionStatus", repr(status), "a point that was placed")
         position = _member(path, f"{field}.position", point.get("position"), list)
-        numbers = [x for x in position if isinstance(x, int | float) and not isinstance(x, bool)]
-        if len(numbers) != 3 or len(position) != 3 or not np.isfinite(numbers).all():
+        # Compared as they are: Python's whole numbers have no largest one, and NumPy's do.
+        numbers = [x for x in position if type(x) in (int, float) and abs(x) <= MAX_NUMBER]
+        if len(numbers) != 3 or len(position) != 3:
             raise fault(path, f"{field}.position", repr(position), "three numbers")
         if not label or label in labels:
             raise fault(path, f"{field}.label", repr(label), "a label that no other point has")

@@ -14,16 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.errors import InputError
+from mvest.reading.bounded import max_inflated
 from mvest.reading.text import one_line
 
 __all__ = ["MAX_ARRAYS", "check_array", "read_npz"]
 
 MAX_ARRAYS = 2**29
 """Bytes of all arrays in one file."""
-MAX_UNASKED = 2**26
-"""Bytes of all arrays, however small the file."""
-MAX_RATIO = 100
-"""Of arrays' bytes to the file's beyond that: measured and simulated fields have 1 to 10."""
 MAX_MEMBERS = 10_000
 MAX_HEADER = 4096
 """Bytes that say what an array is; those of plain ones are 128."""
@@ -94,7 +91,7 @@ def read_npz(
             if exact and len(members) != len(asked):
                 more = one_line(", ".join(name for name in members if name not in asked), 120)
                 raise InputError(f"{where}: holds arrays {more} beside those that are expected")
-            limit = min(max_bytes, max(MAX_UNASKED, MAX_RATIO * size))
+            limit = min(max_bytes, max_inflated(size))
             total = sum(members[name].file_size for name in asked)
             if total > limit:
                 raise InputError(f"{where}: {total} bytes of arrays, expected at most {limit}")

@@ -145,6 +145,7 @@ def solid(name: str, folder: Path) -> Path:
 
 READERS = (
     Reader("surface.stl", read_surface, (text_stl, binary_stl)),
+    Reader("surface.stl-merged", lambda path: read_regions(path, {1: "both"}), (text_stl,)),
     Reader("surface.obj", regions, (obj,)),
     Reader("surface.ply", regions, (text_ply, binary_ply)),
     Reader(

@@ -19,11 +19,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits are thos
 STORED = ROOT / "tests" / "fuzz" / "stored"
 INPUTS = 80
 """Of each reader."""
-NOT_YET = {
-    *("leaflets", "markups", "solid", "surface.obj", "surface.ply", "surface.stl", "surface.vtp"),
-    *("surface.vtu", "volume.metaimage", "volume.nrrd", "volume.nrrd-data", "volume.philips"),
-}
-"""Known to fail on some inputs."""
 
 a_change = st.builds(Change, st.sampled_from(list(CHANGES)), st.integers(0, 2**32 - 1))
 some_changes = st.lists(a_change, min_size=1, max_size=4)
@@ -51,8 +46,6 @@ def test_the_examples_are_valid(name: str, benches: dict[str, Bench]) -> None:
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files(name: str, benches: dict[str, Bench]) -> None:
     bench = benches[name]
-    if name in NOT_YET:
-        pytest.skip("known to fail on some inputs")
 
     # The same inputs every time: what is new is found by `make fuzz`.
     @settings(

@@ -1,14 +1,15 @@
 """Exactly as many bytes as a header promises, from this file or from one beside it.
 
-The libraries read until a file ends: what a few compressed bytes grow to has no bound there, and a
-missing end or a wrong checksum passes unseen.
+The libraries allocate what a header says and read until a file ends: what a few compressed bytes
+grow to has no bound there, and a missing end or a wrong checksum passes unseen.
 """
 
 from __future__ import annotations
 
 import gzip
+import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvest.imaging.reading.stated import fault
+from mvest.reading.bounded import max_inflated
 
-__all__ = ["beside", "from_gzip", "from_zlib", "plainly", "read_exactly"]
+__all__ = ["beside", "read_exactly"]
 
 CHUNK = 2**22
 """Bytes read or decompressed at a time."""
@@ -40,21 +42,67 @@ def beside(path: Path, field: str, name: str) -> Path:
     return path.parent / plain
 
 
-def plainly(file: BinaryIO) -> Iterator[bytes]:
-    """The bytes as they are."""
+def read_exactly(
+    path: Path, field: str, file: BinaryIO, size: int, packed: str = ""
+) -> NDArray[np.uint8]:
+    """The `size` bytes that a file must hold from where it is, and no more.
+
+    Parameters
+    ----------
+    path, field
+        For messages.
+    file
+        At the first of the bytes.
+    size
+        As the header declares it; nothing is allocated that the file cannot fill.
+    packed
+        Empty for bytes as they are, ``"gzip"`` for members one after the other, or ``"zlib"`` for
+        one stream of zlib or gzip, with its checksum.
+
+    Raises
+    ------
+    InputError
+        Truncated or damaged data, more than there should be, or more than what is compressed may
+        hold (`mvest.reading.bounded`).
+    """
+    stored = os.fstat(file.fileno()).st_size - file.tell()
+    expected = f"the {size} bytes that the header says"
+    if packed and size > max_inflated(stored):
+        raise fault(
+            path,
+            field,
+            f"{size} bytes compressed to {stored}",
+            f"at most {max_inflated(stored)}, or data without compression",
+        )
+    if not packed and stored != size:
+        raise fault(path, field, f"{stored} bytes", expected)
+    result = np.empty(size, dtype=np.uint8)
+    done = 0
+    try:
+        for chunk in _CHUNKS[packed](file):
+            if done + len(chunk) > size:
+                raise fault(path, field, f"more than {size} bytes", expected)
+            result[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
+            done += len(chunk)
+    except (EOFError, OSError, zlib.error) as error:
+        raise fault(path, field, f"{done} bytes, then {error}", expected) from error
+    if done < size:
+        raise fault(path, field, f"{done} bytes", expected)
+    return result
+
+
+def _plainly(file: BinaryIO) -> Iterator[bytes]:
     while chunk := file.read(CHUNK):
         yield chunk
 
 
-def from_gzip(file: BinaryIO) -> Iterator[bytes]:
-    """The bytes that gzip members hold, one after the other."""
+def _from_gzip(file: BinaryIO) -> Iterator[bytes]:
     with gzip.GzipFile(fileobj=file) as stream:
         while chunk := stream.read(CHUNK):
             yield chunk
 
 
-def from_zlib(file: BinaryIO) -> Iterator[bytes]:
-    """The bytes that one stream of zlib or gzip holds, with its checksum."""
+def _from_zlib(file: BinaryIO) -> Iterator[bytes]:
     stream = zlib.decompressobj(zlib.MAX_WBITS | 32)
     rest = b""
     while not stream.eof:
@@ -65,25 +113,8 @@ def from_zlib(file: BinaryIO) -> Iterator[bytes]:
         rest = stream.unconsumed_tail
 
 
-def read_exactly(path: Path, field: str, chunks: Iterator[bytes], size: int) -> NDArray[np.uint8]:
-    """Collect `size` bytes from chunks that must hold them and no more.
-
-    Raises
-    ------
-    InputError
-        Truncated or damaged data, or more than there should be.
-    """
-    result = np.empty(size, dtype=np.uint8)
-    expected = f"the {size} bytes that the header says"
-    done = 0
-    try:
-        for chunk in chunks:
-            if done + len(chunk) > size:
-                raise fault(path, field, f"more than {size} bytes", expected)
-            result[done : done + len(chunk)] = np.frombuffer(chunk, dtype=np.uint8)
-            done += len(chunk)
-    except (EOFError, OSError, zlib.error) as error:
-        raise fault(path, field, f"{done} bytes, then {error}", expected) from error
-    if done < size:
-        raise fault(path, field, f"{done} bytes", expected)
-    return result
+_CHUNKS: dict[str, Callable[[BinaryIO], Iterator[bytes]]] = {
+    "": _plainly,
+    "gzip": _from_gzip,
+    "zlib": _from_zlib,
+}

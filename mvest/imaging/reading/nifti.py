@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mvest.imaging.reading.data import from_gzip, plainly, read_exactly
+from mvest.imaging.reading.data import read_exactly
 from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.typing import FloatArray
@@ -52,7 +52,7 @@ def is_nifti(path: Path) -> bool:
     return head[344:348] in (b"n+1\0", b"ni1\0") or head[4:8] in (b"n+2\0", b"ni2\0")
 
 
-def read_nifti(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
+def read_nifti(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
     """Read a NIfTI file of three or four axes.
 
     Raises
@@ -82,7 +82,7 @@ def read_nifti(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise fault(path, "datatype", dtype, "one grey value, no colour or complex number")
     sizes = (*shape, 1)[:4]
-    check_size(path, "dim", [sizes[3], *sizes[:3]], dtype.itemsize)
+    check_size(path, "dim", [sizes[3], *sizes[:3]], dtype.itemsize, max_bytes)
     steps, origin = _geometry(path, header, affine, units[0])
     times = _times(path, header, len(shape), int(sizes[3]), units[1])
     frames = _frames(path, header, dtype, sizes)
@@ -136,8 +136,7 @@ def _frames(path: Path, header: Any, dtype: np.dtype[Any], sizes: tuple[int, ...
         raise fault(path, "vox_offset", offset, f"{BYTES_BEFORE[0]} to {BYTES_BEFORE[1]} bytes")
     start = int(offset)
     with path.open("rb") as file:
-        compressed = file.read(2) == GZIP
+        packed = "gzip" if file.read(2) == GZIP else ""
         file.seek(0)
-        chunks = from_gzip(file) if compressed else plainly(file)
-        content = read_exactly(path, "data", chunks, start + size)
+        content = read_exactly(path, "data", file, start + size, packed)
     return np.moveaxis(content[start:].view(dtype).reshape(sizes, order="F"), 3, 0)

@@ -19,7 +19,7 @@ import nrrd
 import numpy as np
 from numpy.typing import NDArray
 
-from mvest.imaging.reading.data import beside, from_gzip, plainly, read_exactly
+from mvest.imaging.reading.data import beside, read_exactly
 from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
@@ -31,7 +31,18 @@ NAMES = FieldNames("sizes", "space directions", "space directions", "space origi
 MODALITY_KEY = "mvest.modality"
 """Key under which this package writes what the voxels are."""
 MAX_HEADER_BYTES = 2**20
-"""Within which the empty line after a header must come."""
+"""Within which the empty line after a header must come, and lines to skip end."""
+MAX_LINES = 1000
+"""Of a header, and to skip; a recording of four axes has some 50."""
+
+MAX_LIST = 4096
+"""Characters of the fields that pynrrd takes apart."""
+NUMERIC = (
+    *("dimension", "space dimension", "line skip", "byte skip", "min", "max", "old min", "old max"),
+    *("oldmin", "oldmax", "sizes", "spacings", "thicknesses", "axis mins", "axismins", "axis maxs"),
+    *("axismaxs", "space origin", "measurement frame", "space directions"),
+)
+LISTS = ("kinds", "centerings", "labels", "units", "space units")
 
 TO_LPS = {
     "left-posterior-superior": (1.0, 1.0, 1.0),
@@ -51,7 +62,7 @@ KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 
 
-def read_nrrd(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
+def read_nrrd(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
     """Read a NRRD file of three or four axes, with the files that it consists of.
 
     Raises
@@ -66,7 +77,7 @@ def read_nrrd(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     of_space = [n for a, n in enumerate(sizes) if a != axis]
     frames = 1 if axis is None else sizes[axis]
     dtype = _voxel_type(header)
-    check_size(path, "sizes", [frames, *of_space], dtype.itemsize)
+    check_size(path, "sizes", [frames, *of_space], dtype.itemsize, max_bytes)
     times = StatedTimes(None, "", "dimension") if axis is None else _times(header, axis, frames)
     modality = _modality(header)
     voxels, files = _voxels(header, dtype, sizes)
@@ -91,7 +102,7 @@ def _header(path: Path) -> Header:
         name, colon, value = line.partition(":")
         if line.startswith("#"):
             continue
-        if not colon:
+        if not colon or len(values) > MAX_LINES:
             raise fault(path, "header", f"line {line!r}", "'field: value' or 'key:=value'")
         name, value = name.strip(), " ".join(value.removeprefix("=").split())
         if ":=" not in line:
@@ -102,6 +113,11 @@ def _header(path: Path) -> Header:
             raise fault(path, name, f"{values[name]!r} and {value!r}", "one value")
     fields = {}
     for name, value in values.items():
+        numeric = name in NUMERIC
+        if (numeric or name in LISTS) and len(value) > MAX_LIST:
+            raise fault(path, name, f"{len(value)} characters", f"at most {MAX_LIST}")
+        if numeric and ("_" in value or not value.isascii()):
+            raise fault(path, name, repr(value), "decimal numbers")
         try:
             fields[name] = nrrd.read_header([magic, f"{name}: {value}"])[name]
         except Exception as error:  # pynrrd's parsers fail in many ways on a damaged value
@@ -252,17 +268,21 @@ def _voxels(
     source, field = (path, "data") if name is None else (beside(path, "data file", name), name)
     size = int(np.prod(sizes, dtype=np.int64)) * dtype.itemsize
     lines, skip = header.fields.get("line skip", 0), header.fields.get("byte skip", 0)
-    if lines < 0 or skip < -1 or (skip and encoding != "raw"):
+    stored = source.stat().st_size
+    if not 0 <= lines <= MAX_LINES or not -1 <= skip <= stored or (skip and encoding != "raw"):
         raise fault(path, "byte skip", f"{skip}, with {lines} lines", "as NRRD defines it, no gzip")
     with source.open("rb") as file:
         file.seek(header.length if name is None else 0)
-        for _ in range(lines):
-            file.readline()
-        start = file.tell() + skip if skip >= 0 else source.stat().st_size - size
-        if start < file.tell():
-            raise fault(path, field, f"{size + start} bytes", f"{size} bytes or more")
-        file.seek(start)
-        chunks = plainly(file) if encoding == "raw" else from_gzip(file)
-        flat = read_exactly(path, field, chunks, size)
+        start = file.tell()
+        if lines:
+            ends = [at.end() for at in re.finditer(rb"\n", file.read(MAX_HEADER_BYTES))]
+            if len(ends) < lines:
+                raise fault(path, "line skip", lines, f"no more than the {len(ends)} lines")
+            start += ends[lines - 1]
+        first = start + skip if skip >= 0 else stored - size
+        if first < start:
+            raise fault(path, field, f"{size + first} bytes", f"{size} bytes or more")
+        file.seek(first)
+        flat = read_exactly(path, field, file, size, "" if encoding == "raw" else "gzip")
     files = (path,) if name is None else (path, source)
     return flat.view(dtype).reshape(sizes, order="F"), files

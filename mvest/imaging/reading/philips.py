@@ -14,6 +14,9 @@ world's zero.
 
 from __future__ import annotations
 
+import io
+import mmap
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -28,6 +31,7 @@ from mvest.imaging.volume import Modality
 __all__ = ["is_dicom", "read_philips"]
 
 SOP_CLASS = "1.2.840.113543.6.6.1.3.10002"
+DEFLATED = b"1.2.840.10008.1.2.1.99"
 SLICES, SLICE_UNIT, SLICE_SPACING = (0x3001, 0x1001), (0x3001, 0x1002), (0x3001, 0x1003)
 CENTIMETRES = 3
 """Of PhysicalUnitsXDirection (DICOM PS3.3, C.8.5.5.1.15)."""
@@ -53,7 +57,7 @@ def is_dicom(head: bytes) -> bool:
     return head[128:132] == b"DICM" or head[:2] in (b"\x08\x00", b"\x02\x00")
 
 
-def read_philips(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
+def read_philips(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
     """Read a Philips Cartesian DICOM file.
 
     Raises
@@ -64,10 +68,11 @@ def read_philips(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
     with warnings.catch_warnings():
         # These files break DICOM's rules in ways that do not matter here.
         warnings.simplefilter("ignore")
-        return _read(path), (path,)
+        return _read(path, max_bytes), (path,)
 
 
-def _read(path: Path) -> StatedVolume:
+def _read(path: Path, max_bytes: int) -> StatedVolume:
+    _refuse_deflated(path)
     data = _dataset(path)
     sop_class = data.get("SOPClassUID")
     if sop_class is None:
@@ -91,7 +96,7 @@ def _read(path: Path) -> StatedVolume:
             (SLICES, "<I"),
         )
     ]
-    check_size(path, NAMES.size, shape, 1)
+    check_size(path, NAMES.size, shape, 1, max_bytes)
     spacing = MM_PER_CM * np.array(
         [
             _number(path, data, field, "<d")
@@ -110,14 +115,35 @@ def _read(path: Path) -> StatedVolume:
     return StatedVolume(frames, steps, origin, times, Modality.ULTRASOUND, NAMES)
 
 
+class _Clamped(io.BufferedReader):
+    """A file that is never asked for more than it has: Python allocates what it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path.open("rb", buffering=0))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _refuse_deflated(path: Path) -> None:
+    """Of all transfer syntaxes pydicom inflates only this one, at once and without bound."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content.find(DEFLATED) >= 0:
+            raise fault(path, "TransferSyntaxUID", DEFLATED.decode(), CONVERT)
+
+
 def _dataset(path: Path) -> Any:
     """The fields, the pixels left in the file."""
     import pydicom
 
     try:
-        data = pydicom.dcmread(path, force=True, defer_size=LONG)
-        data.get("SOPClassUID")  # parsed only now
-        return data
+        with _Clamped(path) as file:
+            data = pydicom.dcmread(file, force=True, defer_size=LONG)
+            # Without its name nothing can be read later, where its length is not looked at.
+            data.filename = None
+            data.get("SOPClassUID")  # parsed only now
+            return data
     except Exception as error:  # pydicom fails in many ways on a damaged file
         raise fault(path, "content", f"damaged DICOM ({error})", CONVERT) from error
 
@@ -143,17 +169,16 @@ def _pixels(path: Path, data: Any, shape: list[int]) -> np.ndarray:
     """Frames ``(T, I, J, K)``, without decoding by way of DICOM's own rows and columns."""
     if "PixelData" not in data:
         raise fault(path, "PixelData", "not stated", "the voxels")
-    length = int(data.get_item("PixelData", keep_deferred=True).length)
+    raw = data.get_item("PixelData", keep_deferred=True)
+    length = int(raw.length)
     if length == 0xFFFFFFFF:
         raise fault(path, "PixelData", "compressed", "bytes as they are")
     size = int(np.prod(shape, dtype=np.int64))
-    try:
-        content = np.frombuffer(data.PixelData, dtype=np.uint8)
-    except Exception as error:  # pydicom fails in many ways on a truncated value
-        raise fault(path, "PixelData", error, f"{max(size, length)} bytes") from error
-    if len(content) < length or length < size:
-        raise fault(path, "PixelData", f"{len(content)} bytes", f"{max(size, length)} bytes")
+    stored = path.stat().st_size - int(raw.value_tell)
+    if stored < length or length < size:
+        raise fault(path, "PixelData", f"{min(stored, length)} bytes", f"{max(size, length)} bytes")
     # An odd number of bytes is followed by one that makes it even.
-    end = length - (1 if size % 2 and length % 2 == 0 else 0)
+    end = int(raw.value_tell) + length - (1 if size % 2 and length % 2 == 0 else 0)
+    content = np.fromfile(path, dtype=np.uint8, count=size, offset=end - size)
     t, i, j, k = shape
-    return content[end - size : end].reshape(t, k, j, i).transpose(0, 3, 2, 1)
+    return content.reshape(t, k, j, i).transpose(0, 3, 2, 1)

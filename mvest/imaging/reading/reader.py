@@ -12,9 +12,10 @@ from mvest.imaging.reading.metaimage import is_metaimage, read_metaimage
 from mvest.imaging.reading.nifti import is_nifti, read_nifti
 from mvest.imaging.reading.nrrd_file import read_nrrd
 from mvest.imaging.reading.philips import is_dicom, read_philips
-from mvest.imaging.reading.plausible import checked_sequence
+from mvest.imaging.reading.plausible import MAX_BYTES, checked_sequence
 from mvest.imaging.reading.stated import StatedVolume, fault
 from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reading.bounded import refusing
 
 __all__ = ["read_volume"]
 
@@ -27,6 +28,7 @@ def read_volume(
     modality: Modality | None = None,
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
+    max_bytes: int = MAX_BYTES,
 ) -> VolumeSequence:
     """Read a volume over time; what the file is, its content says, not its name.
 
@@ -45,6 +47,8 @@ def read_volume(
         Seconds between frames, for files that state no times in a unit of time.
     time_unit
         ``"s"`` or ``"ms"``, for files that state times without a unit.
+    max_bytes
+        Of all frames, decoded; reading them takes up to three times as much memory for a while.
 
     Raises
     ------
@@ -53,7 +57,8 @@ def read_volume(
         kind, truncated or damaged; not three or four axes; colour; no spacing, direction or origin,
         or such as no heart fits (0.05 to 5 mm, 20 to 500 mm in all, at least 16 voxels along each
         axis); axes that are not at right angles; a frame without contrast; values that are no
-        numbers; times that do not increase, or by less than 2 ms or 1 s and more; more than 4 GiB.
+        numbers; times that do not increase, or by less than 2 ms or 1 s and more; more than
+        `max_bytes`, or data compressed more than 100 times.
     """
     source = Path(path)
     if source.is_dir():
@@ -66,27 +71,24 @@ def read_volume(
     if not source.is_file():
         raise InputError(f"{source}: no such file")
     # What overflows is refused with the numbers that are no finite ones.
-    with np.errstate(all="ignore"):
-        try:
-            stated, files = _stated(source)
-            sha256 = _sha256(files)
-        except OSError as error:
-            raise InputError(f"{source}: cannot be read: {error.strerror or error}") from error
+    with np.errstate(all="ignore"), refusing(source, "volume"):
+        stated, files = _stated(source, max_bytes)
+        sha256 = _sha256(files)
         return checked_sequence(source, stated, sha256, modality, frame_interval_s, time_unit)
 
 
-def _stated(path: Path) -> tuple[StatedVolume, tuple[Path, ...]]:
+def _stated(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
     """What the file states, and the files that it consists of."""
     with path.open("rb") as file:
         head = file.read(1024)
     if head.startswith(b"NRRD"):
-        return read_nrrd(path)
+        return read_nrrd(path, max_bytes)
     if is_nifti(path):
-        return read_nifti(path)
+        return read_nifti(path, max_bytes)
     if is_dicom(head):
-        return read_philips(path)
+        return read_philips(path, max_bytes)
     if is_metaimage(head):
-        return read_metaimage(path)
+        return read_metaimage(path, max_bytes)
     raise fault(path, "content", f"{head[:8]!r}", READABLE)
 
 

@@ -12,20 +12,22 @@ from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.imaging.volume import Modality
+from mvest.reading.text import MAX_LINE, one_line
 from mvest.typing import FloatArray
 
 __all__ = ["FieldNames", "Header", "StatedTimes", "StatedVolume", "fault"]
 
-MAX_WORDS = 300
-"""Characters of a message that come from a file or from a library."""
+MIN_VALUE = 40
+"""Characters of a value that are shown in any case."""
 
 
 def fault(path: Path, field: str, value: object, expected: str) -> InputError:
-    """What to raise where a file's field is not what it must be, in one line."""
-    words = " ".join(str(value).split())
-    if len(words) > MAX_WORDS:
-        words = words[:MAX_WORDS] + " ..."
-    return InputError(f"{path}: {field}: {words}, expected {expected}")
+    """What to raise where a file's field is not what it must be, in one line of bounded length."""
+    field = one_line(field, 80)
+    left = MAX_LINE - len(f"{path.name}: {field}: , expected {expected}")
+    return InputError(
+        f"{path}: {field}: {one_line(value, max(left, MIN_VALUE))}, expected {expected}"
+    )
 
 
 @dataclass(frozen=True, slots=True)

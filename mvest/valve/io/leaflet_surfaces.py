@@ -1,12 +1,10 @@
 """Reading and writing surfaces and solid meshes: VTU, VTP, STL, OBJ, PLY, time series for ParaView.
 
-VTU, STL, OBJ and PLY go through meshio, VTP through `mvest.valve.io.vtp`. Coordinates are mm. A
-file appears under its name only once it is complete.
+Coordinates are mm. A file appears under its name only once it is complete.
 """
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,15 +16,16 @@ from numpy.typing import NDArray
 
 from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
+from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.io.vtp import SurfaceFile, read_vtp, write_vtp
+from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
+from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
 
 __all__ = [
     "SurfaceFile",
     "cell_arrays",
     "read_leaflets",
-    "read_mesh",
     "read_surface",
     "write_cells",
     "write_leaflets",
@@ -40,24 +39,16 @@ Data = Mapping[str, NDArray[np.generic]]
 SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
 
 
-def _read_ply(name: str) -> meshio.Mesh:
-    """Read PLY with meshio, which would wait forever for the end of a header that is cut off."""
-    if not re.search(rb"^[ \t]*end_header[ \t\r]*$", Path(name).read_bytes(), re.MULTILINE):
-        raise ValueError("no end_header")
-    return meshio.ply.read(name)
-
-
 _READERS = {
-    ".vtu": meshio.vtu.read,
-    ".stl": meshio.stl.read,
-    ".obj": meshio.obj.read,
-    ".ply": _read_ply,
+    ".vtu": lambda path: _triangles(read_vtu(path)),
+    ".vtp": read_vtp,
+    ".stl": read_stl,
+    ".obj": read_obj,
+    ".ply": read_ply,
 }
 _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
 """Formats that are written without data."""
 REGION_PREFIX = "region."
-BINARY_PLY = " (properties of faces are read from text files only: write an ascii PLY, or VTP)"
-"""What meshio's reader of binary PLY files does not do."""
 
 
 def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
@@ -71,26 +62,6 @@ def _input_path(path: Path | str, suffixes: tuple[str, ...]) -> Path:
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: extension {path.suffix!r}, expected {', '.join(suffixes)}")
-
-
-def read_mesh(path: Path | str) -> meshio.Mesh:
-    """Read a VTU, STL, OBJ or PLY file with meshio; a fault of the file is an `InputError`."""
-    source = _input_path(path, tuple(_READERS))
-    try:
-        # meshio takes a text STL for a binary one first, and may overflow on its supposed size.
-        with np.errstate(over="ignore"):
-            mesh = _READERS[source.suffix.lower()](str(source))
-    except Exception as fault:  # meshio's readers fail in many ways on a damaged file
-        known = "" if source.suffix.lower() != ".ply" else BINARY_PLY
-        raise InputError(
-            f"{source}: damaged or no {source.suffix[1:].upper()} file: {fault}{known}"
-        ) from fault
-    if mesh.points.ndim != 2 or mesh.points.shape[1] != 3:
-        raise GeometryError(f"{source}: points of shape {mesh.points.shape}, expected (n, 3)")
-    bad = np.flatnonzero(~np.isfinite(mesh.points).all(axis=1))
-    if len(bad):
-        raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
-    return mesh
 
 
 def read_surface(path: Path | str) -> SurfaceFile:
@@ -107,30 +78,36 @@ def read_surface(path: Path | str) -> SurfaceFile:
         No triangles, other cells, or points that are not finite.
     """
     source = _input_path(path, SURFACE_SUFFIXES)
-    if source.suffix.lower() == ".vtp":
-        surface = read_vtp(source)
-        bad = np.flatnonzero(~np.isfinite(surface.vertices).all(axis=1))
-        if len(bad):
-            raise GeometryError(f"{source}: points {bad[:5].tolist()} are not finite numbers")
-    else:
-        mesh = read_mesh(source)
-        others = sorted({block.type for block in mesh.cells} - {"triangle"})
-        if others:
-            raise GeometryError(
-                f"{source}: holds cells of type {', '.join(others)}; expected triangles only"
-            )
-        blocks = [block.data for block in mesh.cells]
-        surface = SurfaceFile(
-            np.asarray(mesh.points, dtype=np.float64),
-            np.concatenate(blocks).astype(np.int64) if blocks else np.zeros((0, 3), np.int64),
-            dict(mesh.point_data),
-            {name: np.concatenate(v) for name, v in mesh.cell_data.items() if blocks},
-        )
-    if len(surface.triangles) == 0:
-        raise GeometryError(f"{source}: no triangles; expected a triangulated surface")
-    if surface.triangles.min() < 0 or surface.triangles.max() >= len(surface.vertices):
-        raise GeometryError(f"{source}: triangles name points that do not exist")
-    return surface
+    with refusing(source, "surface"):
+        surface = _READERS[source.suffix.lower()](source)
+        check_finite(surface.vertices)
+        if len(surface.triangles) == 0:
+            raise GeometryError("no triangles; expected a triangulated surface")
+        if surface.triangles.min() < 0 or surface.triangles.max() >= len(surface.vertices):
+            raise GeometryError("triangles name points that do not exist")
+        for data, rows in (
+            (surface.cell_data, len(surface.triangles)),
+            (surface.point_data, len(surface.vertices)),
+        ):
+            for name, values in data.items():
+                if len(values) != rows:
+                    raise InputError(f"data {name!r} has {len(values)} rows, expected {rows}")
+        return surface
+
+
+def _triangles(file: CellFile) -> SurfaceFile:
+    others = sorted({name for name, _, _ in file.blocks} - {"triangle"})
+    if others:
+        raise GeometryError(f"holds cells of type {', '.join(others)}; expected triangles only")
+    blocks = [block for _, _, block in file.blocks] or [np.zeros((0, 3), dtype=np.int64)]
+    return SurfaceFile(file.points, np.concatenate(blocks), file.point_data, file.cell_data)
+
+
+def check_finite(points: FloatArray) -> None:
+    """Refuse points ``(n, 3)`` that are no numbers."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise GeometryError(f"points {bad[:5].tolist()} are not finite numbers")
 
 
 def _checked_data(data: Data | None, rows: int, what: str) -> dict[str, NDArray[np.generic]]:
@@ -226,14 +203,14 @@ def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray
     return result
 
 
-def region_names(cell_data: Mapping[str, Any], path: Path) -> tuple[str, ...]:
+def region_names(cell_data: Mapping[str, Any]) -> tuple[str, ...]:
     """Names of the regions, in order, from the indicators that `region_arrays` wrote."""
     names = tuple(
         name.removeprefix(REGION_PREFIX) for name in cell_data if name.startswith(REGION_PREFIX)
     )
     if not names:
         raise InputError(
-            f"{path}: no cell data {REGION_PREFIX}NAME; expected one indicator for every region"
+            f"no cell data {REGION_PREFIX}NAME; expected one indicator for every region"
         )
     return names
 
@@ -264,28 +241,24 @@ def read_leaflets(path: Path | str) -> LeafletSurface:
         As `read_surface`, data that are missing, or an inadmissible midsurface.
     """
     source = _input_path(path, (".vtu", ".vtp"))
-    file = read_surface(source)
-    for name, data in (
-        ("fibre", file.point_data),
-        ("thickness", file.point_data),
-        ("region", file.cell_data),
-    ):
-        if name not in data:
-            kind = "cell" if name == "region" else "point"
-            raise InputError(
-                f"{source}: no {kind} data {name!r}; found {', '.join(data) or 'none'}"
-            )
-    try:
+    with refusing(source, "leaflet surface"):
+        file = read_surface(source)
+        for name, data in (
+            ("fibre", file.point_data),
+            ("thickness", file.point_data),
+            ("region", file.cell_data),
+        ):
+            if name not in data:
+                kind = "cell" if name == "region" else "point"
+                raise InputError(f"no {kind} data {name!r}; found {', '.join(data) or 'none'}")
         return LeafletSurface(
             vertices=file.vertices,
             triangles=file.triangles,
             region=file.cell_data["region"].astype(np.int64),
-            region_names=region_names(file.cell_data, source),
+            region_names=region_names(file.cell_data),
             fibre=file.point_data["fibre"].astype(np.float64),
             thickness=file.point_data["thickness"].astype(np.float64),
         )
-    except InputError as fault:
-        raise type(fault)(f"{source}: {fault}") from fault
 
 
 def write_series(

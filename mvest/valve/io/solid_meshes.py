@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from mvest.elements import FACES, element
 from mvest.errors import InputError
+from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import (
     cell_arrays,
-    read_mesh,
+    check_finite,
     region_arrays,
     region_names,
     write_cells,
 )
+from mvest.valve.io.vtk_xml import CellFile, read_vtu
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["read_solid", "vtk_cells", "write_solid"]
@@ -151,39 +153,42 @@ def read_solid(path: Path | str) -> SolidMesh:
         Missing, damaged or foreign file, or an inadmissible mesh.
     """
     source = Path(path)
-    mesh = read_mesh(source)
+    if source.suffix.lower() != ".vtu":
+        raise InputError(f"{source}: extension {source.suffix!r}, expected .vtu")
+    with refusing(source, "solid mesh"):
+        return _solid(read_vtu(source))
+
+
+def _solid(mesh: CellFile) -> SolidMesh:
+    check_finite(mesh.points)
     names = {kind: name for name, (kind, _) in (*VTK_ORDER.items(), *QUARTERS.items())}
-    blocks = {names.get(block.type, block.type): block.data for block in mesh.cells}
+    blocks = {names.get(kind, kind): (start, cells) for kind, start, cells in mesh.blocks}
     solids = [name for name in blocks if name in names.values() and name not in FACES]
-    if len(solids) != 1 or len(mesh.cells) > 2:
-        raise InputError(
-            f"{source}: cells of type {', '.join(block.type for block in mesh.cells) or 'none'}, "
-            f"expected one kind of solid element and its faces"
-        )
+    if len(solids) != 1 or len(mesh.blocks) > 2:
+        kinds = ", ".join(kind for kind, _, _ in mesh.blocks) or "none"
+        raise InputError(f"cells of type {kinds}, expected one kind of solid element and its faces")
     missing = [name for name in ("region", "node_fibres") if name not in mesh.cell_data]
     if missing:
-        raise InputError(f"{source}: no cell data {', '.join(missing)}; not written by mvest?")
+        raise InputError(f"no cell data {', '.join(missing)}; not written by mvest?")
     name = solids[0]
     reference = element(name)
-    data = {
-        key: values[next(i for i, b in enumerate(mesh.cells) if names.get(b.type) == name)]
-        for key, values in mesh.cell_data.items()
-    }
-    elements = _from_vtk(name, np.asarray(blocks[name], dtype=np.int64))
+    start, cells = blocks[name]
     pieces = 4 if name in QUARTERS else 1
+    if len(cells) % pieces:
+        raise InputError(f"{len(cells)} cells, expected {pieces} for each element")
+    rows = slice(start, start + len(cells), pieces)
+    elements = _from_vtk(name, cells)
+    faces = np.zeros((0, FACES[reference.face].n_nodes), dtype=np.int64)
     if reference.face in blocks:
-        faces = _from_vtk(reference.face, np.asarray(blocks[reference.face], dtype=np.int64))
-    else:
-        faces = np.zeros((0, FACES[reference.face].n_nodes), dtype=np.int64)
-    try:
-        return SolidMesh(
-            nodes=np.asarray(mesh.points, dtype=np.float64),
-            elements=elements,
-            element_type=name + THIN if THIN in mesh.cell_data else name,
-            region=np.asarray(data["region"][::pieces], dtype=np.int64),
-            region_names=region_names(mesh.cell_data, source),
-            fibre=data["node_fibres"][::pieces].reshape(len(elements), -1, 3),
-            pressure_faces=faces,
-        )
-    except InputError as fault:
-        raise type(fault)(f"{source}: {fault}") from fault
+        faces = _from_vtk(reference.face, blocks[reference.face][1])
+    return SolidMesh(
+        nodes=mesh.points,
+        elements=elements,
+        element_type=name + THIN if THIN in mesh.cell_data else name,
+        region=np.asarray(mesh.cell_data["region"][rows], dtype=np.int64),
+        region_names=region_names(mesh.cell_data),
+        fibre=np.asarray(
+            mesh.cell_data["node_fibres"][rows].reshape(len(elements), -1, 3), dtype=np.float64
+        ),
+        pressure_faces=faces,
+    )

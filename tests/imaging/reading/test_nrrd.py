@@ -27,6 +27,14 @@ def test_the_frames_may_lie_along_any_axis(tmp_path: Path, axis: int, encoding: 
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def test_a_limit_of_bytes_can_be_stated(tmp_path: Path) -> None:
+    path = v.write_nrrd(tmp_path / "a.nrrd", v.nrrd_fields())
+    size = v.frames().size
+    assert read_volume(path, modality=Modality.MR, max_bytes=size).frames.size == size
+    with pytest.raises(InputError, match="max_bytes of read_volume"):
+        read_volume(path, modality=Modality.MR, max_bytes=size - 1)
+
+
 def test_the_content_counts_and_not_the_name(tmp_path: Path) -> None:
     v.assert_same(read(v.write_nrrd(tmp_path / "a.nii.gz", v.nrrd_fields())), v.sequence())
 

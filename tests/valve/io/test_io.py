@@ -102,6 +102,50 @@ def test_vtp_of_vtk_itself_is_read(shapes, tmp_path, form, compressed):
     np.testing.assert_array_equal(back.cell_data["number"], np.arange(len(triangles)))
 
 
+@pytest.mark.parametrize("form", ["Ascii", "Binary", "Appended"])
+@pytest.mark.parametrize("compressor", ["None", "ZLib", "LZMA"])
+def test_vtu_of_vtk_itself_is_read(shapes, tmp_path, form, compressor):
+    vtk = pytest.importorskip("vtk")
+    pyvista = pytest.importorskip("pyvista")
+    vertices, triangles = shapes.sphere(2.0, 4)
+    mesh = pyvista.PolyData.from_regular_faces(vertices, triangles).cast_to_unstructured_grid()
+    mesh.point_data["height"] = vertices[:, 2]
+    mesh.cell_data["number"] = np.arange(len(triangles))
+    writer = vtk.vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(tmp_path / "s.vtu"))
+    writer.SetInputData(mesh)
+    getattr(writer, f"SetDataModeTo{form}")()
+    getattr(writer, f"SetCompressorTypeTo{compressor}")()
+    assert writer.Write()
+    back = read_surface(tmp_path / "s.vtu")
+    np.testing.assert_allclose(back.vertices, vertices, atol=1e-12)
+    np.testing.assert_array_equal(back.triangles, triangles)
+    np.testing.assert_allclose(back.point_data["height"], vertices[:, 2], atol=1e-12)
+    np.testing.assert_array_equal(back.cell_data["number"], np.arange(len(triangles)))
+
+
+def test_properties_of_faces_are_read_from_a_binary_ply(tmp_path):
+    faces = np.zeros(2, [("count", "u1"), ("corners", ">i4", 3), ("region", ">f4")])
+    faces["count"], faces["corners"], faces["region"] = 3, [[0, 1, 2], [2, 1, 3]], [7, 9]
+    points = np.arange(12, dtype=">f4")
+    head = (
+        "ply\nformat binary_big_endian 1.0\nelement vertex 4\nproperty float x\n"
+        "property float y\nproperty float z\nelement face 2\n"
+        "property list uchar int vertex_index\nproperty float region\nend_header\n"
+    )
+    (tmp_path / "a.ply").write_bytes(head.encode() + points.tobytes() + faces.tobytes())
+    back = read_surface(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.vertices, points.reshape(4, 3))
+    np.testing.assert_array_equal(back.triangles, faces["corners"])
+    np.testing.assert_array_equal(back.cell_data["region"], [7, 9])
+
+
+def test_negative_numbers_in_obj_count_from_the_last_vertex(tmp_path):
+    (tmp_path / "a.obj").write_text(TRIANGLE + "f -3 -2 -1\nv 1 1 0\nf -1 3 2\n")
+    back = read_surface(tmp_path / "a.obj")
+    np.testing.assert_array_equal(back.triangles, [[0, 1, 2], [3, 2, 1]])
+
+
 def test_vtp_is_read_by_vtk(shapes, tmp_path):
     pyvista = pytest.importorskip("pyvista")
     vertices, triangles = shapes.sphere(2.0, 4)
