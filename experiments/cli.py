@@ -2,7 +2,7 @@
 
 Every word is the one application (``experiments.run``), or a page of it, with the overrides that it
 takes. Exit status as in ``experiments.run``: 0 done; 1 no estimate; 2 the request is wrong (one
-line says how); 130 interrupted.
+line says how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from experiments.common.places import EXPERIMENTS
+from experiments.runner.interruption import interruptible
 from mvest import __version__
 from mvest.errors import MvestError
 
@@ -46,6 +47,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"error: {message}\n")
 
 
+@interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command on its arguments, those of the command line by default; the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)

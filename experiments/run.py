@@ -1,8 +1,8 @@
 """The one application: ``python -m experiments.run experiment=NAME [overrides] [--multirun]``.
 
 Exit status: 0 done; 1 a run, or a job of a sweep, found no estimate (it is recorded, with its
-reason); 2 the request is wrong (one line says how) or nothing can be written; 130 interrupted
-(nothing is left half-written).
+reason); 2 the request is wrong (one line says how) or nothing can be written; 130, 143 or 129
+stopped by Ctrl-C, SIGTERM or SIGHUP (nothing is left half-written).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.config import register
 from experiments.common.places import CONF
 from experiments.runner.folder import FailedRunError, nothing_empty
+from experiments.runner.interruption import interruptible
 from experiments.runner.plugins import FailedSweepError, register_plugins
 from experiments.runner.request import Request
 from experiments.runner.tracking import track_job
@@ -39,6 +40,7 @@ TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable with which a user asks for tracebacks."""
 
 
+@interruptible
 def main() -> int:
     """Run the application on the command line's arguments; returns the exit status."""
     wants_tracebacks = TRACEBACKS in os.environ
@@ -58,12 +60,6 @@ def main() -> int:
         hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(task)()
         for error in ended:
             raise error
-    except KeyboardInterrupt:
-        print(
-            "interrupted: what is finished is kept, and the same command goes on from there",
-            file=sys.stderr,
-        )
-        return 130
     except FailedSweepError:
         return 1
     except FailedRunError as error:

@@ -8,12 +8,14 @@ from pathlib import Path
 
 from experiments.results.keep import RECORDS, regenerate
 from experiments.results.page import write_report
+from experiments.runner.interruption import interruptible
 from experiments.sweeps.report import read_sweeps, write_sweep
 from mvest.errors import MvestError
 
 __all__ = ["main"]
 
 
+@interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Regenerate the tables and figures; returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)

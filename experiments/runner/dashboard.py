@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -21,15 +20,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from urllib.parse import quote
 
 from experiments.common.ranges import range_of
+from experiments.runner.interruption import raised
 from experiments.runner.plan import PLAN
 from experiments.runner.summary import IS_SWEEP
 from experiments.runner.sync import jobs_in
 from experiments.runner.tracking import open_store
 from mvest.errors import InputError, MvestError
+from mvest.processes import Program
 from mvest.reading.json_file import read_mapping
 
 __all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         range_of("port").require("--port", given.port)
         comparison = last_comparison(given.outputs)
-        with serving(comparison.place, given.outputs, given.port) as (address, server):
+        with raised(), serving(comparison.place, given.outputs, given.port) as (address, server):
             page = comparison.page(address)
             print(f"last sweep, {len(comparison.runs)} runs: {page}", flush=True)
             webbrowser.open(page)
@@ -178,20 +178,9 @@ def serving(
     # Whatever the login shell has set: nobody else is let in.
     kept = {name: value for name, value in os.environ.items() if not name.startswith(WIDER)}
     out = subprocess.DEVNULL if quiet else None
-    before = {name: signal.signal(name, _interrupt) for name in (signal.SIGTERM, signal.SIGHUP)}
-    # A group of its own: the server starts workers, which are to end with it.
-    server = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True, env=kept)
-    try:
-        _await(f"http://127.0.0.1:{port}", server)
-        yield f"http://127.0.0.1:{port}", server
-    finally:
-        for end in (signal.SIGTERM, signal.SIGKILL):
-            with suppress(ProcessLookupError):
-                os.killpg(server.pid, end)
-            with suppress(subprocess.TimeoutExpired):
-                server.wait(5.0)
-        for name, handler in before.items():
-            signal.signal(name, handler)
+    with Program(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=kept) as server:
+        _await(f"http://127.0.0.1:{port}", server.process)
+        yield f"http://127.0.0.1:{port}", server.process
 
 
 def allowed_hosts(port: int) -> list[str]:
@@ -200,10 +189,6 @@ def allowed_hosts(port: int) -> list[str]:
     MLflow's own list lets names like 192.168.evil.com in.
     """
     return [f"{host}:{port}" for host in HOSTS] + (list(HOSTS) if port == HTTP_PORT else [])
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def _await(address: str, server: subprocess.Popen[bytes]) -> None:

@@ -74,11 +74,11 @@ def drain_here(plan: Plan) -> None:
         left.put(job)
     workers = [new_worker() for _ in range(min(plan.workers, left.qsize()))]
     with ThreadPoolExecutor(max(1, len(workers))) as pool:
-        threads = [
-            pool.submit(_drain, plan, _taken(left), worker, f"here-{number}")
-            for number, worker in enumerate(workers)
-        ]
         try:
+            threads = [
+                pool.submit(_drain, plan, _taken(left), worker, f"here-{number}")
+                for number, worker in enumerate(workers)
+            ]
             wait(threads)
         finally:
             for worker in workers:

@@ -10,13 +10,13 @@ import atexit
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any
 
 import experiments
@@ -33,6 +33,7 @@ from experiments.runner.folder import (
 from experiments.runner.limits import MEMORY_LIMIT, default_memory_gb
 from experiments.runner.request import Request
 from mvest.errors import ConfigurationError
+from mvest.processes import Program
 from mvest.provenance import THREAD_VARIABLES
 
 __all__ = ["StoppedError", "WorkerProcess", "new_worker", "run_apart"]
@@ -55,7 +56,7 @@ class WorkerProcess:
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
-        self._process: subprocess.Popen[str] | None = None
+        self._program: Program | None = None
         self._stopped = False
         atexit.register(self.close)
 
@@ -78,14 +79,15 @@ class WorkerProcess:
         ConfigurationError
             If a job that runs aloud is refused.
         """
-        process = self._started()
+        program = self._started()
+        process = program.process
         assert process.stdin is not None
         assert process.stdout is not None
         expired = threading.Event()
 
         def stop() -> None:
             expired.set()
-            _kill(process)
+            program.end()
 
         timer = threading.Timer(time_limit_s or 0.0, stop)
         timer.daemon = True
@@ -121,42 +123,40 @@ class WorkerProcess:
 
     def close(self) -> None:
         """End the process, and whatever it has started."""
-        if self._process is not None:
-            _kill(self._process)
-            self._process.communicate()
-            self._process = None
+        if self._program is not None:
+            self._program.close()
+            self._program = None
 
     def stop(self) -> None:
         """End the process for good, from another thread than the one that waits for its job."""
         self._stopped = True
-        process = self._process
-        if process is not None:
-            _kill(process)
+        program = self._program
+        if program is not None:
+            program.end()
 
-    def _started(self) -> subprocess.Popen[str]:
-        if self._process is not None and self._process.poll() is not None:
+    def _started(self) -> Program:
+        if self._program is not None and self._program.process.poll() is not None:
             self.close()
-        if self._process is None:
+        if self._program is None:
             # The package itself, wherever the command is typed.
             places = [
                 str(Path(experiments.__file__).resolve().parents[1]),
                 os.environ.get("PYTHONPATH", ""),
             ]
-            self._process = subprocess.Popen(
+            self._program = Program(
                 self._command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                stdin=PIPE,
+                stdout=PIPE,
                 text=True,
                 encoding="utf-8",
                 env=os.environ
                 | dict.fromkeys(THREAD_VARIABLES, "1")
                 | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
-                start_new_session=True,
             )
         if self._stopped:
             self.close()
             raise StoppedError
-        return self._process
+        return self._program
 
 
 def new_worker() -> WorkerProcess:
@@ -222,14 +222,6 @@ def _done_since(folder: Path, asked_ns: int | None) -> bool:
     if asked_ns is None or written is None:
         return False
     return written > asked_ns and is_done(folder)
-
-
-def _kill(process: subprocess.Popen[str]) -> None:
-    """End a process and its group."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return
 
 
 def _end(code: int | None) -> str:

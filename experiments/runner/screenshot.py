@@ -17,6 +17,7 @@ from PIL import Image
 
 from experiments.runner.dashboard import last_comparison, serving
 from mvest.errors import InputError, MvestError
+from mvest.processes import run
 
 __all__ = ["look_at", "main"]
 
@@ -69,12 +70,17 @@ def look_at(address: str, what: str) -> str:
         window = f"--window-size={PICTURE[0] + PANEL},{PICTURE[1]}"
         command = [program, *FLAGS, window, f"--user-data-dir={profile}", what, address]
         try:
-            seen = subprocess.run(
-                command, check=True, capture_output=True, text=True, timeout=PATIENCE
+            seen = run(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                timeout=PATIENCE,
             )
+            seen.check_returncode()
         except (subprocess.SubprocessError, OSError) as error:
             raise InputError(f"Chromium shows no page: {error}") from error
-    return seen.stdout
+    return str(seen.stdout)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.runner.interruption import interruptible
 from experiments.runner.plan import PLAN, Plan
 from experiments.runner.summary import SWEEP, log_summary
 from experiments.runner.tracking import (
@@ -34,6 +35,7 @@ MANY = 1000
 """Jobs of a sweep above which each is a run of its own only where that is asked for."""
 
 
+@interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Log every job in the folders given (``outputs`` if none); returns the exit status.
 

@@ -3,8 +3,7 @@
 Started as ``python -m experiments.runner.worker``.
 
 Requests come as lines of JSON on standard input, answers leave as lines of JSON on standard output.
-What a job itself prints, crashes of compiled code included, goes to the log in its folder. The
-process ends with the one that started it, also in the middle of a job: its input is then closed.
+What a job itself prints, crashes of compiled code included, goes to the log in its folder.
 """
 
 from __future__ import annotations
@@ -12,17 +11,15 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
-import queue
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from experiments.runner.folder import LOG
+from experiments.runner.interruption import raised
 from experiments.runner.job import FailedRunError, compute
 from experiments.runner.limits import MEMORY_LIMIT, held_memory
 from experiments.runner.request import Request
@@ -44,18 +41,18 @@ def main() -> None:
         os.dup2(nothing, stream)
     faulthandler.enable()
     _volunteer()
-    waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
-    while True:
-        order = json.loads(waiting.get())
-        limit_gb, aloud = order.pop(MEMORY_LIMIT), order.pop("aloud")
-        request = Request.from_json(order)
-        # Whoever waits for one job sees its progress.
-        streams = (1,) if aloud else (1, 2)
-        with _output_to(request.folder / LOG, streams):
-            answered = answer(request, limit_gb)
-        answers.write(json.dumps(answered) + "\n")
-        answers.flush()
+    # Asked to stop, it takes its temporary files away.
+    with suppress(KeyboardInterrupt), raised():
+        for line in requests:
+            order = json.loads(line)
+            limit_gb, aloud = order.pop(MEMORY_LIMIT), order.pop("aloud")
+            request = Request.from_json(order)
+            # Whoever waits for one job sees its progress.
+            streams = (1,) if aloud else (1, 2)
+            with _output_to(request.folder / LOG, streams):
+                answered = answer(request, limit_gb)
+            answers.write(json.dumps(answered) + "\n")
+            answers.flush()
 
 
 def answer(request: Request, memory_limit_gb: float | None = None) -> dict[str, Any]:
@@ -96,15 +93,6 @@ def _line(error: BaseException) -> str:
 
 def _trace(error: BaseException) -> None:
     traceback.print_exception(error, file=sys.stdout)
-
-
-def _listen(requests: TextIO, waiting: queue.SimpleQueue[str]) -> None:
-    """Pass requests on; at the end of the input, end this process and those it started."""
-    for line in requests:
-        waiting.put(line)
-    if os.getpgrp() == os.getpid():
-        os.killpg(0, signal.SIGKILL)
-    os._exit(0)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
+from mvest.processes import side_by_side
 from mvest.typing import FloatArray
 
 __all__ = ["predict_many"]
@@ -50,14 +51,9 @@ def predict_many(
     fresh = model.fresh()
     if processes == 1:
         return _predict(fresh, values)
-    import joblib  # and with it asyncio, which one process needs not wait for
-
     # Neighbours in the list tend to cost alike: dealt out in turn, all processes get a like share.
     shares = [values[k::processes] for k in range(min(processes, len(values)))]
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        done = joblib.Parallel(n_jobs=processes)(
-            joblib.delayed(_predict)(fresh, share) for share in shares
-        )
+    done = list(side_by_side(_predict, ((fresh, share) for share in shares), processes))
     return [done[k % processes][k // processes] for k in range(len(values))]
 
 

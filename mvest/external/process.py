@@ -1,12 +1,12 @@
 """A program that is started, watched and stopped with all that it has started.
 
 No shell is involved: each argument reaches the program as it stands, whatever characters it holds.
-The program leads a process group of its own, which is stopped as a whole.
+The program leads a process group of its own, which is stopped as a whole, whatever becomes of this
+process.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shutil
@@ -20,6 +20,7 @@ from pathlib import Path
 
 from mvest.errors import ConfigurationError
 from mvest.external.contract import REQUEST
+from mvest.processes import Program
 
 __all__ = ["ERRORS", "OUTPUT", "Command", "Ending"]
 
@@ -27,9 +28,6 @@ OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 """Files of a run's folder that hold what its program said."""
 
 PLACEHOLDER = re.compile(r"\{(request|folder|here)\}")
-GRACE_S = 1.0
-"""Between asking a program to stop and stopping it."""
-
 POLL_S = 0.05
 TAIL_BYTES, TAIL_LINES, LINE_LENGTH = 4096, 4, 200
 
@@ -105,25 +103,22 @@ class Command:
         arguments = [self._filled(text, folder.resolve()) for text in self.arguments]
         try:
             with (folder / OUTPUT).open("wb") as output, (folder / ERRORS).open("wb") as errors:
-                process = subprocess.Popen(
+                program = Program(
                     arguments,
                     cwd=folder,
                     env={**os.environ, **self.environment},
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=errors,
-                    start_new_session=True,
                 )
         except OSError as error:
             reason = f"the program could not be started: {error.strerror or error}"
             return Ending(reason, time.monotonic() - started)
-        try:
-            stopped = self._watch(process, started, stop)
-        finally:
-            # Also what an ended program has left behind: it could write into files read by now.
-            _end(process)
+        # Left, nothing that it has started writes into files that are read by now.
+        with program:
+            stopped = self._watch(program.process, started, stop)
         seconds = time.monotonic() - started
-        reason = stopped or _status(process.returncode)
+        reason = stopped or _status(program.process.returncode)
         return Ending(reason + _last_words(folder) if reason else "", seconds)
 
     def _watch(
@@ -149,24 +144,6 @@ class Command:
             "here": str(Path.cwd()),
         }
         return PLACEHOLDER.sub(lambda found: places[found[1]], text)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a program and its group: asked first, then made to."""
-    if process.poll() is None:
-        _signal(process.pid, signal.SIGTERM)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(GRACE_S)
-    _signal(process.pid, signal.SIGKILL)
-    process.wait()
-
-
-def _signal(group: int, which: signal.Signals) -> None:
-    try:
-        os.killpg(group, which)
-    except (ProcessLookupError, PermissionError):
-        # Nobody is left, or (macOS) only what has ended and waits to be collected.
-        return
 
 
 def _status(code: int) -> str:

@@ -12,11 +12,11 @@ from __future__ import annotations
 import json
 import os
 import resource
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from subprocess import DEVNULL, PIPE
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -29,6 +29,7 @@ from experiments.common.cases.volume import run_volume
 from experiments.common.record import Outcome
 from experiments.common.schema import build
 from mvest.errors import InputError, MvestError
+from mvest.processes import run
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.json_file import read_mapping
 
@@ -97,17 +98,16 @@ def estimate_blindly(
         str(Path(experiments.__file__).resolve().parents[1]),
         os.environ.get("PYTHONPATH", ""),
     ]
-    ended = subprocess.run(
+    ended = run(
         [sys.executable, "-m", "experiments.common.cases.blind"],
         input=json.dumps(request),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        stdout=DEVNULL,
+        stderr=PIPE,
         text=True,
         encoding="utf-8",
         env=os.environ
         | dict.fromkeys(THREAD_VARIABLES, "1")
         | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
-        check=False,
     )
     if ended.returncode or not path.is_file():
         last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-import joblib
+from mvest.processes import side_by_side
 
 __all__ = ["in_processes"]
 
@@ -27,13 +27,7 @@ def in_processes(
     processes : int
         1 computes here, without further processes.
     """
-    if processes == 1:
-        for arguments in calls:
-            yield _timed(function, arguments)
-        return
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
-        yield from parallel(joblib.delayed(_timed)(function, arguments) for arguments in calls)
+    return side_by_side(_timed, ((function, arguments) for arguments in calls), processes)
 
 
 def _timed(function: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[T, float]:

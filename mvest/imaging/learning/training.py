@@ -41,6 +41,7 @@ from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
 from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.volume import VolumeSequence
+from mvest.processes import side_by_side
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -305,41 +306,33 @@ def train_model(
     InputError
         If there is no valve, fewer shapes than modes, or fewer modes than are read off at a pose.
     """
-    import joblib  # and with it asyncio, which finding a valve needs not wait for
-
     if not valves:
         raise InputError("training: no valves")
     if settings.modes < MODES:
         raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
     tell = progress or (lambda what, done, all_: None)
     shape = fit_shape_model(valves, settings.modes)
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = joblib.Parallel(n_jobs=processes, return_as="generator")
-        samples: list[Samples] = []
-        first = min(settings.draft_volumes, settings.volumes)
-        for numbers in (range(first), range(first, settings.volumes)):
-            draft = draft_of(samples, settings, seed) if samples and len(numbers) else None
-            drawn = parallel(
-                joblib.delayed(volume_samples)(
-                    valves[k % len(valves)], k, shape, settings, seed, draft
-                )
-                for k in numbers
-            )
-            for sample in drawn:
-                samples.append(sample)
-                tell("volumes", len(samples), settings.volumes)
-        grown = parallel(
-            joblib.delayed(train_stage)(
-                name,
-                np.concatenate([part[name][0] for part in samples]),
-                np.concatenate([part[name][1] for part in samples]),
-                settings,
-                seed,
-            )
-            for name in STAGES
+    samples: list[Samples] = []
+    first = min(settings.draft_volumes, settings.volumes)
+    for numbers in (range(first), range(first, settings.volumes)):
+        draft = draft_of(samples, settings, seed) if samples and len(numbers) else None
+        volumes = ((valves[k % len(valves)], k, shape, settings, seed, draft) for k in numbers)
+        for sample in side_by_side(volume_samples, volumes, processes):
+            samples.append(sample)
+            tell("volumes", len(samples), settings.volumes)
+    stages = (
+        (
+            name,
+            np.concatenate([part[name][0] for part in samples]),
+            np.concatenate([part[name][1] for part in samples]),
+            settings,
+            seed,
         )
-        boosters = {}
-        for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
-            boosters[name] = found_boosters
-            tell("stages", k + 1, len(STAGES))
+        for name in STAGES
+    )
+    boosters = {}
+    grown = side_by_side(train_stage, stages, processes)
+    for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
+        boosters[name] = found_boosters
+        tell("stages", k + 1, len(STAGES))
     return DetectionModel(shape, boosters, dict(trained_on or {}))

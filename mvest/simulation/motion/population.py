@@ -7,7 +7,7 @@ how many processes work or on how often another valve was drawn again.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.moving_valve import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
+from mvest.processes import side_by_side
 from mvest.provenance import config_hash
 from mvest.simulation.motion.closing import MotionSettings, close_in_motion
 from mvest.simulation.motion.refusal import RefusedError
@@ -140,16 +141,7 @@ def draw_population(
         (f"{names[which]}_{seed}_{k:03d}", bases[names[which]], sequence)
         for k, (which, sequence) in enumerate(zip(order, root.spawn(count), strict=True))
     ]
-    made: Iterable[tuple[MovingValve, list[str]]]
-    if processes == 1:
-        made = (_draw(*job, settings, mechanics) for job in jobs)
-    else:
-        import joblib  # and with it asyncio, which one process needs not wait for
-
-        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-            made = joblib.Parallel(n_jobs=processes, return_as="generator")(
-                joblib.delayed(_draw)(*job, settings, mechanics) for job in jobs
-            )
+    made = side_by_side(_draw, ((*job, settings, mechanics) for job in jobs), processes)
     valves, refused = [], Counter[str]()
     for k, (valve, reasons) in enumerate(made):
         valves.append(valve)

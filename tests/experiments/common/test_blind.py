@@ -133,7 +133,7 @@ def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
             (tmp_path / ESTIMATE).write_text(json.dumps(answer))
         return SimpleNamespace(returncode=returncode, stderr=stderr)
 
-    monkeypatch.setattr(blind.subprocess, "run", run)
+    monkeypatch.setattr(blind, "run", run)
     outcome = estimate_blindly(values, tmp_path, Path("case"), Path("hidden"))
     return heard[0], outcome
 

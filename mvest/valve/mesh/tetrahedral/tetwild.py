@@ -21,6 +21,7 @@ import numpy as np
 
 from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
 from mvest.kept import Entry
+from mvest.processes import run
 from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
@@ -206,15 +207,15 @@ def _mesh(
             coarsen=settings.coarsen,
         )
         try:
-            done = subprocess.run(
+            done = run(
                 [sys.executable, "-P", str(WORKER), str(source), str(target)],
                 cwd=folder,
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
-                capture_output=True,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
                 text=True,
                 errors="replace",
                 timeout=settings.time_limit,
-                check=False,
             )
         except subprocess.TimeoutExpired:
             raise MeshingError(

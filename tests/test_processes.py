@@ -1,0 +1,202 @@
+"""Programs end with whoever started them, with all that they have started, and tell how."""
+
+import ast
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mvest.processes import Program, run, side_by_side
+from tests.places import ROOT
+
+MAY_START = {
+    "mvest/_keeper.py",
+    "mvest/processes.py",
+    # Questions that are answered or given up within seconds, and compute nothing.
+    "mvest/provenance.py",
+    "experiments/runner/slurm.py",
+}
+STARTERS = {"joblib", "loky", "multiprocessing"}
+CALLS = {"Popen", "run", "check_call", "check_output", "call", "fork", "posix_spawn", "system"}
+"""Modules, and functions of `os` and `subprocess`, that start processes."""
+
+
+def starts(tree: ast.AST) -> bool:
+    for node in ast.walk(tree):
+        match node:
+            case ast.Call(func=ast.Attribute(value=ast.Name(id="subprocess" | "os"), attr=name)):
+                if name in CALLS:
+                    return True
+            case ast.Import(names=names) if {n.name.split(".")[0] for n in names} & STARTERS:
+                return True
+            case ast.ImportFrom(module=str(module)) if module.split(".")[0] in STARTERS:
+                # Ending a pool is no start of one.
+                if [name.name for name in node.names] != ["get_reusable_executor"]:
+                    return True
+    return False
+
+
+def test_one_module_starts_what_computes():
+    places = [*(ROOT / "mvest").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")]
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in places
+        if starts(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    assert found == MAY_START
+
+
+@pytest.mark.parametrize(
+    ("code", "status"),
+    [("exit 0", 0), ("exit 7", 7), ("kill -SEGV $$", -11), ("kill -KILL $$", -9)],
+)
+def test_the_end_of_a_program_is_told_as_it_was(code, status):
+    assert run(["/bin/sh", "-c", code], stderr=subprocess.DEVNULL).returncode == status
+
+
+def test_streams_are_the_program_s():
+    ended = run(["/bin/sh", "-c", "cat; echo no >&2"], input="yes", stdout=-1, stderr=-1, text=True)
+    assert (ended.stdout, ended.stderr) == ("yes", "no\n")
+
+
+def test_what_cannot_be_started_is_an_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        run(["no-such-program-here"])
+    (tmp_path / "plain").touch()
+    with pytest.raises(PermissionError):
+        run([str(tmp_path / "plain")])
+
+
+def test_a_signal_to_the_keeper_reaches_the_program():
+    with Program(["/bin/sleep", "60"]) as program:
+        program.process.terminate()
+        assert program.process.wait(30) == -signal.SIGTERM
+
+
+def test_python_s_own_ignored_signals_are_not_handed_on():
+    shell = run(["/bin/sh", "-c", "kill -PIPE $$; echo ignored"], stdout=-1, text=True)
+    assert (shell.returncode, shell.stdout) == (-signal.SIGPIPE, "")
+
+
+linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
+
+
+def alive(folder: Path) -> list[str]:
+    """Command lines of the processes, not this one, that work in a folder."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            state = (place / "stat").read_text().rsplit(") ", 1)[1][0]
+            if state != "Z" and (place / "cwd").readlink() == folder.resolve():
+                found.append((place / "cmdline").read_text().replace("\0", " "))
+        except OSError:
+            continue
+    return found
+
+
+def until(condition: Callable[[], bool]) -> None:
+    stop = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < stop, "waited in vain"
+        time.sleep(0.05)
+
+
+def gone(folder: Path, within_s: float = 5.0) -> bool:
+    stop = time.monotonic() + within_s
+    while alive(folder) and time.monotonic() < stop:
+        time.sleep(0.05)
+    return not alive(folder)
+
+
+STUBBORN = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & (sleep 300 &) ; : > up; wait; wait"
+"""A program that does not listen, with a child, one in a session of its own and an orphan."""
+
+PARENT = """
+import sys, threading
+from mvest.processes import Program
+kept = []
+def begin(): kept.append(Program(["/bin/sh", "-c", sys.argv[1]]))
+if sys.argv[2] == "thread":
+    # The thread that starts it ends long before the process.
+    thread = threading.Thread(target=begin)
+    thread.start()
+    thread.join()
+else:
+    begin()
+threading.Event().wait()
+"""
+
+
+@linux
+@pytest.mark.parametrize("how", ["main", "thread"])
+def test_a_kill_of_the_parent_ends_a_program_that_does_not_listen(tmp_path, how):
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, STUBBORN, how],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    try:
+        # Parent, keeper, shell and three.
+        until(lambda: len(alive(tmp_path)) == 6 and (tmp_path / "up").exists())
+    finally:
+        parent.kill()
+        parent.wait()
+    assert gone(tmp_path), alive(tmp_path)
+
+
+@linux
+def test_a_program_ends_with_a_keeper_that_is_killed(tmp_path):
+    with Program(["/bin/sleep", "300"], cwd=tmp_path) as program:
+        os.kill(program.process.pid, signal.SIGKILL)
+        assert gone(tmp_path)
+
+
+@linux
+def test_a_time_limit_ends_all_that_was_started(tmp_path):
+    with pytest.raises(subprocess.TimeoutExpired):
+        run(["/bin/sh", "-c", STUBBORN], timeout=0.3, cwd=tmp_path)
+    assert alive(tmp_path) == []
+
+
+def pid(number: int) -> int:
+    (Path(os.environ["UP"]) / str(number)).write_text(str(os.getpid()))
+    return number
+
+
+def forever(number: int) -> None:
+    pid(number)
+    time.sleep(300)
+
+
+def test_results_come_in_order_from_here_or_from_a_pool(tmp_path, monkeypatch):
+    monkeypatch.setenv("UP", str(tmp_path))
+    assert list(side_by_side(pid, ((k,) for k in range(3)), 1)) == [0, 1, 2]
+    assert (tmp_path / "0").read_text() == str(os.getpid())
+
+
+POOL = """
+from mvest.processes import side_by_side
+from tests import test_processes
+list(side_by_side(test_processes.forever, ((k,) for k in range(2)), 2))
+"""
+
+
+@linux
+def test_a_pool_ends_with_its_parent(tmp_path):
+    parent = subprocess.Popen(
+        [sys.executable, "-c", POOL],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "UP": str(tmp_path)},
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        until(lambda: len(list(tmp_path.iterdir())) == 2)
+    finally:
+        parent.kill()
+        parent.wait()
+    assert gone(tmp_path), alive(tmp_path)
