@@ -6,9 +6,9 @@ adds to it is written down here.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass
+from functools import cache
 from typing import Any
 
 from hydra.core.object_type import ObjectType
@@ -16,10 +16,11 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.schema import schema
+from experiments.common.schema import schema, with_contents
 from experiments.common.study import load_settings, study_names
 from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.monte_carlo import MonteCarloFilter
+from mvest.files import sha256_of
 from mvest.imaging.models import MODEL_FILE
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.provenance import config_hash
@@ -146,7 +147,6 @@ class PathsConfig:
 
     outputs: str = "outputs"
     results: str = "results"
-    donor: str = "${oc.env:MVEST_TRIVALVE,../shared/data/trivalve}"  # recorded donor valve
 
 
 @dataclass
@@ -225,21 +225,29 @@ def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str
 
 
 def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
-    """SHA-256 of everything in a configuration, resolved or not, that can change the result."""
+    """SHA-256 of everything in a configuration, resolved or not, that can change the result.
+
+    Of files and folders that it names what lies there counts, and not their names.
+    """
     values = plain(config, NOT_THE_RESULT) if isinstance(config, DictConfig) else config
     kept = {str(key): value for key, value in values.items() if key not in NOT_THE_RESULT}
     for name in NOT_THE_RESULT:
         part, _, inner = name.partition(".")
         if inner and kept.get(part) is not None:
             kept[part] = {key: value for key, value in kept[part].items() if key != inner}
-    return config_hash(kept)
+    return config_hash(with_contents(_settings(kept.get("study")), kept))
+
+
+@cache
+def _settings(study: str | None) -> type | None:
+    return load_settings(study) if study in study_names() else None
 
 
 def _package_model() -> str | None:
     """SHA-256 of the detectors that come with the package, if there are any."""
     if not MODEL_FILE.is_file():
         return None
-    return hashlib.sha256(MODEL_FILE.read_bytes()).hexdigest()
+    return sha256_of(MODEL_FILE)
 
 
 class StudySource(ConfigSource):

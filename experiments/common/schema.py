@@ -9,16 +9,88 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 from omegaconf import MISSING
 
 from mvest.errors import ConfigurationError
+from mvest.files import sha256_of
 
-__all__ = ["build", "schema"]
+__all__ = ["InputFile", "Reads", "build", "contents", "schema", "with_contents"]
 
 T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Reads:
+    """Marks a setting that names files or folders which the study reads.
+
+    In the hash of a configuration what lies there stands in place of its name.
+
+    Attributes
+    ----------
+    contents : callable
+        (value of the setting, values beside it) -> plain data that say what will be read.
+    """
+
+    contents: Callable[[Any, Mapping[str, Any]], Any]
+
+
+def contents(value: Any, _beside: Mapping[str, Any] | None = None) -> Any:
+    """Plain data with what lies at each path in place of its name; what cannot be read keeps it."""
+    if isinstance(value, Mapping):
+        return {key: contents(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [contents(item) for item in value]
+    try:
+        return {"sha256": sha256_of(Path(value))} if isinstance(value, str | Path) else value
+    except ValueError:
+        # The study says what is wrong with it.
+        return str(value)
+
+
+InputFile = Annotated[str | None, Reads(contents)]
+"""Type of a setting that names one file or folder, all of which is read."""
+
+
+def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None) -> Any:
+    """Values of a schema, or of one of its types, with what its settings read in their place."""
+    if value is None or value == MISSING or not _may_read(kind):
+        return value
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is Annotated:
+        for mark in arguments[1:]:
+            if isinstance(mark, Reads):
+                return mark.contents(value, beside or {})
+        return with_contents(arguments[0], value)
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
+        return with_contents(arguments[0], value)
+    if _is_schema(kind):
+        hints = _hints(kind)
+        return {k: with_contents(hints.get(k), item, value) for k, item in value.items()}
+    if isinstance(value, Mapping):
+        return {key: with_contents(arguments[1], item) for key, item in value.items()}
+    return [with_contents(arguments[0], item) for item in value]
+
+
+@cache
+def _may_read(kind: Any) -> bool:
+    inner = _hints(kind).values() if _is_schema(kind) else typing.get_args(kind)
+    return isinstance(kind, Reads) or any(map(_may_read, inner))
+
+
+def _is_schema(kind: Any) -> bool:
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    names = {field.name for field in dataclasses.fields(cls)}
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {name: hint for name, hint in hints.items() if name in names}
 
 
 def schema(cls: type, *more: type) -> type:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from experiments.common.config import hash_of
 from experiments.common.record import Record, record_from, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Study, load_study, study_names
@@ -100,7 +102,12 @@ def compute(request: Request) -> None:
     values, folder = request.values, request.folder
     study = load_study(values["study"])
     job = _job(study, request)
-    record = stamp(values, request.config_hash, study.run(job), started)
+    outcome = study.run(job)
+    if hash_of(values) != request.config_hash:
+        # Nobody can say of which content it is the result.
+        reason = "a file or folder that the settings name was changed before the job ended"
+        outcome = replace(outcome, status="failed", reason=reason)
+    record = stamp(values, request.config_hash, outcome, started)
 
     write_json(folder / CONFIG, values)
     write_record(folder / RESULT, record)

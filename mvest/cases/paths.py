@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mvest.cases.schema import wrong
+from mvest.errors import InputError
+from mvest.reading.yaml_file import read_yaml
 
-__all__ = ["CASE_FILE", "CaseFolder"]
+__all__ = ["CASE_FILE", "CaseFolder", "files_of_case"]
 
 CASE_FILE = "case.yaml"
 
@@ -52,3 +56,29 @@ class CaseFolder:
             digest.update(f"{len(name.encode())} {name} {len(content)} ".encode())
             digest.update(content)
         return digest.hexdigest()
+
+
+def files_of_case(root: Path) -> dict[str, Path]:
+    """Name -> file of all that reading a case folder can open, as far as it is there.
+
+    These are the file with the fields and whatever a text in it names, whichever field it is in.
+    """
+    files = {CASE_FILE: root / CASE_FILE}
+    try:
+        files |= {text: root / text for text in _texts(read_yaml(root / CASE_FILE))}
+        return {name: file for name, file in files.items() if file.is_file()}
+    except (InputError, OSError):
+        # It is refused when it is read.
+        return files
+
+
+def _texts(data: Any) -> Iterator[str]:
+    if isinstance(data, dict | list):
+        for item in data.values() if isinstance(data, dict) else data:
+            yield from _texts(item)
+    elif isinstance(data, str) and len(data) < MAX_NAME and not Path(data).is_absolute():
+        yield data
+
+
+MAX_NAME = 1024
+"""Characters; longer texts are descriptions."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,8 @@ from mvest.errors import ConfigurationError, InputError, cannot_write
 from mvest.estimation.prediction import Prediction
 from mvest.external.contract import ANSWERS, Answer, RunRequest, read_answer, write_request
 from mvest.external.differences import Differences
-from mvest.external.process import Command
+from mvest.external.process import Command, files_of_command
+from mvest.files import sha256_of
 from mvest.provenance import config_hash, write_json
 from mvest.reading.json_file import read_mapping
 from mvest.typing import FloatArray
@@ -66,8 +66,9 @@ class ProcessModel:
     reuse : bool
         Whether finished runs serve again.
     inputs : sequence of Path
-        Files whose contents a run depends on, such as the program's own and its mesh: after a
-        change of one of them nothing finished serves any more.
+        Files and folders whose contents a run depends on beside those that the command names
+        (:func:`mvest.external.process.files_of_command`): after a change of one of them nothing
+        finished serves any more, and a run during which one is changed counts as failed.
 
     Attributes
     ----------
@@ -108,7 +109,8 @@ class ProcessModel:
         self._points = None if points is None else np.asarray(points, dtype=np.float64)
         if self._points is not None and self._points.shape != (count, 3):
             raise ConfigurationError(f"points: shape {self._points.shape}, expected ({count}, 3)")
-        self._inputs = {str(path): _sha256(path) for path in inputs}
+        self._inputs = tuple(inputs)
+        self._contents()
         # Units and names are in order, or this says what is not.
         self._request(np.zeros(len(self.names)), True)
         try:
@@ -184,7 +186,7 @@ class ProcessModel:
 
     def _run(self, request: RunRequest, stop: threading.Event | None) -> _Run:
         """One run in its folder, unless it is finished there."""
-        folder = self.folder / f"run-{self._hash(request)[:24]}"
+        folder = self._place(request)
         try:
             folder.mkdir(exist_ok=True)
             with FileLock(folder / ".lock"):
@@ -208,6 +210,8 @@ class ProcessModel:
         if ending.reason:
             said = [] if not answer.reason or "missing" in answer.reason else [answer.reason]
             answer = Answer("; ".join([ending.reason, *said]), np.empty(0))
+        if not answer.reason and self._place(request) != folder:
+            answer = Answer("a file that it depends on was changed while it ran", np.empty(0))
         if answer.reason:
             answer = Answer(f"{folder.name}: {answer.reason}", np.empty(0))
         else:
@@ -224,26 +228,26 @@ class ProcessModel:
             pass
         return None
 
-    def _hash(self, request: RunRequest) -> str:
-        """SHA-256 of all that an answer depends on."""
-        return config_hash(
+    def _place(self, request: RunRequest) -> Path:
+        """The folder of a run, named by the SHA-256 of all that its answer depends on."""
+        named = config_hash(
             {
                 "request": request.data(),
                 "command": self.command.arguments,
                 "environment": self.command.environment,
                 "points": self._points,
-                "inputs": self._inputs,
+                "inputs": self._contents(),
             }
         )
+        return self.folder / f"run-{named[:24]}"
+
+    def _contents(self) -> dict[str, str]:
+        """SHA-256 of the files that the command names and of the inputs, as they are now."""
+        named = files_of_command(self.command.arguments, self.command.environment)
+        files = {**named, **{str(path): path for path in self._inputs}}
+        return {name: sha256_of(path) for name, path in files.items()}
 
 
 def _answers(folder: Path) -> dict[str, str]:
     """SHA-256 of the files of an answer that are there."""
-    return {name: _sha256(folder / name) for name in ANSWERS if (folder / name).is_file()}
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    return {name: sha256_of(folder / name) for name in ANSWERS if (folder / name).is_file()}

@@ -7,6 +7,7 @@ process.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -14,7 +15,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from mvest.errors import ConfigurationError
 from mvest.external.contract import REQUEST
 from mvest.processes import Program
 
-__all__ = ["ERRORS", "OUTPUT", "Command", "Ending"]
+__all__ = ["ERRORS", "OUTPUT", "Command", "Ending", "files_of_command"]
 
 OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 """Files of a run's folder that hold what its program said."""
@@ -30,6 +31,42 @@ OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 PLACEHOLDER = re.compile(r"\{(request|folder|here)\}")
 POLL_S = 0.05
 TAIL_BYTES, TAIL_LINES, LINE_LENGTH = 4096, 4, 200
+
+
+CODE = (".jl", ".m", ".py", ".r", ".sh")
+"""Endings of programs that take others from the folder that they lie in."""
+
+
+def files_of_command(arguments: Sequence[str], environment: Mapping[str, str]) -> dict[str, Path]:
+    """What a command names of the files that are there: these decide what it answers.
+
+    They are the program itself, arguments that are files, what follows a ``=`` in an argument, and
+    beside a script all others of its kind, which it may import. What only the program knows of
+    (its libraries, files named within files, modules by ``python -m``) is not among them.
+
+    Parameters
+    ----------
+    arguments, environment
+        As in `Command`.
+    """
+    path = {**os.environ, **environment}.get("PATH")
+    files = {}
+    for k, text in enumerate(arguments):
+        for name in (text, text.partition("=")[2]):
+            place = Path(name.replace("{here}", str(Path.cwd())))
+            if k == 0:
+                place = Path(shutil.which(place, path=path) or place).absolute()
+            with contextlib.suppress(OSError, ValueError):  # a text that is no name
+                # A run's own files are named by {request} and {folder}, or relative to its folder.
+                if place.is_absolute() and place.is_file():
+                    files[name] = place
+    scripts = [file for file in files.values() if file.suffix.lower() in CODE]
+    return files | {
+        str(other): other
+        for script in scripts
+        for other in script.parent.glob(f"*{script.suffix}")
+        if other.is_file()
+    }
 
 
 @dataclass(frozen=True, slots=True)

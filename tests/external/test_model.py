@@ -8,7 +8,7 @@ import pytest
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation import Gaussian, IteratedFilter, Log, Reason
 from mvest.external import Command, Differences, ProcessModel
-from tests.external.programs import NAMES, answering, model, springs
+from tests.external.programs import NAMES, SPRINGS, answering, model, springs
 
 M = np.array([0.8, 2.5])
 
@@ -105,11 +105,14 @@ def test_a_finished_run_that_was_damaged_is_done_again(tmp_path):
 
 
 def test_a_failed_run_is_not_kept_and_its_old_answer_is_not_read(tmp_path):
-    assert model(tmp_path, "exact")(M).converged
+    # A program that goes by what no command says: it writes nothing once there is that file.
+    off = f"import os, sys\nif os.path.exists({str(tmp_path / 'off')!r}): sys.exit()\n"
+    assert model(tmp_path, "exact", source=off + SPRINGS)(M).converged
     (folder,) = (tmp_path / "runs").glob("run-*")
     (folder / "finished.json").unlink()
-    # The same run by a program that writes nothing: what lies there is another's.
-    silent = model(tmp_path, "exact", source="")
+    (tmp_path / "off").touch()
+    # The same run again: what lies there is another's.
+    silent = model(tmp_path, "exact", source=off + SPRINGS)
     for _ in range(2):
         assert silent(M).reason == f"{folder.name}: response.json is missing"
     assert (silent.runs, silent.reused) == (2, 0)
@@ -197,3 +200,49 @@ def test_a_run_without_a_place_is_a_reason_and_no_run(tmp_path):
     (tmp_path / "runs").touch()
     assert "Not a directory" in program(M).reason
     assert (program.runs, program.reused) == (0, 0)
+
+
+def counted(monkeypatch, tmp_path, *arguments: str) -> int:
+    """Runs that are started for a command line in ``tmp_path``."""
+    monkeypatch.chdir(tmp_path)
+    command = Command((*arguments, "{request}", "{folder}"))
+    program = ProcessModel(command, tmp_path / "runs", NAMES, 2, units=("N/mm", "N/mm"))
+    assert program(M).converged
+    return program.runs
+
+
+def test_after_a_change_of_a_file_in_the_command_nothing_finished_serves(tmp_path, monkeypatch):
+    ours = tmp_path / "bin"
+    ours.mkdir()
+    (ours / "solve.py").write_text(SPRINGS)
+    helper, mesh, tool = ours / "helper.py", tmp_path / "mesh.inp", ours / "tool"
+    for file in (helper, mesh):
+        file.write_text("1")
+    tool.write_text(f'#!/bin/sh\nexec {sys.executable} -S "$1" "$3" "$4"\n')
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(ours), prepend=":")
+    words = ("tool", "{here}/bin/solve.py", f"--mesh={mesh}")
+    assert counted(monkeypatch, tmp_path, *words) == 5
+    assert counted(monkeypatch, tmp_path, *words) == 0
+    for file in (ours / "solve.py", helper, mesh, tool):
+        file.write_text(file.read_text() + "\n# changed\n")
+        assert counted(monkeypatch, tmp_path, *words) == 5, file
+    # Another program of this name is found first.
+    other = tmp_path / "first"
+    other.mkdir()
+    (other / "tool").write_text(tool.read_text() + "# another\n")
+    (other / "tool").chmod(0o755)
+    monkeypatch.setenv("PATH", str(other), prepend=":")
+    assert counted(monkeypatch, tmp_path, *words) == 5
+    # What the program writes into its run's folder is none of it, nor what lies elsewhere.
+    (tmp_path / "notes.txt").touch()
+    assert counted(monkeypatch, tmp_path, *words) == 0
+
+
+def test_an_answer_is_not_kept_whose_program_was_changed_while_it_ran(tmp_path):
+    source = SPRINGS + "\nopen(__file__, 'a').write('# and on')\n"
+    prediction = model(tmp_path, "exact", source=source, differences=None)(M)
+    assert "a file that it depends on was changed while it ran" in prediction.reason
+    again = model(tmp_path, "exact", differences=None)
+    assert again(M).converged
+    assert again.runs == 1

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+from experiments.common.schema import InputFile, Reads, contents
 from mvest.personalise.settings import CaseMesh, PaperSettings
 
-__all__ = ["ImagedSettings", "PersonalSettings", "UnknownSettings"]
+__all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
+
+
+def _case(value: str, _beside: Mapping[str, Any]) -> Any:
+    # Where no case is read this is not either.
+    from mvest.cases.paths import files_of_case
+
+    return contents(files_of_case(Path(value))) or value
+
+
+def _volume(value: str, _beside: Mapping[str, Any]) -> Any:
+    from mvest.imaging.reading.data import files_of_volume
+
+    return contents(files_of_volume(Path(value))) or value
+
+
+CaseInput = Annotated[str | None, Reads(_case)]
+"""Type of a setting that names the folder of a case."""
+
+VolumeInput = Annotated[str | None, Reads(_volume)]
+"""Type of a setting that names the file of a volume over time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,17 +61,17 @@ class PersonalSettings:
 class ImagedSettings:
     """From a volume over time to a case: what the file does not say."""
 
-    model: str | None = None  # file of the detection model; null: the one for ultrasound
-    package_model: str | None = None  # SHA-256 of that one, where a result is kept as its own
+    model: InputFile = None  # file of the detection model; null: the one for ultrasound
+    package_model: str | None = "${package_model:}"  # SHA-256 of that one
     modality: str | None = None  # ultrasound, ct or mr, where the file does not say
     frame_interval_s: float | None = None  # where the file states no times
     time_unit: str | None = None  # s or ms, where the file states times without a unit
     # [frame, .mrk.json] with landmarks placed by hand, where the automatic ones fail.
-    landmarks: tuple[Any, ...] = ()
+    landmarks: Annotated[tuple[Any, ...], Reads(contents)] = ()
     open_frame: int | None = None  # null: the one with the largest orifice
     closed_frame: int | None = None  # null: the one whose leaflets touch most
     pressure_mmHg: float | None = None  # transmitral, in the closed frame
-    pressure_curve: str | None = None  # .csv time,pressure (s, mmHg, the times of the volume)
+    pressure_curve: InputFile = None  # .csv time,pressure (s, mmHg, the times of the volume)
     held_out: tuple[Any, ...] = ()  # [frame, mmHg]: closed frames not shown
     thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
     valve_confidence: float = 0.6  # of the best frame; below it there is no valve (0: show it)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.settings import CaseInput, PersonalSettings
 
 __all__ = ["Settings"]
 
@@ -13,5 +13,5 @@ __all__ = ["Settings"]
 class Settings:
     """What the study adds to the configuration."""
 
-    case: str | None = None  # folder of a case
+    case: CaseInput = None  # folder of a case
     personal: PersonalSettings

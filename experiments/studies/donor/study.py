@@ -7,7 +7,6 @@ the start, and the fitted closure is nearer to the recording than the one with g
 
 from __future__ import annotations
 
-import hashlib
 import resource
 import time
 from collections.abc import Mapping
@@ -43,6 +42,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Transform
 from mvest.estimation.wrappers import Remembered
+from mvest.files import sha256_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
@@ -147,7 +147,7 @@ def build_donor(config: Values, donor: DonorSettings) -> DonorStudy:
             f"donor.starts = {list(donor.starts)}, expected lists of {len(parameters)} moduli each"
         )
     settings = mechanics_of(config)
-    recording = read_donor(config["paths"]["donor"])
+    recording = read_donor(donor.recording)
     unknown = [f"E_f.{name}" for name in recording.surface.region_names]
     if sorted(unknown) != sorted(parameters):
         raise ConfigurationError(
@@ -212,7 +212,6 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
             generic=_closed(fits.generic),
             fitted=first.fitted[-1],
         )
-    recording = donor_file(job.values["paths"]["donor"]).read_bytes()
     run = seed_run(job.values["seed"], first)
     motion = np.linalg.norm(study.observation.positions[-1] - study.coarse.surface.vertices, axis=1)
     findings = Findings(
@@ -228,7 +227,7 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         seconds=sum(row.seconds for row in rows),
         memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         claim=CLAIM,
-        data=Data(CITATION, hashlib.sha256(recording).hexdigest()),
+        data=Data(CITATION, sha256_of(donor_file(job.settings.donor.recording))),
         regions=tuple(study.recording.surface.region_names),
         rows=rows,
         recorded_motion_mm=float(motion.mean()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from experiments.common.cases.settings import ImagedSettings, PersonalSettings
+from experiments.common.cases.settings import ImagedSettings, PersonalSettings, VolumeInput
 
 __all__ = ["Settings"]
 
@@ -13,6 +13,6 @@ __all__ = ["Settings"]
 class Settings:
     """What the study adds to the configuration."""
 
-    volume: str | None = None  # file of a volume over time
+    volume: VolumeInput = None  # file of a volume over time
     imaged: ImagedSettings = field(default_factory=ImagedSettings)
     personal: PersonalSettings

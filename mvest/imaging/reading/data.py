@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mvest.imaging.reading.stated import fault
 from mvest.reading.bounded import max_inflated
 
-__all__ = ["beside", "read_exactly"]
+__all__ = ["beside", "files_of_volume", "read_exactly"]
 
 CHUNK = 2**22
 """Bytes read or decompressed at a time."""
@@ -40,6 +40,28 @@ def beside(path: Path, field: str, name: str) -> Path:
     if not (path.parent / plain).is_file():
         raise fault(path, field, f"{name!r} does not exist", "a file in the same folder")
     return path.parent / plain
+
+
+MAX_HEADER = 2**20
+"""Bytes within which a header that has its data elsewhere names them."""
+
+
+def files_of_volume(path: Path) -> dict[str, Path]:
+    """Name -> file of all that reading a volume can open, as far as it is there.
+
+    These are the file, and files beside it whose names are in its header, whichever field it is.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(MAX_HEADER)
+        detached = head.startswith(b"NRRD") or b"ElementDataFile" in head
+        others = [other for other in path.parent.iterdir() if detached and other.is_file()]
+    except (OSError, ValueError):
+        # It is refused when it is read.
+        return {}
+    return {other.name: other for other in others if os.fsencode(other.name) in head} | {
+        path.name: path
+    }
 
 
 def read_exactly(

@@ -85,7 +85,7 @@ def made_up_recording(folder: Path) -> str:
     module = reader_tests()
     arrays = module.skirt()
     arrays["frames_xyz_mm"] = arrays["frames_xyz_mm"].astype(np.float64)
-    place = f"paths.donor={module.write(folder, arrays)}"
+    place = f"donor.recording={module.write(folder, arrays)}"
     config = settings(*SMALL, place)
     study = build_donor(config, build(DonorSettings, config["donor"]))
     closed = study.model().close(TRUTH, sensitivities=False).simulation
@@ -152,6 +152,6 @@ def test_absent_data_are_one_clear_line(run, tmp_path: Path, monkeypatch) -> Non
 def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
     module = reader_tests()
     module.write(tmp_path, module.skirt())
-    status, _, err = run(*SMALL, f"paths.donor={tmp_path}", override)
+    status, _, err = run(*SMALL, f"donor.recording={tmp_path}", override)
     assert status == 2
     assert words in err

@@ -75,6 +75,19 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     assert record.findings.program.reused == program.runs
 
 
+def test_a_program_that_was_edited_is_run_again(run, tmp_path):
+    run()
+    first = read_record(tmp_path / "here" / "result.json", Findings)
+    # Twice as stiff springs: half the moduli explain what is observed.
+    source = (tmp_path / "solve.py").read_text().replace("(p[", "(2 * p[")
+    (tmp_path / "solve.py").write_text(source)
+    assert run()[0] == 0
+    second = read_record(tmp_path / "here" / "result.json", Findings)
+    np.testing.assert_allclose(second.findings.estimate, M / 2, rtol=2e-3)
+    assert second.findings.program.reused == 0
+    assert second.provenance.config_hash != first.provenance.config_hash
+
+
 def test_check_runs_the_program_once_and_compares_its_derivatives(run, tmp_path):
     status, said = run(check="true")
     assert status == 0, said.err

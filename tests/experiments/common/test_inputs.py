@@ -1,0 +1,230 @@
+"""Every file that a result depends on is in the hash of its configuration, by what is in it."""
+
+import json
+import sys
+import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mvest.files
+from experiments.common.config import hash_of
+from experiments.common.schema import Reads, build
+from experiments.common.study import load_settings, study_names
+from experiments.run import main
+from experiments.studies.donor.settings import DonorSettings
+from experiments.studies.donor.study import build_donor
+from mvest.cases.writer import write_case
+from mvest.external import write_points
+from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.imaging.writing import write_sequence_nrrd
+from mvest.reading.json_file import read_mapping
+from tests.cases.from_images.test_imaged_case import sequence
+from tests.experiments.studies import test_donor
+from tests.external.programs import SPRINGS, springs
+from tests.made_up_closure import made_up_case
+
+
+def marked(cls: type, above: str = "") -> Iterator[str]:
+    """Names of all settings that name files."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    for field in fields(cls):
+        for kind in (hints[field.name], *typing.get_args(hints[field.name])):
+            if isinstance(kind, Reads):
+                yield above + field.name
+            elif is_dataclass(kind) and isinstance(kind, type):
+                yield from marked(kind, f"{above}{field.name}.")
+
+
+SETTINGS = [(study, name) for study in study_names() for name in marked(load_settings(study))]
+
+
+def test_the_settings_that_name_files_are_found():
+    assert {
+        ("case", "case"),
+        ("volume", "volume"),
+        ("volume", "imaged.model"),
+        ("volume", "imaged.landmarks"),
+        ("donor", "donor.recording"),
+        ("external", "external.command"),
+        ("external", "external.inputs"),
+    } <= set(SETTINGS)
+
+
+@pytest.fixture
+def given(tmp_path, monkeypatch):
+    """An empty folder to type the command in, and one beside it for what is read."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "given").mkdir()
+    return tmp_path / "given"
+
+
+def configuration(study: str, name: str, value: object) -> dict:
+    *parts, last = name.split(".")
+    values = {"study": study}
+    inner = values
+    for part in parts:
+        inner = inner.setdefault(part, {})
+    inner[last] = value
+    return values
+
+
+def placed(name: str, folder: Path) -> tuple[object, Path]:
+    """A value of a setting, and a file of what it names."""
+    file = folder / "a.npz"
+    file.write_text("1")
+    if name == "case":
+        (folder / "case.yaml").write_text("frames: [{surface: {file: a.npz}}]")
+        return str(folder), file
+    listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
+    listed["external.command"] = [sys.executable, f"--mesh={file}"]
+    return listed.get(name, str(file)), file
+
+
+@pytest.mark.parametrize(("study", "name"), SETTINGS)
+def test_what_lies_there_is_in_the_hash(given, study, name):
+    value, file = placed(name, given)
+    first = hash_of(configuration(study, name, value))
+    assert hash_of(configuration(study, name, value)) == first
+    file.write_text("2")
+    changed = hash_of(configuration(study, name, value))
+    assert changed != first
+    file.unlink()
+    assert hash_of(configuration(study, name, value)) not in (first, changed)
+    # A link that leads elsewhere now.
+    for content in "12":
+        (given.parent / content).write_text(content)
+        file.unlink(missing_ok=True)
+        file.symlink_to(given.parent / content)
+        assert hash_of(configuration(study, name, value)) == (first if content == "1" else changed)
+
+
+def test_a_relative_name_is_what_it_is_where_the_command_is_typed(given, monkeypatch):
+    found = []
+    for place in ("one", "two", "three"):
+        (given / place / "case").mkdir(parents=True)
+        monkeypatch.chdir(given / place)
+        Path("case/case.yaml").write_text("a" if place == "one" else "b")
+        found.append(hash_of({"study": "case", "case": "case"}))
+    assert found[0] != found[1] == found[2]
+
+
+def test_of_a_case_what_is_not_read_does_not_count(given):
+    value, _ = placed("case", given)
+    first = hash_of({"study": "case", "case": value})
+    (given / "log.txt").write_text("noted")
+    assert hash_of({"study": "case", "case": value}) == first
+
+
+def test_the_data_that_a_header_names_beside_it_count(given):
+    header, data = given / "a.mhd", given / "a.raw"
+    header.write_text("NDims = 3\nElementDataFile = a.raw\n")
+    data.write_bytes(b"1")
+    (given / "other").write_bytes(b"1")
+    first = hash_of({"study": "volume", "volume": str(header)})
+    (given / "other").write_bytes(b"2")
+    assert hash_of({"study": "volume", "volume": str(header)}) == first
+    data.write_bytes(b"2")
+    assert hash_of({"study": "volume", "volume": str(header)}) != first
+
+
+OPENED: list[Path] | None = None
+"""What this process opened, while anyone asks."""
+
+
+def _note(event: str, arguments: tuple) -> None:
+    if OPENED is not None and event == "open" and isinstance(arguments[0], str):
+        OPENED.append(Path(arguments[0]).absolute())
+
+
+sys.addaudithook(_note)
+
+
+@contextmanager
+def all_digested(given: Path) -> Iterator[None]:
+    """Fails where something in ``given`` is opened that was not taken a digest of."""
+    digested, true = set(), mvest.files._digest
+
+    def digest(file: Path) -> str:
+        digested.add(file.absolute())
+        return true(file)
+
+    noted: list[Path] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mvest.files, "_digest", digest)
+        patch.setattr(sys.modules[__name__], "OPENED", noted)
+        yield
+    opened = {path for path in noted if path.is_relative_to(given) and path.is_file()}
+    assert opened
+    assert opened <= digested
+
+
+def typed(monkeypatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["experiments.run", *words])
+    return main()
+
+
+def own_case(folder: Path) -> list[str]:
+    write_case(folder / "case", made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    return ["experiment=own_valve", f"case={folder / 'case'}", "personal.mesh.source=structured"]
+
+
+def own_volume(folder: Path) -> list[str]:
+    frames = np.random.default_rng(1).integers(0, 255, (4, 20, 20, 20), dtype=np.uint8)
+    place = (np.full(3, 3.0), np.eye(3), np.full(3, -30.0))
+    made = VolumeSequence(frames, *place, sequence().times, Modality.ULTRASOUND)
+    file = write_sequence_nrrd(folder / "tee.seq.nrrd", made)
+    (folder / "curve.csv").write_text("time,pressure\n0,5\n9,100\n")
+    return ["experiment=volume", f"volume={file}", f"imaged.pressure_curve={folder / 'curve.csv'}"]
+
+
+def own_program(folder: Path) -> list[str]:
+    (folder / "solve.py").write_text(SPRINGS)
+    write_points(folder / "observed.csv", springs(0.8, 2.5)[0].reshape(-1, 3))
+    solver = str(folder / "solve.py")
+    command = json.dumps([sys.executable, "-S", solver, "{request}", "{folder}"])
+    return ["experiment=external", "parameters=[k1,k2]", "filter.initial=[2.0,1.0]",
+            "external.prior_std=[3.0,3.0]", "external.noise_mm=0.01",
+            f"external.observation={folder / 'observed.csv'}",
+            f"external.command={command}"]  # fmt: skip
+
+
+@pytest.mark.parametrize("made", [own_case, own_volume, own_program])
+def test_nothing_is_read_that_is_not_in_the_hash(given, monkeypatch, made):
+    words = made(given)
+    with all_digested(given):
+        typed(monkeypatch, *words, "check=true", "tracking.enabled=false")
+
+
+def test_of_a_recording_nothing_is_read_that_is_not_in_the_hash(given):
+    module = test_donor.reader_tests()
+    place = module.write(given, module.skirt())
+    config = test_donor.settings(*test_donor.SMALL, f"donor.recording={place}")
+    with all_digested(given):
+        first = hash_of(config)
+        build_donor(config, build(DonorSettings, config["donor"]))
+    other = module.skirt()
+    other["frames_xyz_mm"] = other["frames_xyz_mm"] + 1e-3
+    module.write(given, other)
+    assert hash_of(config) != first
+
+
+def test_a_job_whose_input_is_changed_meanwhile_fails_and_is_not_done(given, monkeypatch, capsys):
+    words = [*own_program(given), "tracking.enabled=false", "hydra.run.dir=out", "figures=false"]
+    slow = SPRINGS + f"\nopen({str(given / 'observed.csv')!r}, 'a').write('')\n"
+    touched = slow + f"open({str(given / 'mesh')!r}, 'w').write(str(time.time()))\n"
+    (given / "mesh").write_text("0")
+    (given / "solve.py").write_text(touched)
+    assert typed(monkeypatch, *words, f"external.inputs=[{given / 'mesh'}]") == 1
+    assert "was changed" in capsys.readouterr().err
+    assert read_mapping(Path("out/result.json"))["status"] == "failed"
+    assert not Path("out/done").exists()
+    # Nothing is wrong with a program that leaves its inputs as they are.
+    (given / "solve.py").write_text(slow)
+    assert typed(monkeypatch, *words, f"external.inputs=[{given / 'mesh'}]") == 0
+    assert Path("out/done").exists()
