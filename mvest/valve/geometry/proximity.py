@@ -8,6 +8,7 @@ Collision Detection* (2005), section 5.1.5 (Voronoi regions of the triangle's fe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import ipctk
 import numpy as np
@@ -87,20 +88,6 @@ def distance_to_triangle(
         difference = p[i] - (u * a[i] + v * b[i] + w * c[i])
         squared += difference * difference
     return np.sqrt(squared), u, v, w
-
-
-@njit(cache=True)
-def paired_distances(
-    points: FloatArray, vertices: FloatArray, triangles: IntArray, triangle: IntArray
-) -> FloatArray:
-    """Distance (mm) of ``points[i]`` to the triangle numbered ``triangle[i]``, shape ``(n,)``."""
-    distance = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        t = triangles[triangle[i]]
-        distance[i] = distance_to_triangle(
-            row(points, i), row(vertices, t[0]), row(vertices, t[1]), row(vertices, t[2])
-        )[0]
-    return distance
 
 
 @njit(cache=True)
@@ -197,11 +184,7 @@ def closest_points(points: FloatArray, vertices: FloatArray, triangles: IntArray
         lists = tree.query_ball_point(points[part], distance[part] + reach * (1 + 1e-12))
         counts = np.array([len(entry) for entry in lists], dtype=np.int64)
         offsets = np.concatenate(([0], np.cumsum(counts)))
-        candidates = (
-            np.concatenate([np.asarray(entry, dtype=np.int64) for entry in lists])
-            if offsets[-1]
-            else np.zeros(0, dtype=np.int64)
-        )
+        candidates = np.fromiter(chain.from_iterable(lists), np.int64, offsets[-1])
         _closest_of_candidates(
             points[part], vertices, triangles, offsets, candidates,
             distance[part], triangle[part], barycentric[part],

@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.proximity import distance_to_triangle, paired_distances, row
+from mvest.valve.geometry.proximity import distance_to_triangle, row
 from mvest.valve.measure.annulus import AnnulusPlane, checked_loop
 
 MAX_GRID_POINTS = 60_000_000
@@ -72,6 +72,33 @@ def _near_distances(
                     if d < distance[i, j, k]:
                         distance[i, j, k] = d
                         owner[i, j, k] = t
+
+
+@njit(cache=True)
+def _far_distances(
+    points: FloatArray,
+    triangles: IntArray,
+    half: FloatArray,
+    origin: FloatArray,
+    step: float,
+    nearest: IntArray,
+    owner: IntArray,
+    distance: FloatArray,
+) -> None:
+    """Distance beyond one step of any triangle, and of all of them what half a leaflet takes off.
+
+    ``nearest`` holds the indices, axis first, of the nearest grid point that has an owner.
+    """
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            for k in range(distance.shape[2]):
+                t = owner[nearest[0, i, j, k], nearest[1, i, j, k], nearest[2, i, j, k]]
+                if distance[i, j, k] > step:
+                    p = (origin[0] + i * step, origin[1] + j * step, origin[2] + k * step)
+                    a, b = row(points, triangles[t, 0]), row(points, triangles[t, 1])
+                    c = row(points, triangles[t, 2])
+                    distance[i, j, k] = distance_to_triangle(p, a, b, c)[0]
+                distance[i, j, k] -= half[t]
 
 
 @njit(cache=True)
@@ -257,10 +284,5 @@ def _distance_field(
     owner = np.full(tuple(shape), -1, dtype=np.int64)
     _near_distances(points, triangles, low, step, distance, owner)
     nearest = distance_transform_edt(distance > step, return_distances=False, return_indices=True)
-    far = distance > step
-    x, y, z = np.nonzero(far)
-    triangle = owner[nearest[0][far], nearest[1][far], nearest[2][far]]
-    grid = low + step * np.column_stack([x, y, z])
-    distance[far] = paired_distances(grid, points, triangles, triangle) - half[triangle]
-    distance[~far] -= half[owner[~far]]
+    _far_distances(points, triangles, half, low, step, nearest, owner, distance)
     return distance

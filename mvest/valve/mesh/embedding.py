@@ -19,6 +19,9 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["Embedding", "embed"]
 
+LAST_STEP = 1e-9
+"""In reference coordinates; the step after one this small, its square, is round-off."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Embedding:
@@ -157,12 +160,17 @@ def _invert(
     reference = mesh.reference
     x_e = mesh.nodes[mesh.elements[e]]
     xi = np.repeat(reference.centre, len(e), axis=0)
+    left = np.arange(len(e))
     for _ in range(iterations):
-        gap = points - np.einsum("ka,kai->ki", reference.shape(xi), x_e)
-        jacobian = np.einsum("kai,kaj->kij", x_e, reference.gradient(xi))
+        at, nodes = xi[left], x_e[left]
+        gap = points[left] - np.einsum("ka,kai->ki", reference.shape(at), nodes)
+        jacobian = np.einsum("kai,kaj->kij", nodes, reference.gradient(at))
         regular = np.abs(np.linalg.det(jacobian)) > 1e-12
         jacobian[~regular] = np.eye(3)
         step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
-        xi = np.clip(xi + np.clip(step, -1.0, 1.0), -3.0, 3.0)
+        xi[left] = np.clip(at + np.clip(step, -1.0, 1.0), -3.0, 3.0)
+        left = left[np.abs(step).max(axis=1) > LAST_STEP]
+        if not left.size:
+            break
     gap = points - np.einsum("ka,kai->ki", reference.shape(xi), x_e)
     return xi, np.linalg.norm(gap, axis=1)
