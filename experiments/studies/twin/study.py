@@ -39,7 +39,7 @@ from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.wrappers import SharedStart
 from mvest.files import write_atomically
-from mvest.observation.vertices import Observation, observed_frames
+from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -126,21 +126,23 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
 def _confirm(twin: Twin, result: StudyResult) -> float | None:
     """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
 
-    None where every closure started from the open state, so that there is nothing to confirm, or
-    where the new closure failed.
+    None where every closure started from the open state or the closed frame is not observed, so
+    that there is nothing to confirm, or where the new closure failed.
     """
     usual = twin.model.continuation, twin.model.guide
     if result.estimate is None or result.fitted is None or usual == (False, None):
         return None
+    fitted = dict(zip(twin.frames, result.fitted, strict=True)).get("closed")
+    if fitted is None:
+        return None
     twin.model.continuation, twin.model.guide = False, None
     with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
         twin.model.on_step = bar.step
-        anew = observed_frames(twin.model, twin.frames)(result.estimate)
+        anew = twin.model.close(result.estimate, sensitivities=False).simulation
     twin.model.continuation, twin.model.guide = usual
     if not anew.converged:
         return None
-    last = anew.y.reshape(result.fitted.shape)[-1]
-    return float(np.linalg.norm(last - result.fitted[-1], axis=1).max())
+    return float(np.linalg.norm(twin.model.observed(anew.frames[-1]) - fitted, axis=1).max())
 
 
 def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements | str] | None:
