@@ -7,11 +7,13 @@ also distinguished by its marker. Nothing touches matplotlib's global state or n
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 
@@ -21,9 +23,13 @@ from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
+    "ATRIUM",
     "COLOURS",
     "LEAFLET_COLOURS",
     "MARKERS",
+    "SIDE",
+    "VIEWS",
+    "View",
     "iterates_figure",
     "save_figure_with",
     "valve_figure",
@@ -41,8 +47,28 @@ DISTANCE_MAP = "viridis"
 UNSEEN = (0.75, 0.75, 0.75)
 DPI = 200
 
-VIEWS = (("from the atrium", 90.0, -90.0), ("from the side", 12.0, -60.0))
-"""Title, elevation and azimuth in degrees; the atrium is at positive z."""
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A direction to look from: elevation over the annulus plane and azimuth, degrees."""
+
+    name: str
+    elevation: float
+    azimuth: float
+
+    @property
+    def axes(self) -> FloatArray:
+        """``(3, 3)`` columns: to the right, up, and towards the eye."""
+        e, a = np.deg2rad(self.elevation), np.deg2rad(self.azimuth)
+        eye = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right = np.array([-np.sin(a), np.cos(a), 0.0])
+        return np.stack([right, np.cross(eye, right), eye], axis=1)
+
+
+ATRIUM = View("from the atrium", 90.0, -90.0)
+SIDE = View("from the side", 12.0, -60.0)
+VIEWS = (ATRIUM, SIDE)
+"""The atrium is at positive z."""
 
 
 def iterates_figure(
@@ -124,16 +150,12 @@ def valve_figure(fields: Path) -> Figure:
     mean = distance[triangles].mean(axis=1)
     coloured = np.where(np.isnan(mean)[:, None], UNSEEN, shown.to_rgba(mean)[:, :3])
     columns = (("open", rest, tissue), ("closed", closed, coloured))
-    span = (np.minimum(rest.min(0), closed.min(0)), np.maximum(rest.max(0), closed.max(0)))
-    axes = []
-    for row, (view, elevation, azimuth) in enumerate(VIEWS):
-        for column, (frame, points, colours) in enumerate(columns):
-            panel = figure.add_subplot(2, 2, 2 * row + column + 1, projection="3d")
-            _draw(panel, points, triangles, colours, span)
-            panel.view_init(elevation, azimuth)
-            panel.set_title(f"{frame}, {view}", fontsize=10)
-            axes.append(panel)
-    bar = figure.colorbar(shown, ax=[axes[1], axes[3]], shrink=0.6, pad=0.02)
+    panels = figure.subplots(2, 2, sharex="row", sharey="row")
+    for row, view in zip(panels, VIEWS, strict=True):
+        for axes, (frame, points, colours) in zip(row, columns, strict=True):
+            _draw(axes, points, triangles, colours, view)
+            axes.set_title(f"{frame}, {view.name}", fontsize=10)
+    bar = figure.colorbar(shown, ax=panels[:, 1], shrink=0.6, pad=0.02)
     bar.set_label(f"distance, fitted to observed [{unit}]")
     return figure
 
@@ -149,7 +171,7 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     note = figure.supxlabel(line, fontsize=5, color="grey", ha="center")
     # Without dates, so that the same result gives the same file.
     metadata = {".png": {"Description": line}, ".pdf": {"Subject": line, "CreationDate": None}}
-    written = []
+    written, layout = [], figure.get_layout_engine()
     for suffix, entries in metadata.items():
         path = base.with_name(base.name + suffix)
         written.append(
@@ -158,32 +180,34 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
                 lambda file, entries=entries: figure.savefig(file, dpi=DPI, metadata=entries),  # type: ignore[misc]
             )
         )
+        # What is laid out need not be once more, which takes as long as drawing it.
+        figure.set_layout_engine(None)
     note.remove()
+    figure.set_layout_engine(layout)
     return written
 
 
 def _draw(
-    axes: Any,
-    points: FloatArray,
-    triangles: IntArray,
-    colours: FloatArray,
-    span: tuple[FloatArray, FloatArray],
+    axes: Any, points: FloatArray, triangles: IntArray, colours: FloatArray, view: View
 ) -> None:
+    """Shaded triangles seen from one side, the farthest first, in axes in millimetres."""
     corners = points[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     light = LightSource(azdeg=225, altdeg=55).direction
     # Both sides of a leaflet are seen: what faces away is lit as if it faced the light.
     shade = 0.6 + 0.4 * np.abs(normal @ light)
-    # The midsurface folds over itself seen from above; its own triangles are drawn, none are made.
-    faces = axes.plot_trisurf(*points.T, triangles=triangles, shade=False, antialiased=False)
-    faces.set_facecolor(colours * shade[:, None])
-    faces.set_edgecolor("none")
-    faces.set_rasterized(True)
-    low, high = span
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_zlim(low[2], high[2])
-    axes.set_box_aspect(tuple(high - low), zoom=1.2)
-    axes.set_proj_type("ortho")
+    seen = corners @ view.axes
+    order = np.argsort(seen[..., 2].mean(axis=1), kind="stable")
+    outlines: Any = seen[order, :, :2]
+    faces = PolyCollection(
+        outlines,
+        facecolors=(colours * shade[:, None])[order],
+        edgecolors="none",
+        antialiased=False,
+        rasterized=True,
+    )
+    axes.add_collection(faces)
+    axes.autoscale_view()
+    axes.set_aspect("equal")
     axes.set_axis_off()

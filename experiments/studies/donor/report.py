@@ -54,16 +54,16 @@ def donor_figure(fields: Path) -> Figure:
     span = everything.min(axis=0), everything.max(axis=0)
     figure = Figure(figsize=(11.0, 7.2), layout="constrained")
     panels = []
-    for row, (view, elevation, azimuth) in enumerate(VIEWS):
+    for row, view in enumerate(VIEWS):
         for column, (name, points) in enumerate(shapes.items()):
             axes = figure.add_subplot(2, 3, 3 * row + column + 1, projection="3d")
             colours = np.tile(PLAIN, (len(triangles), 1))
             if name != "recorded":
                 colours = scale.to_rgba(distance[name][triangles].mean(axis=1))[:, :3]
             _draw(axes, points, triangles, colours, loops, span)
-            axes.view_init(elevation, azimuth)
+            axes.view_init(view.elevation, view.azimuth)
             mean = "" if name == "recorded" else f", mean {distance[name].mean():.2f} mm"
-            axes.set_title(f"{name}{mean}\n{view}", fontsize=10)
+            axes.set_title(f"{name}{mean}\n{view.name}", fontsize=10)
             panels.append(axes)
     bar = figure.colorbar(scale, ax=panels, shrink=0.6, pad=0.02)
     bar.set_label("distance from the recording [mm]")

@@ -34,6 +34,9 @@ __all__ = [
 
 Twin = Record[Findings]
 
+ITERATES, VALVE = "iterates", "valve"
+"""Figures of a run in its folder."""
+
 
 def frame(records: Sequence[Twin]) -> pd.DataFrame:
     """Tidy table of runs: one row each, plain numbers, units in the column names.
@@ -202,10 +205,12 @@ def _at(values: Sequence[float] | None, k: int) -> float | None:
 def write_twin(folder: Path, records: Mapping[str, Twin], arrays: Mapping[str, Path]) -> list[Path]:
     """The table of all records, and the figures of the one that the table is named after."""
     first, main = next(iter(records.items()))
-    table = main.table
+    table, fields = main.table, arrays.get(first)
     written = write_tables(folder, table, list(records.values()))
     if first == table:
-        written += _figures(folder / table, folder / f"{table}_valve", main, arrays.get(first))
+        names = {ITERATES: table, VALVE: f"{table}_valve"}
+        drawn = _copied(fields.parent, folder, names) if fields is not None else []
+        written += drawn or _figures(folder, names, main, fields)
     return written
 
 
@@ -215,23 +220,38 @@ def write_twin_run(folder: Path, record: Twin) -> list[Path]:
     fitted = record.findings.first.distance_mm is not None and fields.is_file()
     return [
         *write_tables(folder, record.table, [record]),
-        *_figures(folder / "iterates", folder / "valve", record, fields if fitted else None),
+        *_figures(folder, {}, record, fields if fitted else None),
     ]
 
 
-def _figures(iterates: Path, valve: Path, record: Twin, fields: Path | None) -> list[Path]:
+def _copied(run: Path, folder: Path, names: Mapping[str, str]) -> list[Path]:
+    """The figures that a run drew in its folder, under other names elsewhere."""
+    return [
+        write_atomically(folder / f"{name}{drawn.suffix}", drawn.read_bytes())
+        for own, name in names.items()
+        for drawn in sorted(run.glob(f"{own}.*"))
+    ]
+
+
+def _figures(
+    folder: Path, names: Mapping[str, str], record: Twin, fields: Path | None
+) -> list[Path]:
     """How the estimate came about, and the fitted valve if its arrays are there."""
     from mvest.reporting.figures import iterates_figure, save_figure_with, valve_figure
 
     first, written = record.findings.first, []
     if first.iterates:
-        title, names = f"{record.title}: {record.row}", record.parameters
         figure = iterates_figure(
-            title, names, first.iterates, first.iterate_std, record.findings.truth
+            f"{record.title}: {record.row}",
+            record.parameters,
+            first.iterates,
+            first.iterate_std,
+            record.findings.truth,
         )
-        written += save_figure_with(iterates, figure, record.line)
+        written += save_figure_with(folder / names.get(ITERATES, ITERATES), figure, record.line)
     if fields is not None:
-        written += save_figure_with(valve, valve_figure(fields), record.line)
+        figure = valve_figure(fields)
+        written += save_figure_with(folder / names.get(VALVE, VALVE), figure, record.line)
     return written
 
 

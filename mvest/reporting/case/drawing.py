@@ -7,14 +7,13 @@ and every panel can have the same scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import PolyCollection
 
 from mvest.reporting.case.fields import CaseFields
-from mvest.reporting.figures import LEAFLET_COLOURS
+from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import annulus_plane
@@ -56,28 +55,6 @@ SCALE_MM = 10.0
 
 Part: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Triangles ``(k, 3, 2)`` on the page, their depth ``(k,)``, colour ``(k, 3)`` and line width."""
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A direction to look from: elevation over the annulus plane and azimuth, degrees."""
-
-    name: str
-    elevation: float
-    azimuth: float
-
-    @property
-    def axes(self) -> FloatArray:
-        """``(3, 3)`` columns: to the right, up, and towards the eye."""
-        e, a = np.deg2rad(self.elevation), np.deg2rad(self.azimuth)
-        eye = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        right = np.array([-np.sin(a), np.cos(a), 0.0])
-        return np.stack([right, np.cross(eye, right), eye], axis=1)
-
-
-ATRIUM = View("seen from the atrium", 90.0, -90.0)
-SIDE = View("seen from the side", 12.0, -60.0)
-VIEWS = (ATRIUM, SIDE)
 
 
 def leaflet_colours(region: IntArray) -> FloatArray:

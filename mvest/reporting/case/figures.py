@@ -71,7 +71,7 @@ def views_figure(
                 axes.set_title(title, fontsize=10, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], reach, view)
-        _say_view(grid[row, 0], view.name)
+        _say_view(grid[row, 0], f"seen {view.name}")
     return figure
 
 
@@ -114,7 +114,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
                 axes.set_title(f"{title}\n{Spread.of(distance)} mm", fontsize=11, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
-        _say_view(grid[row, 0], view.name)
+        _say_view(grid[row, 0], f"seen {view.name}")
     beyond = any(np.nanmax(distance) > top for _, _, distance in panels)
     bar = figure.colorbar(
         scale, ax=grid, shrink=0.7, pad=0.02, extend="max" if beyond else "neither"
@@ -202,7 +202,7 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
         colours = corner_colours(scale, size, fields.triangles)
         draw_valve(axes, fields, points, colours, view, fields.closed + 1, strength=0.2)
         same_scale([axes], [points], view)
-        axes.set_title(view.name, fontsize=10, pad=14)
+        axes.set_title(f"seen {view.name}", fontsize=10, pad=14)
     name_leaflets(grid[0], fields, names)
     beyond = np.nanmax(size) > top
     bar = figure.colorbar(scale, ax=grid, shrink=0.85, extend="max" if beyond else "neither")

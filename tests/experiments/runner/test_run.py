@@ -263,6 +263,9 @@ def test_results_are_renewed_by_the_experiment_as_configured_only(
     kept = {path.name: path.read_bytes() for path in (tmp_path / "published").glob("table1*")}
     assert {"table1.csv", "table1.md", "table1.tex", "table1.png", "table1_valve.png"} <= set(kept)
     assert b"paper, Table 1" in kept["table1.md"]
+    # The run's own figures, drawn once.
+    assert kept["table1_valve.png"] == (tmp_path / "here" / "valve.png").read_bytes()
+    assert kept["table1.pdf"] == (tmp_path / "here" / "iterates.pdf").read_bytes()
     # The tables follow from the record alone.
     for name in kept:
         if "valve" not in name:
