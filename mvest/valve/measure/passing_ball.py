@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from mvest.errors import GeometryError
@@ -81,7 +82,7 @@ def _far_distances(
     half: FloatArray,
     origin: FloatArray,
     step: float,
-    nearest: IntArray,
+    nearest: NDArray[np.int32],
     owner: IntArray,
     distance: FloatArray,
 ) -> None:
