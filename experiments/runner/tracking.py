@@ -13,9 +13,10 @@ import hashlib
 import logging
 import os
 import re
+import sqlite3
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ from experiments.runner.compared import Compared, compared
 from experiments.runner.comparison import inputs, metrics, parameters
 from experiments.runner.folder import is_done
 from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.files import remove_parts, write_atomically
 from mvest.provenance import write_json
 from mvest.reading.json_file import read_mapping
 
@@ -74,6 +76,15 @@ MANNERS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
 }
 """Settings of MLflow's, unless the user has made them; its server inherits them."""
+
+SQLITE = "sqlite:///"
+"""How the address of a local database begins."""
+
+BESIDE = ("-journal", "-wal", "-shm")
+"""Ends of the names of files that SQLite keeps beside a database while it is written."""
+
+DEFAULT = "0"
+"""Id of the experiment that MLflow makes last in a new store."""
 
 PASSWORD = re.compile(r"://[^/@:]*:[^/@]+@")
 """A password within the address of a store."""
@@ -153,7 +164,8 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     """Open the tracking store and the experiment, both created if need be.
 
     Only one process at a time creates a local store: several that open a fresh SQLite database at
-    once can leave it broken for good.
+    once can leave it broken for good. It takes its name once it is whole. One that is broken all
+    the same is set aside, and a new one made; a database on a server is never touched.
 
     Raises
     ------
@@ -174,12 +186,66 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     with telling(place):
         outputs.mkdir(parents=True, exist_ok=True)
         with FileLock(outputs / ".mlflow.lock"):
+            if place.startswith(SQLITE):
+                _make_whole(Path(place.removeprefix(SQLITE).partition("?")[0]))
             client = MlflowClient(tracking_uri=place)
             found = client.get_experiment_by_name(experiment)
             if found is not None:
                 return Store(client, found.experiment_id, place)
             made = client.create_experiment(experiment, artifact_location=artifacts)
             return Store(client, made, place)
+
+
+def _make_whole(path: Path) -> None:
+    """Set a broken database aside, and make one that is not there."""
+    broken = _broken(path) if path.exists() else ""
+    if broken:
+        number = 1 + len(list(path.parent.glob(f"{path.stem}.broken-*")))
+        aside = path.with_name(f"{path.stem}.broken-{number}{path.suffix}")
+        path.rename(aside)
+        print(
+            f"note: {path} cannot be used ({broken}) and is kept as {aside.name}; a new one is "
+            "made, and `make sync` uploads every result that is on disk",
+            file=sys.stderr,
+        )
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for beside in ("", *BESIDE):
+            path.with_name(path.name + beside).unlink(missing_ok=True)
+            remove_parts(path.parent, path.name + beside)
+        write_atomically(path, _fill, sync=True)
+
+
+def _fill(path: Path) -> None:
+    """Make a database, which takes seconds."""
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(tracking_uri=f"{SQLITE}{path}")
+    client.get_experiment(DEFAULT)
+    # Whatever it keeps beside the file is in it then.
+    client._tracking_client.store.engine.dispose()
+
+
+def _broken(path: Path) -> str:
+    """Why a database is of no use; empty where it is sound, or only locked or out of reach.
+
+    Of one that was made to its end MLflow's own experiment is there.
+    """
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True)) as database:
+            (state,) = database.execute("pragma quick_check(1)").fetchone()
+            tables = database.execute("select name from sqlite_master").fetchall()
+            if state != "ok":
+                return " ".join(str(state).split())
+            if ("experiments",) in tables:
+                query = "select count(*) from experiments"
+                if database.execute(query).fetchone() != (0,):
+                    return ""
+            return "it was never finished"
+    except sqlite3.OperationalError:
+        return ""
+    except sqlite3.DatabaseError as error:
+        return first_line(error)
 
 
 def track_job(folder: Path, config: Mapping[str, Any]) -> None:

@@ -25,6 +25,7 @@ from experiments.runner.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
 from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
+from tests.places import ROOT
 
 NAMES = ["E_f.anterior", "E_f.posterior"]
 
@@ -298,6 +299,82 @@ def test_a_lost_database_is_rebuilt(tmp_path, capsys, empty_database) -> None:
     after = stored(rescued)
     assert {run.data.tags["folder"]: run.data.metrics for run in after} == before
     assert {run.data.tags["sweep_id"] for run in after} == {"sweep-1"}
+
+
+MAKE = """
+from pathlib import Path
+from experiments.runner.tracking import open_store
+open_store(None, Path("fresh"), "debug")
+"""
+
+
+def test_a_database_takes_its_name_once_it_is_whole(tmp_path) -> None:
+    fresh = tmp_path / "fresh"
+    place = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    making = subprocess.Popen(
+        [sys.executable, "-c", MAKE], cwd=tmp_path, env=os.environ | {"PYTHONPATH": place}
+    )
+    try:
+        while not any(part.stat().st_size for part in fresh.glob(".part-*-mlflow.db")):
+            assert making.poll() is None
+            time.sleep(0.01)
+    finally:
+        making.kill()
+        making.wait()
+    assert not (fresh / "mlflow.db").exists()
+    assert list(fresh.glob(".part-*"))
+    open_store(None, fresh, "debug")
+    assert {path.name for path in fresh.iterdir()} == {"mlflow.db", ".mlflow.lock"}
+
+
+@pytest.mark.parametrize("state", ["unfinished", "empty", "no database", "damaged"])
+def test_a_broken_database_is_set_aside_and_rebuilt(
+    tmp_path, capsys, empty_database, monkeypatch, state
+) -> None:
+    make_job(tmp_path, "a")
+    sync.main([str(tmp_path)])
+    outputs = tmp_path / "outputs"
+    shutil.copytree(tmp_path / "debug", outputs / "debug")
+    path = outputs / "mlflow.db"
+    match state:
+        case "unfinished":
+            # Killed while MLflow made its tables: it can never open this one again.
+            with sqlite3.connect(path) as database:
+                database.execute("create table experiments (experiment_id integer)")
+            database.close()
+        case "empty":
+            path.touch()
+        case "no database":
+            path.write_text("nonsense " * 1000)
+        case "damaged":
+            whole = bytearray(empty_database.read_bytes())
+            whole[4096:40960] = bytes(36864)
+            path.write_bytes(whole)
+    before = path.read_bytes()
+    monkeypatch.setattr(tracking, "_fill", lambda part: shutil.copy(empty_database, part))
+    capsys.readouterr()
+    assert sync.main([str(outputs)]) == 0
+    said = capsys.readouterr()
+    assert "debug: 1 uploaded" in said.out
+    assert said.err.count("mlflow.broken-1.db") == 1
+    assert len(said.err.strip().splitlines()) == 1
+    assert (outputs / "mlflow.broken-1.db").read_bytes() == before
+    assert len(stored(outputs)) == 1
+
+
+def test_a_database_that_may_be_of_use_is_left_alone(tmp_path, empty_database) -> None:
+    other = tmp_path / "other.db"
+    shutil.copy(empty_database, other)
+    assert tracking._broken(other) == ""
+    holder = sqlite3.connect(other, isolation_level=None)
+    holder.execute("update alembic_version set version_num = 'of another version'")
+    assert tracking._broken(other) == ""
+    holder.execute("begin exclusive")
+    assert tracking._broken(other) == "", "locked"
+    holder.close()
+    with pytest.raises(TrackingError):
+        open_store(f"sqlite:///{other}", tmp_path, "debug")
+    assert [path.name for path in tmp_path.glob("other*")] == ["other.db"]
 
 
 def test_sync_leaves_out_what_is_not_to_be_uploaded_and_says_what_it_cannot_read(
