@@ -94,6 +94,7 @@ def link_to_pages(app: Sphinx, path: Path, docname: str, content: list[str]) -> 
     for readme, page in README_PAGES.items():
         content[0] = re.sub(rf"\({re.escape(readme)}(#[^)]*)?\)", f"({page})", content[0])
     content[0] = re.sub(r"\(docs/(\w+\.md)\)", r"(\1)", content[0])
+    content[0] = content[0].replace("(SECURITY.md)", "(security.md)")
 
 
 def setup(app: Sphinx) -> None:

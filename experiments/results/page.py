@@ -11,11 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-import mvest
 from experiments.common.study import Section, Study, load_study, study_names
 from experiments.results.keep import records_of
 from experiments.sweeps.collected import Sweep
@@ -30,12 +28,13 @@ from experiments.sweeps.rows import (
 )
 from experiments.sweeps.tables import failure_rows, summary, table_note
 from mvest.files import write_atomically
+from mvest.reporting.markup import shown_text
+from mvest.reporting.page import rendered
 from mvest.reporting.pictures import embedded
 
 __all__ = ["REPORT", "write_report"]
 
 REPORT = "report.html"
-TEMPLATES = (Path(__file__).parent, Path(mvest.__file__).parent / "reporting" / "templates")
 
 MAX_FAILURES = 200
 """Listed one by one on the page; the tidy table has all."""
@@ -73,18 +72,14 @@ def write_report(results: Path) -> Path:
         If a published sweep is damaged, a picture cannot be read or the page cannot be written.
     """
     sweeps = sorted(read_sweeps(results), key=_place)
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-    )
     others = [
         _other_section(results, section, study)
         for section, study in _sections()
         if (results / f"{section.name}.md").is_file()
     ]
-    page = environment.get_template("page.html.jinja").render(
+    page = rendered(
+        "page.html.jinja",
+        Path(__file__).parent,
         sweeps=[_sweep_section(results, sweep) for sweep in sweeps],
         parts=[
             ("Validation", [section for section in others if section["validation"]]),
@@ -197,7 +192,7 @@ def _other_section(
     body = re.sub(r"</?sub>", "", body)
     # Below the section's own heading.
     body = re.sub(r"^(#+ )", r"#\1", body, flags=re.MULTILINE)
-    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(body)
+    html = MarkdownIt("commonmark", {"html": False}).enable("table").render(shown_text(body))
     html = html.replace("<table>", '<div class="scroll tall"><table>')
     html = html.replace("</table>", "</table></div>")
     found = [(results / f"{picture}.png", caption) for picture, caption in section.pictures.items()]

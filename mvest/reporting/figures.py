@@ -6,6 +6,7 @@ also distinguished by its marker. Nothing touches matplotlib's global state or n
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +17,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
 from mvest.reading.npz import read_npz
+from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -46,6 +49,13 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
 UNSEEN = (0.75, 0.75, 0.75)
 DPI = 200
+
+LONGEST_TEXT, LONGEST_LINE = 160, 400
+"""Characters of a text in a figure, and of the line at its foot."""
+KEPT = 20
+"""Characters of a longer one that are shown, so that something is left of the figure."""
+TICK = re.compile(r"\$\\mathdefault\{[−-]?[\d.]*(?:\\times)?[\d.]*(?:\^\{[−-]?[\d.]+\})?\}\$")
+"""What matplotlib writes at a logarithmic axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +178,9 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     InputError
         If a file cannot be written.
     """
-    note = figure.supxlabel(line, fontsize=5, color="grey", ha="center")
+    _show_texts(figure)
+    line = shown_text(line, LONGEST_LINE)
+    note = figure.supxlabel(line, fontsize=5, color="grey", ha="center", parse_math=False)
     # Without dates, so that the same result gives the same file.
     metadata = {".png": {"Description": line}, ".pdf": {"Subject": line, "CreationDate": None}}
     written, layout = [], figure.get_layout_engine()
@@ -185,6 +197,27 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     note.remove()
     figure.set_layout_engine(layout)
     return written
+
+
+def _show_texts(figure: Figure) -> None:
+    """Have texts of a record printed as they stand, whatever matplotlib would read in them."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_text(_printed(text.get_text()))
+    names = ("xaxis", "yaxis", "zaxis")
+    for axis in [getattr(a, name) for a in figure.axes for name in names if hasattr(a, name)]:
+        if any(label.get_text() != _printed(label.get_text()) for label in axis.get_ticklabels()):
+            before = axis.get_major_formatter()
+            # Where names stand at the ticks.
+            axis.set_major_formatter(lambda *at, before=before: _printed(before(*at)))
+
+
+def _printed(text: str) -> str:
+    """Text that matplotlib prints as it stands: what is between dollars is mathematics to it."""
+    if TICK.fullmatch(text):
+        return text
+    cut = text if len(text) <= LONGEST_TEXT else f"{text[:KEPT]}…"
+    return re.sub(r"\\?\$", r"\\$", shown_text(cut).replace("\t", " "))
 
 
 def _draw(

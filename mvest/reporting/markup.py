@@ -18,10 +18,17 @@ __all__ = [
     "markdown_rows",
     "markdown_text",
     "number",
+    "shown_text",
     "with_std",
 ]
 
 MISSING = "–"
+
+ACTING = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+    "\ufff9-\ufffb\ud800-\udfff\U000e0000-\U000e007f]"
+)
+"""Characters that turn others round, hide or cannot be written; no tab and no end of a line."""
 
 LATEX = str.maketrans(
     {
@@ -50,14 +57,28 @@ LATEX = str.maketrans(
 )
 
 
+def shown_text(text: str, longest: int | None = None) -> str:
+    """Text whose characters that act are named, ``[U+202E]``; what is cut off is said.
+
+    Parameters
+    ----------
+    text : str
+    longest : int, optional
+        Characters that are shown of it.
+    """
+    if longest is not None and len(text) > longest:
+        text = f"{text[:longest]}… ({len(text)} characters)"
+    return ACTING.sub(lambda found: f"[U+{ord(found[0]):04X}]", text.replace("\r", " "))
+
+
 def latex_text(text: str) -> str:
     r"""Text that LaTeX prints as it stands: ``E_f`` as ``E\_f``, ± in its own way."""
-    return text.translate(LATEX)
+    return shown_text(text).translate(LATEX)
 
 
 def markdown_text(text: str) -> str:
     """Text in a cell of a Markdown table: no cell ends early, no tag, link or emphasis begins."""
-    flat = " ".join(text.split())
+    flat = shown_text(" ".join(text.split()))
     escaped = flat.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     # Units in brackets and underscores within words mean nothing in Markdown and stay legible.
     return re.sub(r"([\\`*|~$]|(?<!\w)_|_(?!\w)|(?<=\])[(\[:])", r"\\\1", escaped)

@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from PIL import Image
 
 from mvest.errors import InputError
@@ -46,7 +47,7 @@ def embedded(path: Path, caption: str) -> dict[str, Any]:
     image.save(stream, "WEBP", quality=WEBP_QUALITY, method=6)
     data = base64.b64encode(stream.getvalue()).decode("ascii")
     return {
-        "source": f"data:image/webp;base64,{data}",
+        "source": Markup(f"data:image/webp;base64,{data}"),
         "caption": caption,
         "width": image.width,
         "height": image.height,

@@ -6,13 +6,14 @@ it, and its content policy forbids every request. Text of the findings is escape
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
@@ -37,12 +38,13 @@ from mvest.reporting.case.plots import (
 )
 from mvest.reporting.case.view import case_view
 from mvest.reporting.figures import save_figure_with
+from mvest.reporting.page import TEMPLATES, rendered
 from mvest.reporting.pictures import embedded
 
 __all__ = ["REPORT", "write_case_report"]
 
 REPORT = "report.html"
-TEMPLATES = Path(__file__).parents[1] / "templates"
+SCRIPT = TEMPLATES / "case_report.js"
 FULL_WIDTH_INCHES = 8.6
 """Of a picture as wide as the page; print is equally large in narrower ones."""
 FLAT_SHARE = 0.25
@@ -94,7 +96,6 @@ def write_case_report(
         except InputError as error:
             missing[name] = f"Not shown: {error}."
             continue
-        _print_dollars(figure)
         paths = save_figure_with(folder / name, figure, note)
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
         pictures[name] = embedded(paths[0], (caption or figure3_caption(shapes)) + marked) | {
@@ -107,16 +108,13 @@ def write_case_report(
             pictures[name] = embedded(folder / shown.file, shown.caption) | {"percent": 100}
         except InputError as error:
             missing[name] = f"Not shown: {error}."
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        keep_trailing_newline=True,
-    )
-    page = environment.get_template("case_report.html.jinja").render(
+    view = case_view(shapes, names)
+    page = rendered(
+        "case_report.html.jinja",
+        scripts=_policy(view.markup, SCRIPT.read_text(encoding="utf-8")),
         pictures=pictures,
         missing=missing,
-        view=case_view(shapes, names),
+        view=view,
         files=[path.name for path in written],
         case=case,
         words=words,
@@ -129,6 +127,13 @@ def write_case_report(
         ),
     )
     return [write_atomically(folder / REPORT, page), *written]
+
+
+def _policy(scene: str, script: str) -> str:
+    """The scripts of the page by their hashes, so that a browser runs no other."""
+    own = re.findall(r"<script[^>]*>(.*?)</script>", scene, re.DOTALL)
+    digests = (hashlib.sha256(text.encode()).digest() for text in [*own, script])
+    return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
 
 
 def _figures(
@@ -207,10 +212,3 @@ def _where(
             text += "."
         rows.append({"label": one.label, "text": text})
     return rows
-
-
-def _print_dollars(figure: Figure) -> None:
-    """Have text of the findings printed as it stands: matplotlib sets dollars as mathematics."""
-    for text in figure.findobj(Text):
-        if isinstance(text, Text) and "$" in text.get_text():
-            text.set_parse_math(False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.case.figures import distance_top
 from mvest.reporting.figures import LEAFLET_COLOURS
+from mvest.reporting.markup import shown_text
 from mvest.typing import FloatArray, IntArray
 
 __all__ = ["CaseView", "case_view", "small"]
@@ -138,7 +139,7 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
         mesh.color = f"rgb({','.join(str(round(c)) for c in colour)})"
         name = names[r] if r < len(names) else f"leaflet {r + 1}"
         # plotly reads tags in its texts.
-        mesh.update(name=escape(str(name)), hoverinfo="name")
+        mesh.update(name=escape(shown_text(str(name))), hoverinfo="name")
         parts.append(mesh)
     return parts + _lines(fields, points, frame)
 

@@ -360,5 +360,4 @@ def provenance_note(case: CaseFindings, line: str) -> str:
         f"case {about.sha256[:HASH_DIGITS]}" if about.sha256 else "",
         line,
     ]
-    # matplotlib reads what stands between dollars as mathematics.
-    return ", ".join(filter(None, parts)).replace("$", r"\$")
+    return ", ".join(filter(None, parts))

@@ -1,0 +1,188 @@
+"""Pages in a real browser whose every text is an attack: nothing runs, no page is broken."""
+
+import base64
+import io
+import re
+import shutil
+from dataclasses import fields, is_dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from experiments.results.page import write_report
+from experiments.runner.screenshot import look_at
+from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
+from mvest.reporting.case.report import write_case_report
+from tests.experiments.results.test_report import publish
+from tests.experiments.sweeps.synthetic_sweeps import TRUTH, job, run, sweep
+from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case
+
+needs_browser = pytest.mark.skipif(
+    not (shutil.which("chromium") or shutil.which("chromium-browser")),
+    reason="Chromium is not installed (Debian: apt install chromium)",
+)
+
+RUN = "document.documentElement.dataset.ran=1"
+"""What an attack does, if it runs, for the test to see."""
+
+HOSTILE = (
+    f"<script>{RUN}</script></script></title></style><script>{RUN}</script>"
+    f'<img src=x onerror={RUN}><svg onload={RUN}></svg>" onerror="{RUN}" onmouseover=\'{RUN}\' '
+    "{{7*7}} {% raw %} ]]> --> $\\frac$ \u202egnp.exe\u202c \u2066a\u200f\n\r\n\u2028\ta"
+)
+LONG = HOSTILE + "W" * 10_000
+
+MEASURE = (
+    "<script>document.documentElement.dataset.width="
+    "document.documentElement.scrollWidth + '/' + window.innerWidth;</script>"
+)
+"""Put at the end of a copy without its policy, to see how wide it is."""
+
+ACTING = re.compile("[\u200e\u200f\u202a-\u202e\u2066-\u2069\u2028]")
+
+
+class Seen(HTMLParser):
+    """What a browser made of a page: its elements, its handlers of events, and its root."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.handlers: list[str] = []
+        self.addresses: list[str] = []
+        self.root: dict[str, str | None] = {}
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.handlers += [name for name, _ in attrs if name.startswith("on")]
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag == "html":
+            self.root = dict(attrs)
+
+
+def looked_at(page: Path) -> Seen:
+    return Seen(look_at(page.as_uri(), "--dump-dom"))
+
+
+def widths(page: Path) -> tuple[int, int]:
+    """Pixels of what the page holds and of the window."""
+    text = page.read_text(encoding="utf-8")
+    copy = page.with_name(f"measured_{page.name}")
+    copy.write_text(re.sub("<meta http-equiv=[^>]*>", "", text) + MEASURE, encoding="utf-8")
+    held, _, window = (looked_at(copy).root["data-width"] or "").partition("/")
+    return int(held), int(window)
+
+
+def poisoned(value, key=""):
+    """Findings in which every text is an attack, but for what a page decides by."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value)]
+        return replace(value, **{k: poisoned(getattr(value, k), k) for k in names})
+    if isinstance(value, dict):
+        return {k: poisoned(v, k) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return type(value)(poisoned(v, key) for v in value)
+    if not isinstance(value, str) or key in ("kind", "treatment"):
+        return value
+    return value + LONG
+
+
+def images(folder: Path) -> ImageStep:
+    """From images to a valve, all of whose words are an attack."""
+    return ImageStep(
+        volume=VolumeAbout(LONG, LONG, LONG, (9, 10, 10, 10), (1.0, 1.0, 1.0)),
+        pictures={LONG: Picture("missing.png", LONG)},
+        sentences=(LONG,),
+        frames=({"frame": 1},),
+        files=(LONG, f"javascript:{RUN}"),
+        model={LONG: LONG},
+        open_frame=0,
+        closed_frame=5,
+        confidence=(0.9,),
+        std_mm=0.5,
+        correlation_length_mm=5.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def case_page(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("case")
+    findings, shapes = made_up_case(folder)
+    hostile = replace(
+        poisoned(findings),
+        settings={LONG: LONG},
+        measurements={LONG: {LONG: {LONG: 1.0}}},
+        image_step=images(folder),
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mvest.reporting.figures.DPI", 30)
+        patch.setattr("mvest.reporting.case.drawing.MAX_SPLITS", 0)
+        return write_case_report(folder, hostile, shapes, poisoned(LINE), poisoned(PROVENANCE))[0]
+
+
+@pytest.fixture(scope="module")
+def results_page(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    jobs = [
+        job({"filter": f"{LONG}{k}", LONG: k}, [run(1, TRUTH * 1.02, [0.1, 0.1])], row=LONG)
+        for k in range(2)
+    ]
+    lost = job({"filter": LONG, LONG: 2}, [], LONG, row=LONG)
+    publish(folder, sweep("filter", [*jobs, lost], title=LONG, settings={LONG: LONG}))
+    (folder / "gate.md").write_text(
+        f"# {LONG}\n\n{LONG}\n\n| {HOSTILE} |\n|---|\n| b |\n", encoding="utf-8"
+    )
+    return write_report(folder)
+
+
+@pytest.fixture(params=["case_page", "results_page"])
+def page(request) -> Path:
+    return request.getfixturevalue(request.param)
+
+
+@needs_browser
+def test_nothing_that_a_record_says_runs(page) -> None:
+    seen = looked_at(page)
+    assert "data-ran" not in seen.root
+    assert seen.handlers == []
+    assert not {"iframe", "object", "embed", "base"} & set(seen.tags)
+    assert not [address for address in seen.addresses if address.startswith("javascript:")]
+
+
+@needs_browser
+def test_a_page_stays_as_wide_as_its_window(page) -> None:
+    held, window = widths(page)
+    assert held <= window
+
+
+@needs_browser
+def test_the_policy_runs_the_scene_and_no_script_that_slipped_in(case_page) -> None:
+    text = case_page.read_text(encoding="utf-8")
+    slipped = case_page.with_name("slipped.html")
+    attack = f"<script>{RUN}</script><img src=x onerror={RUN}>"
+    slipped.write_text(text.replace("<header>", f"<header>{attack}"), encoding="utf-8")
+    seen = look_at(slipped.as_uri(), "--dump-dom")
+    assert "data-ran" not in Seen(seen).root
+    assert "js-plotly-plot" in seen
+    # The attack works where no policy stops it.
+    slipped.write_text(
+        re.sub("<meta http-equiv=[^>]*>", "", slipped.read_text(encoding="utf-8")), encoding="utf-8"
+    )
+    assert looked_at(slipped).root["data-ran"] == "1"
+
+
+def test_characters_that_act_are_named_and_what_is_cut_is_said(page) -> None:
+    text = page.read_text(encoding="utf-8")
+    text = re.sub("<script.*?</script>", "", text, flags=re.DOTALL)
+    assert not ACTING.search(text)
+    assert "[U+202E]gnp.exe[U+202C]" in text
+    assert "characters)" in text
+
+
+def test_pictures_stay_whole(page) -> None:
+    found = re.findall('src="data:image/webp;base64,([^"]*)"', page.read_text(encoding="utf-8"))
+    assert found
+    for data in found:
+        Image.open(io.BytesIO(base64.b64decode(data, validate=True))).load()
