@@ -30,6 +30,8 @@ __all__ = ["MERGE_TOLERANCE", "RegionSurface", "read_regions"]
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
 
+MAX_TRIANGLES = 50_000
+"""Of a surface: leaflets of 2000 mm^2 with edges of 0.3 mm."""
 MAX_NEIGHBOURS = 100
 """Vertices that are one, on average; where triangles share none there are about six."""
 
@@ -103,6 +105,11 @@ def _checked(surface: RegionSurface, regions: Mapping[int, str]) -> RegionSurfac
 
 def _read(file: Path) -> SurfaceFile:
     surface = read_surface(file)
+    if len(surface.triangles) > MAX_TRIANGLES:
+        raise GeometryError(
+            f"{file}: {len(surface.triangles)} triangles, expected at most {MAX_TRIANGLES}; make "
+            "them larger"
+        )
     far = np.flatnonzero((np.abs(surface.vertices) > MAX_NUMBER).any(axis=1))
     if len(far):
         raise GeometryError(

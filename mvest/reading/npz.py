@@ -80,7 +80,7 @@ def read_npz(
     try:
         size = path.stat().st_size if isinstance(path, Path) else path.seek(0, 2)
         if isinstance(path, Path) and not path.is_file():
-            raise InputError(f"{where} cannot be read: it is no regular file")
+            raise InputError(f"{where}: cannot be read: it is no regular file")
         with zipfile.ZipFile(path) as archive:
             members = _members(archive, where)
             asked = list(members) if names is None else list(names)
@@ -102,7 +102,7 @@ def read_npz(
         raise InputError(f"{where} is missing") from fault
     except _DAMAGE as fault:
         raise InputError(
-            f"{where} cannot be read: {one_line(fault, 100)}; expected .npz of plain arrays, "
+            f"{where}: cannot be read: {one_line(fault, 100)}; expected .npz of plain arrays, "
             "without pickles"
         ) from fault
 

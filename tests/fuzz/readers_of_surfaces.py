@@ -4,11 +4,14 @@ import base64
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from mvest.cases.folder import read_case
 from mvest.cases.surface_files import read_regions
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.io.leaflet_surfaces import read_leaflets, read_surface, write_leaflets
 from mvest.valve.io.solid_meshes import read_solid, write_solid
+from tests.cases.folders import plain_folder
 from tests.fuzz.trial import Reader
 from tests.valve.io import test_io
 
@@ -143,7 +146,15 @@ def solid(name: str, folder: Path) -> Path:
     return write_solid(folder / "a.vtu", test_io.one_element(name))
 
 
+def case(folder: Path) -> Path:
+    """A case folder of which the reference surface is damaged."""
+    document = plain_folder(folder)
+    (folder / "case.yaml").write_text(yaml.safe_dump(document))
+    return folder / "open.vtp"
+
+
 READERS = (
+    Reader("case.surface", lambda path: read_case(path.parent), (case,)),
     Reader("surface.stl", read_surface, (text_stl, binary_stl)),
     Reader("surface.stl-merged", lambda path: read_regions(path, {1: "both"}), (text_stl,)),
     Reader("surface.obj", regions, (obj,)),

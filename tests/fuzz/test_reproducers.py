@@ -145,6 +145,29 @@ def far_point(whole: bytes) -> bytes:
     return f"solid a\n{facets}endsolid\n".encode()
 
 
+def band(columns: int, rows: int, shuffled: bool) -> bytes:
+    """A whole band of triangles, as it is or with its vertices anywhere."""
+    i, j = np.divmod(np.arange(columns * (rows - 1)), rows - 1)
+    a, b = i * rows + j, (i + 1) % columns * rows + j
+    triangles = np.concatenate([np.stack([a, b, a + 1], 1), np.stack([b, b + 1, a + 1], 1)])
+    phi, z = np.divmod(np.arange(columns * rows), rows)
+    angle = 2 * np.pi * phi / columns
+    points = np.column_stack([16 * np.cos(angle), 14 * np.sin(angle), -20 * z / (rows - 1)])
+    if shuffled:
+        points = np.random.default_rng(0).uniform(-15, 15, points.shape)
+    count = len(triangles)
+    region = (np.concatenate([i, i]) < columns // 2).astype(np.int8)
+    arrays = {
+        "points": ("Float64", points),
+        "connectivity": ("Int64", triangles),
+        "offsets": ("Int64", 3 * np.arange(1, count + 1)),
+        "region": ("Int8", region),
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces, "ARRAYS", arrays)
+        return surfaces.vtk_text("vtp", "appended")
+
+
 # Reader, number of its example, what is made of it, words of the message.
 CASES: dict[str, tuple[str, int, Callable[[bytes], bytes], str]] = {
     "VTP inflates to 2 GiB": (
@@ -184,6 +207,12 @@ CASES: dict[str, tuple[str, int, Callable[[bytes], bytes], str]] = {
     ),
     "PLY of corners without end": (
         *("surface.ply", 1, replaced("uchar int", "uint double"), "ends within"),
+    ),
+    "case of a surface of shuffled vertices": (
+        *("case.surface", 0, lambda _: band(300, 40, True), "self-intersection"),
+    ),
+    "case of too many triangles": (
+        *("case.surface", 0, lambda _: band(300, 90, False), "expected at most 50000"),
     ),
     "STL of 2^32 triangles": (
         *("surface.stl", 1, lambda whole: whole[:80] + b"\xff" * 4 + whole[84:], "bytes, expected"),

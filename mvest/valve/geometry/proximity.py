@@ -19,6 +19,11 @@ from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import surface_edges
 
+SAMPLED_EDGES = 100
+"""Whose boxes are compared with all others, to know how many overlap."""
+EDGES_AT_A_TIME = 50
+MAX_LOOKED_AT = 100_000
+"""Edges in turn, and pairs in all, when only some intersections are looked for."""
 Vector = tuple[float, float, float]
 """A point or a vector in compiled code, where an array of three takes longer than its sums."""
 
@@ -215,30 +220,50 @@ def has_intersections(vertices: FloatArray, triangles: IntArray) -> bool:
     return bool(ipctk.has_intersections(mesh, vertices))
 
 
-def intersecting_triangles(vertices: FloatArray, triangles: IntArray) -> IntArray:
+def overlapping_boxes(vertices: FloatArray, triangles: IntArray) -> float:
+    """About how many pairs of an edge and a triangle have bounding boxes that overlap.
+
+    That many are looked at for intersections, each with its memory: some ten for an edge of a
+    surface in good order, and as many as there are triangles where these lie across each other.
+    """
+    edges = surface_edges(triangles)
+    corners = vertices[triangles]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    some = edges[:: max(1, len(edges) // SAMPLED_EDGES)]
+    count = 0
+    for ends in vertices[some]:
+        count += int(((low <= ends.max(axis=0)) & (high >= ends.min(axis=0))).all(axis=1).sum())
+    return count / len(some) * len(edges)
+
+
+def intersecting_triangles(
+    vertices: FloatArray, triangles: IntArray, enough: int | None = None
+) -> IntArray:
     """Pairs of intersecting triangles ``(k, 2)``, lower number first, each pair once.
 
     A pair is listed when an edge of one passes through the other; see `has_intersections` for
     what is not tested.
+
+    Parameters
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm and ``(m, 3)``.
+    enough
+        Edges and triangles that intersect after which no more are looked for, nor after
+        `MAX_LOOKED_AT` pairs of which boxes overlap, when there may be none; without it all are.
     """
     if not has_intersections(vertices, triangles):
         return np.zeros((0, 2), dtype=np.int64)
     edges = surface_edges(triangles)
-    phase = ipctk.LBVH()
-    phase.build(
-        np.asfortranarray(vertices, dtype=np.float64),
-        np.asfortranarray(edges, dtype=np.int32),
-        np.asfortranarray(triangles, dtype=np.int32),
-        1e-9,
-    )
-    hits = [
-        (candidate.edge_id, candidate.face_id)
-        for candidate in phase.detect_edge_face_candidates()
-        if not np.isin(edges[candidate.edge_id], triangles[candidate.face_id]).any()
-        and ipctk.is_edge_intersecting_triangle(
-            *vertices[edges[candidate.edge_id]], *vertices[triangles[candidate.face_id]]
-        )
-    ]
+    step = len(edges) if enough is None else EDGES_AT_A_TIME
+    hits: list[tuple[int, int]] = []
+    looked_at = 0
+    for start in range(0, len(edges), step):
+        found, count = _edges_through(vertices, triangles, edges[start : start + step], start)
+        hits += found
+        looked_at += count
+        if enough is not None and (len(hits) >= enough or looked_at > MAX_LOOKED_AT):
+            break
     if not hits:
         return np.zeros((0, 2), dtype=np.int64)
     owners: dict[tuple[int, int], list[int]] = {}
@@ -252,6 +277,29 @@ def intersecting_triangles(vertices: FloatArray, triangles: IntArray) -> IntArra
         for owner in owners[int(edges[edge][0]), int(edges[edge][1])]
     }
     return np.array(sorted(pairs), dtype=np.int64)
+
+
+def _edges_through(
+    vertices: FloatArray, triangles: IntArray, edges: IntArray, first: int
+) -> tuple[list[tuple[int, int]], int]:
+    """Edges, numbered from `first`, with triangles that they pass through; pairs looked at."""
+    phase = ipctk.LBVH()
+    phase.build(
+        np.asfortranarray(vertices, dtype=np.float64),
+        np.asfortranarray(edges, dtype=np.int32),
+        np.asfortranarray(triangles, dtype=np.int32),
+        1e-9,
+    )
+    candidates = phase.detect_edge_face_candidates()
+    hits = [
+        (first + candidate.edge_id, candidate.face_id)
+        for candidate in candidates
+        if not np.isin(edges[candidate.edge_id], triangles[candidate.face_id]).any()
+        and ipctk.is_edge_intersecting_triangle(
+            *vertices[edges[candidate.edge_id]], *vertices[triangles[candidate.face_id]]
+        )
+    ]
+    return hits, len(candidates)
 
 
 def plane_section(
