@@ -28,7 +28,9 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.approach import approach
 from mvest.mechanics.assembly import add_forces
-from mvest.mechanics.forces.contact import HARMLESS, Contact, ContactPairs
+from mvest.mechanics.forces.contact import Contact
+from mvest.mechanics.forces.pair_search import ContactPairs
+from mvest.mechanics.forces.passing import HARMLESS
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,

@@ -21,7 +21,8 @@ from mvest.mechanics.assembly import (
     scatter_blocks,
 )
 from mvest.mechanics.forces.cables import Cables, Hinge
-from mvest.mechanics.forces.contact import Contact, ContactPairs
+from mvest.mechanics.forces.contact import Contact
+from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.common.build import guide_of
 from mvest.closure.model import ClosureModel
-from mvest.mechanics.forces.contact import ContactPairs
+from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import Simulation

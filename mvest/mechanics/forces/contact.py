@@ -30,86 +30,29 @@ on the same sheet must not repel each other: the reach of a pair is shortened to
 active in the stress-free state and the same rule serves pleats, commissures and leaflets alike.
 
 No passing: no Newton step takes from a known pair more than three quarters of its distance to the
-barrier, nor the triangulated midsurface samples through each other. Mostly that follows from how
-far apart the points stay. Where an edge of length a meets one of length b, or a point a triangle
-whose edges are at most a long, the average of the squared distances of the ends, weighted by where
-the meeting lies, is at most :math:`(a^2 + b^2)/4` or :math:`a^2/3`: two points are at least so
-near. The length of an edge is convex along a step, so that its ends bound it. Listed pairs are
-looked at one by one; those that the search has left out are apart by its skin, less what points
-have moved since. Where this proves nothing, continuous collision detection decides (Li et al. 2020,
-ACM Trans. Graph. 39(4):49, by the IPC toolkit). Neighbours within the sheet always are too near for
-the proof, and no time step is accepted whose triangles intersect: it is repeated with detection
-throughout.
+barrier, nor the triangulated midsurface samples through each other
+(:mod:`mvest.mechanics.forces.passing`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import ipctk
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.spatial import cKDTree
 
 from mvest.errors import InputError
-from mvest.mechanics.forces.pair_search import NEIGHBOUR, search_pairs
+from mvest.mechanics.forces.pair_search import ContactPairs, search_pairs
+from mvest.mechanics.forces.passing import Passing
 from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = ["Contact", "ContactPairs"]
+__all__ = ["Contact"]
 
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
 APPROACH = 0.75
 """A pair may lose at most this share of its distance to the barrier in one Newton step."""
-HARMLESS = 0.02
-"""mm; a step that moves no point farther cannot take sheets through each other."""
-
-CLEARANCE = 1e-3
-"""mm between midsurfaces that touch nowhere: equilibria keep a part of their thickness. Detection
-of collisions from a distance of zero does not end."""
-
-MAX_SUBDIVISIONS = 100_000
-"""Of one pair's times while a collision is looked for, 10 MB; a pair in doubt then counts as
-colliding (Wang et al. 2021, ACM Trans. Graph. 40:188, section 5)."""
-
-_DETECTION = ipctk.TightInclusionCCD(max_iterations=MAX_SUBDIVISIONS)
-# It warns on stdout of sheets that touch, which the step's outcome says.
-ipctk.set_logger_level(ipctk.LoggerLevel.error)
-RINGS = 3
-"""Edges between points that count as neighbours within the sheet."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ContactPairs:
-    """Candidate pairs sorted by the elements that host them.
-
-    Attributes
-    ----------
-    first, second : ndarray
-        ``(p,)`` points; the host of ``first`` is not behind the host of ``second``.
-    reach : ndarray
-        ``(p,)`` activation distance of each pair, mm.
-    reference : ndarray
-        ``(p,)`` reference distance of each pair, mm.
-    start : ndarray
-        ``(g + 1,)`` where each group of equal hosts starts.
-    hosts : ndarray
-        ``(g, 2)``.
-    positions : ndarray
-        ``(k, 3)`` point positions of the search.
-    """
-
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    reach: FloatArray
-    reference: FloatArray
-    start: IntArray
-    hosts: IntArray
-    positions: FloatArray
 
 
 class Contact:
@@ -128,6 +71,11 @@ class Contact:
     settings : ContactSettings
     skin : float
         mm by which the candidate search exceeds the reach.
+
+    Attributes
+    ----------
+    passing : Passing
+        Whether sheets pass through each other.
     """
 
     def __init__(
@@ -150,11 +98,7 @@ class Contact:
         if len(triangles) == 0:
             raise InputError("contact needs triangles of the sampled midsurface; there are none")
         self._by_host = np.argsort(points.host, kind="stable")
-        self._near = _near_at_rest(self.rest, self.thickness, triangles, settings)
-        faces = np.asfortranarray(triangles, dtype=np.int32)
-        self._collision_mesh = ipctk.CollisionMesh(
-            np.asfortranarray(rest), ipctk.edges(faces), faces
-        )
+        self.passing = Passing(self.rest, self.thickness, triangles, settings, skin)
 
     def search(self, y: FloatArray) -> ContactPairs:
         """Pairs that can become active while no point moves by more than half the skin.
@@ -165,19 +109,16 @@ class Contact:
             ``(k, 3)`` current positions of the points.
         """
         longest = self.settings.activation_distance * float(self.thickness.max())
-        return ContactPairs(
-            *search_pairs(
-                y,
-                self.rest,
-                self.thickness,
-                self._by_host,
-                self.points.host,
-                self.settings.activation_distance,
-                self.settings.reference_distance,
-                longest + self.skin,
-                self.skin,
-            ),
-            y.copy(),
+        return search_pairs(
+            y,
+            self.rest,
+            self.thickness,
+            self._by_host,
+            self.points.host,
+            self.settings.activation_distance,
+            self.settings.reference_distance,
+            longest + self.skin,
+            self.skin,
         )
 
     def stale(self, pairs: ContactPairs, y: FloatArray) -> bool:
@@ -262,35 +203,7 @@ class Contact:
         factor = float(
             _largest_step(y, dy, pairs.first, pairs.second, pairs.reach, pairs.reference)
         )
-        if factor * float(np.max(np.abs(dy), initial=0.0)) < HARMLESS:
-            return factor
-        if not detect and self._stays_apart(pairs, y, factor * dy):
-            return factor
-        start, end = np.asfortranarray(y), np.asfortranarray(y + factor * dy)
-        free = ipctk.compute_collision_free_stepsize(
-            self._collision_mesh,
-            start,
-            end,
-            min_distance=CLEARANCE,
-            narrow_phase_ccd=_DETECTION,
-        )
-        return factor if free >= 1.0 else 0.8 * factor * float(free)
-
-    def _stays_apart(self, pairs: ContactPairs, y: FloatArray, dy: FloatArray) -> bool:
-        """Whether points that are no neighbours are proved too far apart for triangles to meet."""
-        longest = _longest_edges(y, dy, self.triangles)
-        moved = np.sqrt(np.max(np.sum((y - pairs.positions) ** 2, axis=1)))
-        moved += np.sqrt(np.max(np.sum(dy**2, axis=1)))
-        # A pair that is neither listed nor near at rest has the reference distance for its reach at
-        # least.
-        unlisted = self.settings.reference_distance * float(self.thickness.min()) + self.skin
-        if unlisted - 2 * moved <= np.sqrt(0.5) * float(longest.max()):
-            return False
-        near, start, neighbours = self._near
-        return bool(
-            _stay_apart(y, dy, pairs.first, pairs.second, longest, start, neighbours)
-            and _stay_apart(y, dy, near[0], near[1], longest, start, neighbours)
-        )
+        return factor * self.passing.free_share(pairs, y, factor * dy, detect=detect)
 
     def active(self, pairs: ContactPairs, y: FloatArray) -> int:
         """Number of pairs within their reach."""
@@ -298,7 +211,7 @@ class Contact:
 
     def intersects(self, y: FloatArray) -> bool:
         """Whether triangles of the sampled midsurface intersect at ``y (k, 3)``."""
-        return bool(ipctk.has_intersections(self._collision_mesh, np.asfortranarray(y)))
+        return self.passing.intersects(y)
 
 
 @nb.njit(cache=True, inline="always")
@@ -521,78 +434,3 @@ def _largest_step(
         if 0.0 <= t < best:
             best = t
     return best
-
-
-def _near_at_rest(
-    rest: FloatArray, thickness: FloatArray, triangles: IntArray, settings: ContactSettings
-) -> tuple[NDArray[np.int32], IntArray, IntArray]:
-    """Pairs ``(2, p)`` that a search may leave out at any distance, and the neighbours of points.
-
-    The neighbours of point i are those from ``start[i]`` to ``start[i + 1]``.
-    """
-    n = len(rest)
-    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    step = sparse.coo_array((np.ones(len(edges)), edges.T), shape=(n, n)).tocsr()
-    step = step + step.T + sparse.eye_array(n)
-    reached = step
-    for _ in range(RINGS - 1):
-        reached = (reached @ step).tocsr()
-    reached.sort_indices()
-    # Their reach is NEIGHBOUR times the distance at rest; beyond this it is the reference distance.
-    share = settings.reference_distance / NEIGHBOUR
-    pairs = cKDTree(rest).query_pairs(share * float(thickness.max()), output_type="ndarray")
-    apart = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1)
-    pairs = pairs[apart < share * 0.5 * thickness[pairs].sum(axis=1)]
-    start, neighbours = reached.indptr.astype(np.int64), reached.indices.astype(np.int64)
-    return np.ascontiguousarray(pairs.T, dtype=np.int32), start, neighbours
-
-
-@nb.njit(cache=True)
-def _longest_edges(y: FloatArray, dy: FloatArray, triangles: IntArray) -> FloatArray:
-    """Longest edge ``(k,)`` of the triangles around each point, anywhere along the move."""
-    out = np.zeros(len(y))
-    for t in range(len(triangles)):
-        longest = 0.0
-        for s in range(3):
-            i, j = triangles[t, s], triangles[t, (s + 1) % 3]
-            now, then = 0.0, 0.0
-            for c in range(3):
-                edge = y[i, c] - y[j, c]
-                now += edge * edge
-                then += (edge + dy[i, c] - dy[j, c]) ** 2
-            longest = max(longest, now, then)
-        for s in range(3):
-            out[triangles[t, s]] = max(out[triangles[t, s]], longest)
-    return np.sqrt(out)
-
-
-@nb.njit(cache=True)
-def _stay_apart(
-    y: FloatArray,
-    dy: FloatArray,
-    first: NDArray[np.int32],
-    second: NDArray[np.int32],
-    longest: FloatArray,
-    start: IntArray,
-    neighbours: IntArray,
-) -> bool:
-    """Whether all pairs but neighbours stay farther apart than those of triangles that meet."""
-    for k in range(len(first)):
-        i, j = first[k], second[k]
-        rr, rd, dd = 0.0, 0.0, 0.0
-        for c in range(3):
-            r = y[i, c] - y[j, c]
-            s = dy[i, c] - dy[j, c]
-            rr += r * r
-            rd += r * s
-            dd += s * s
-        if rd < 0.0:
-            t = min(1.0, -rd / dd)
-            rr += t * (2.0 * rd + t * dd)
-        a, b = longest[i] ** 2, longest[j] ** 2
-        if rr <= max((a + b) / 4.0, max(a, b) / 3.0):
-            own = neighbours[start[i] : start[i + 1]]
-            at = np.searchsorted(own, j)
-            if at == len(own) or own[at] != j:
-                return False
-    return True

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["NEIGHBOUR", "search_pairs"]
+__all__ = ["NEIGHBOUR", "ContactPairs", "search_pairs"]
 
 NEIGHBOUR = 0.8
 """Reach of a pair over its rest distance, at most: a sheet touches itself from 20 % compression."""
@@ -16,6 +18,35 @@ FINENESS = 2
 """Cubes along the search radius: smaller ones enclose the sphere of that radius more closely."""
 EXPECTED = 72
 """Pairs of a point for which there is room at first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactPairs:
+    """Candidate pairs sorted by the elements that host them.
+
+    Attributes
+    ----------
+    first, second : ndarray
+        ``(p,)`` points; the host of ``first`` is not behind the host of ``second``.
+    reach : ndarray
+        ``(p,)`` activation distance of each pair, mm.
+    reference : ndarray
+        ``(p,)`` reference distance of each pair, mm.
+    start : ndarray
+        ``(g + 1,)`` where each group of equal hosts starts.
+    hosts : ndarray
+        ``(g, 2)``.
+    positions : ndarray
+        ``(k, 3)`` point positions of the search.
+    """
+
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+    reach: FloatArray
+    reference: FloatArray
+    start: IntArray
+    hosts: IntArray
+    positions: FloatArray
 
 
 def search_pairs(
@@ -28,7 +59,7 @@ def search_pairs(
     distance: float,
     radius: float,
     skin: float,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray, FloatArray, IntArray, IntArray]:
+) -> ContactPairs:
     """Candidate pairs in the order of their hosts, grouped by them.
 
     Parameters
@@ -45,17 +76,6 @@ def search_pairs(
         mm, largest reach of all plus ``skin``.
     skin : float
         mm by which the search exceeds the reach of a pair.
-
-    Returns
-    -------
-    first, second : ndarray
-        ``(p,)`` points; the host of ``first`` is not behind that of ``second``.
-    reach, reference : ndarray
-        ``(p,)`` mm, activation and reference distance of each pair.
-    start : ndarray
-        ``(g + 1,)`` where each group of equal hosts starts.
-    hosts : ndarray
-        ``(g, 2)``.
     """
     n = len(y)
     counts, place, first_of, table = _cells(y, by_host, radius / FINENESS)
@@ -92,7 +112,7 @@ def search_pairs(
     start, hosts = _grouped(
         rest, thickness, by_host, host, activation, distance, ends, second, points, lengths
     )
-    return points[0], points[1], lengths[0], lengths[1], start, hosts
+    return ContactPairs(points[0], points[1], lengths[0], lengths[1], start, hosts, y.copy())
 
 
 @nb.njit(cache=True)

@@ -12,10 +12,9 @@ from mvest.mechanics.forces.contact import (
     APPROACH,
     BARRIER,
     Contact,
-    ContactPairs,
-    _longest_edges,
 )
-from mvest.mechanics.forces.pair_search import NEIGHBOUR
+from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs
+from mvest.mechanics.forces.passing import _longest_edges
 from mvest.mechanics.settings import ContactSettings
 from mvest.valve.mesh.embedding import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses
@@ -292,10 +291,10 @@ def test_nothing_is_proved_of_sheets_that_are_close_at_rest():
     pairs = close.search(y)
     distance = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
     assert distance.min() > 0.7
-    assert not close._stays_apart(pairs, y, np.outer(upper, [0.0, 0.0, -0.1]))
+    assert not close.passing.stays_apart(pairs, y, np.outer(upper, [0.0, 0.0, -0.1]))
     # Neighbours in one sheet are as close, and nothing is asked of them.
     y = y + np.outer(upper, [0.0, 0.0, 3.0])
-    assert close._stays_apart(close.search(y), y, np.outer(upper, [0.0, 0.0, -0.1]))
+    assert close.passing.stays_apart(close.search(y), y, np.outer(upper, [0.0, 0.0, -0.1]))
 
 
 def test_nothing_is_proved_of_a_meeting_half_way():
@@ -307,8 +306,10 @@ def test_nothing_is_proved_of_a_meeting_half_way():
         y + np.outer(np.repeat([0, 1], 3), [0, 0, FAR]), triangles=triangles, skin=20.0
     )
     pairs, aside = contact.search(y), np.outer(np.repeat([0, 1], 3), [-5.0, 0, 0])
-    assert not contact._stays_apart(pairs, y, aside)
-    assert contact._stays_apart(pairs, y - np.outer(np.repeat([0, 1], 3), [0, 0, 0.6]), aside)
+    assert not contact.passing.stays_apart(pairs, y, aside)
+    assert contact.passing.stays_apart(
+        pairs, y - np.outer(np.repeat([0, 1], 3), [0, 0, 0.6]), aside
+    )
 
 
 def test_edges_are_as_long_as_they_get_on_the_way():
@@ -369,10 +370,10 @@ def test_what_is_proved_apart_is_free_of_collisions():
         pairs = contact.search(y)
         move = random.uniform(0, 2) * np.outer(upper, random.uniform(-1, 1, 3))
         move += random.normal(scale=0.1, size=y.shape)
-        if contact._stays_apart(pairs, y, move):
+        if contact.passing.stays_apart(pairs, y, move):
             proved += 1
             start, end = np.asfortranarray(y), np.asfortranarray(y + move)
-            mesh = contact._collision_mesh
+            mesh = contact.passing.mesh
             assert ipctk.compute_collision_free_stepsize(mesh, start, end) == 1.0
     assert proved > 5
 
