@@ -14,6 +14,7 @@ from experiments.common.estimate_record import identified_of, innovation_of, see
 from experiments.common.estimates import Data, SeedRun
 from experiments.common.record import Mesh, Model, Outcome
 from mvest.cases.case import Role, ValveCase
+from mvest.cases.plausibility import doubts
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.result import Personalised
 from mvest.problem.estimate import StudyResult
@@ -224,6 +225,7 @@ def _about(case: ValveCase) -> About:
         tuple(case.derived),
         case.sha256,
         tuple(case.surface.region_names),
+        tuple(map(str, doubts(case))),
     )
 
 

@@ -16,6 +16,7 @@ from experiments.common.progress import SolveBar
 from experiments.common.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
+from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
 from mvest.personalise.chain import personalise_case
 from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
@@ -92,6 +93,8 @@ def run_case(
     fields.unlink(missing_ok=True)
     for sentence in case.derived:
         print(f"derived: {sentence}", file=sys.stderr)
+    for doubt in doubts(case):
+        print(f"doubtful: {doubt}", file=sys.stderr)
     settings = settings_of(values, personal)
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]

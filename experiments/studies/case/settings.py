@@ -14,4 +14,5 @@ class Settings:
     """What the study adds to the configuration."""
 
     case: CaseInput = None  # folder of a case
+    strict: bool = False  # refuse a case that is not plausible, instead of saying so
     personal: PersonalSettings

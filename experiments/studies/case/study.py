@@ -16,6 +16,7 @@ from experiments.common.schema import build
 from experiments.common.study import Job, Study
 from experiments.studies.case.settings import Settings
 from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.plausibility import doubts, require_plausible
 from mvest.personalise.model import build_model
 from mvest.reporting.case.fields import turn_of
 
@@ -27,7 +28,7 @@ __all__ = ["STUDY", "check_case", "run_own_case"]
 
 def run_own_case(job: Job[Settings]) -> Outcome[Findings]:
     """Read the configured case and personalise it."""
-    case = read_configured(job.settings.case)
+    case = _read(job.values)
     return run_case(job.values, job.settings.personal, case, job.folder)
 
 
@@ -41,7 +42,7 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
     """
     from mvest.reporting.figures import save_figure_with
 
-    case = read_configured(values["case"])
+    case = _read(values)
     settings = settings_of(values, build(PersonalSettings, values["personal"]))
     model = build_model(case, settings, meshes_of(values))
     files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
@@ -55,9 +56,26 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
         f"  mesh: {len(model.mesh.nodes)} nodes, {len(model.mesh.elements)} "
         f"{model.mesh.element_type}",
         f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
-        f"In order; drawn in {files[0]}",
     ]
+    strange = doubts(case)
+    lines += [f"  {'MISTAKE?' if one.mistake else 'doubtful'}: {one}" for one in strange]
+    drawn = f"drawn in {files[0]}"
+    if strange:
+        count = "1 thing is" if len(strange) == 1 else f"{len(strange)} things are"
+        lines.append(
+            f"{count} hardly so; look at them before anything is estimated (strict=true refuses "
+            f"them); {drawn}"
+        )
+    else:
+        lines.append(f"In order; {drawn}")
     return "\n".join(lines)
+
+
+def _read(values: Mapping[str, Any]) -> ValveCase:
+    case = read_configured(values["case"])
+    if values["strict"]:
+        require_plausible(case)
+    return case
 
 
 def _drawn(case: ValveCase) -> Figure:

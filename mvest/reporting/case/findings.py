@@ -22,7 +22,10 @@ MODULUS, NUISANCE = "modulus", "nuisance"
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a case says of itself; ``derived`` are sentences on what was not given."""
+    """What a case says of itself.
+
+    ``derived`` are sentences on what was not given, ``doubts`` on what is hardly so.
+    """
 
     name: str
     description: str = ""
@@ -32,6 +35,7 @@ class About:
     derived: tuple[str, ...] = ()
     sha256: str = ""
     regions: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,149 @@
+"""What is hardly so in a case: the example is in order, and each mistake in it is named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import Role
+from mvest.cases.folder import read_case
+from mvest.cases.plausibility import RANGES, doubts, require_plausible
+from mvest.errors import InputError
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
+
+
+@pytest.fixture(scope="module")
+def case():
+    return read_case(EXAMPLE)
+
+
+def with_frame(case, role, **changes):
+    return replace(
+        case, frames=tuple(replace(f, **changes) if f.role is role else f for f in case.frames)
+    )
+
+
+def with_surface(case, **changes):
+    surface = replace(case.surface, **changes)
+    frames = tuple(replace(f, region=surface.region) if f.corresponds else f for f in case.frames)
+    return replace(case, surface=surface, frames=frames)
+
+
+def moved(case, how):
+    """The closed frame with its vertices moved, the curves with them."""
+    closed = case.frame(Role.CLOSED)
+    vertices = how(closed.vertices)
+    return with_frame(
+        case,
+        Role.CLOSED,
+        vertices=vertices,
+        annulus=vertices[case.annulus],
+        free_edge=vertices[case.free_edge],
+    )
+
+
+def test_the_example_is_in_order(case):
+    assert doubts(case) == ()
+    require_plausible(case)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_errors_of_an_image_are_no_mistake(case, seed):
+    """1 mm alike over 10 mm, or 0.3 mm at each vertex by itself."""
+    from mvest.observation.errors import SpatialCorrelation
+
+    rng = np.random.default_rng(seed)
+    n = len(case.surface.vertices)
+    factor = SpatialCorrelation(case.surface.vertices, 10.0).factor
+    assert doubts(moved(case, lambda x: x + factor @ rng.standard_normal((n, 3)))) == ()
+    assert doubts(moved(case, lambda x: x + 0.3 * rng.standard_normal((n, 3)))) == ()
+
+
+def exchanged_leaflets(case):
+    return with_surface(case, region=1 - case.surface.region)
+
+
+def exchanged_frames(case):
+    """Open and closed shapes in each other's place."""
+    open_, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
+    shapes = ("vertices", "annulus", "free_edge", "papillary_tips")
+    other = with_frame(case, Role.REFERENCE, **{k: getattr(closed, k) for k in shapes})
+    other = with_frame(other, Role.CLOSED, **{k: getattr(open_, k) for k in shapes})
+    return with_surface(other, vertices=closed.vertices)
+
+
+def shrunken(case):
+    """A closed shape made by hand: everything drawn together in the middle of the valve."""
+    middle = case.frame(Role.CLOSED).annulus.mean(axis=0)
+    return moved(case, lambda x: middle + (x - middle) * [0.5, 0.5, 1.0])
+
+
+def shuffled(case):
+    """Vertices of the closed frame in another order than those of the open one."""
+    order = np.random.default_rng(0).permutation(len(case.surface.vertices))
+    closed = case.frame(Role.CLOSED)
+    return with_frame(case, Role.CLOSED, vertices=closed.vertices[order])
+
+
+def thin(case):
+    return with_surface(case, thickness=0.1 * case.surface.thickness)
+
+
+def in_kilopascals(case):
+    return with_frame(case, Role.CLOSED, pressure_mmHg=16.0)
+
+
+def low_pressure(case):
+    return with_frame(case, Role.CLOSED, pressure_mmHg=40.0)
+
+
+def tips_away(case):
+    tips = case.frame(Role.CLOSED).papillary_tips
+    return with_frame(case, Role.CLOSED, papillary_tips=tips - [0.0, 0.0, 20.0])
+
+
+def slack_chordae(case):
+    chordae = replace(case.chordae, rest_length=2.0 * case.chordae.rest_length)
+    return replace(case, chordae=chordae)
+
+
+def large_annulus(case):
+    closed = case.frame(Role.CLOSED)
+    return with_frame(case, Role.CLOSED, annulus=1.3 * closed.annulus)
+
+
+@pytest.mark.parametrize(
+    ("made", "field", "words", "mistake"),
+    [
+        (exchanged_leaflets, "regions", "are they exchanged?", True),
+        (exchanged_frames, "frames", "are the frames exchanged?", True),
+        (shrunken, "frames.closed.surface", "area of the anterior leaflet", False),
+        (shuffled, "frames.closed.surface", "do its vertices correspond?", True),
+        (thin, "thickness", "is it in cm?", True),
+        (in_kilopascals, "frames.pressure", "is it in kPa?", True),
+        (low_pressure, "frames.pressure", "is 40 mmHg, expected 60 to 200 mmHg", False),
+        (tips_away, "frames.closed.papillary_tips", "motion of a tip is 20 mm", False),
+        (slack_chordae, "frames.closed.papillary_tips", "half of the chordae", False),
+        (large_annulus, "frames.closed.annulus", "over that of the reference", False),
+    ],
+)
+def test_each_mistake_is_named(case, made, field, words, mistake):
+    found = [doubt for doubt in doubts(made(case)) if doubt.field == field and words in doubt.text]
+    assert found
+    assert all(doubt.mistake is mistake for doubt in found)
+
+
+def test_mistakes_come_first_and_strictness_refuses_all(case):
+    wrong = in_kilopascals(tips_away(case))
+    found = doubts(wrong)
+    assert [doubt.mistake for doubt in found] == sorted((d.mistake for d in found), reverse=True)
+    with pytest.raises(InputError, match=r"is not plausible: .*kPa.*; .*tip"):
+        require_plausible(wrong)
+
+
+def test_every_range_is_one_and_says_why():
+    for name, one in RANGES.items():
+        assert one.low < one.high, name
+        assert one.why, name
