@@ -13,6 +13,7 @@ from experiments.common.record import Record, record_from, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Study, load_study, study_names
 from experiments.results.keep import arrays_of, publish
+from experiments.runner.check import require_room
 from experiments.runner.folder import (
     CONFIG,
     RESULT,
@@ -79,8 +80,10 @@ def run_job(request: Request) -> None:
 def _compute_here(request: Request) -> None:
     """Run a job in this process, which is held to its memory."""
     started, held = time.time(), None
+    limit_gb = request.values[MEMORY_LIMIT] or default_memory_gb()
+    require_room(request.values, limit_gb)
     try:
-        with held_memory(request.values[MEMORY_LIMIT] or default_memory_gb()) as held:
+        with held_memory(limit_gb) as held:
             compute(request)
     except MemoryError as error:
         reason = ": ".join(filter(None, [str(held), str(error)]))

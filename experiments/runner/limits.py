@@ -99,13 +99,13 @@ def held_memory(limit_gb: float) -> Iterator[HeldMemory]:
 
     def hold() -> None:
         while True:
-            resident, reserved = _resident_and_reserved()
-            left = max(0, int(limit_gb * GB) - resident)
-            allowed = min(reserved + left, 2**62)
-            resource.setrlimit(
-                resource.RLIMIT_DATA,
-                (allowed if hard == resource.RLIM_INFINITY else min(allowed, hard), hard),
-            )
+            # At the limit not even this may find room; what was set before then stays.
+            with suppress(MemoryError):
+                resident, reserved = _resident_and_reserved()
+                allowed = reserved + max(0, int(limit_gb * GB) - resident)
+                if hard != resource.RLIM_INFINITY:
+                    allowed = min(allowed, hard)
+                resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
             if ended.wait(POLL_S):
                 return
 

@@ -18,6 +18,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+from experiments.runner.check import require_room
 from experiments.runner.folder import LOG
 from experiments.runner.interruption import raised
 from experiments.runner.job import FailedRunError, compute
@@ -65,6 +66,8 @@ def answer(request: Request, memory_limit_gb: float | None = None) -> dict[str, 
     held = None
     try:
         with memory as held:
+            if memory_limit_gb is not None:
+                require_room(request.values, memory_limit_gb)
             compute(request)
     except FailedRunError:
         return {"reason": None, "healthy": True}
