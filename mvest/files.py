@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import stat
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -33,8 +34,8 @@ def write_atomically(
     path : Path or str
         Its folder must exist.
     content : str, bytes or callable
-        Text is written as UTF-8; a callable is given the temporary path, which ends as ``path``
-        does, and makes a file or a folder there.
+        Text is written as UTF-8, with a ? (and a note) for what has none; a callable is given the
+        temporary path, which ends as ``path`` does, and makes a file or a folder there.
     sync : bool
         Whether all of it is on the disk, and not merely on its way, before it takes its name.
 
@@ -55,7 +56,7 @@ def write_atomically(
             if callable(content):
                 content(part)
             else:
-                part.write_bytes(content.encode() if isinstance(content, str) else content)
+                part.write_bytes(_encoded(content, target) if isinstance(content, str) else content)
             for file in _files(part) if sync else ():
                 with file.open("rb+") as stream:
                     os.fsync(stream.fileno())
@@ -124,6 +125,16 @@ def _remembered(file: Path, key: tuple[int, ...]) -> str:
 def _digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _encoded(text: str, target: Path) -> bytes:
+    """UTF-8; a character that has none is no reason to lose the others."""
+    try:
+        return text.encode()
+    except UnicodeEncodeError as error:
+        code = f"U+{ord(text[error.start]):04X}"
+        print(f"note: {target}: {code} cannot be written and is a ? there", file=sys.stderr)
+        return text.encode(errors="replace")
 
 
 def remove_parts(folder: Path, name: str = "") -> None:

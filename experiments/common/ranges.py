@@ -14,7 +14,8 @@ from decimal import Decimal
 from functools import cache
 from typing import Any
 
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
+from mvest.reading.text import check_words
 
 __all__ = ["ANY", "RANGES", "Range", "range_of", "require_in_range"]
 
@@ -187,9 +188,6 @@ MAX_ENTRIES, MAX_LETTERS, MAX_NAME = 10_000, 10_000, 120
 
 NAMES_OF_FILES = ("name", "table", "study")
 
-NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Characters that act on a terminal or cannot be written; ends of lines and tabs may be."""
-
 PER_PARAMETER = (("truth", "values"), ("filter", "initial"))
 """Lists of one value for each of ``parameters``."""
 
@@ -247,12 +245,10 @@ def _require(key: str, value: Any) -> None:
             range_of(key).require(key, value)
         case str():
             longest = MAX_NAME if key in NAMES_OF_FILES else MAX_LETTERS
-            if len(value) > longest:
-                raise ConfigurationError(
-                    f"{key} has {len(value)} characters, expected at most {longest}"
-                )
-            if wrong := NO_TEXT.search(value):
-                raise ConfigurationError(f"{key} has the character U+{ord(wrong[0]):04X}")
+            try:
+                check_words(value, longest)
+            except InputError as error:
+                raise ConfigurationError(f"{key} has {error}") from error
         case Mapping() | Sequence():
             if len(value) > MAX_ENTRIES:
                 raise ConfigurationError(

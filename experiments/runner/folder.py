@@ -6,6 +6,7 @@ is made last, after everything else is on disk.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,15 +27,18 @@ __all__ = [
     "RESULT",
     "FailedRunError",
     "clear",
+    "computed_record",
     "finished_record",
     "is_done",
     "last_record",
     "lock",
+    "make_way",
     "mark_done",
     "nothing_empty",
     "read_result",
     "require_writable",
     "result_time",
+    "unwritten",
     "write_failure",
 ]
 
@@ -100,6 +104,12 @@ def last_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
     return None
 
 
+def computed_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+    """A record of success without the marker: computed, but not all of it could be written."""
+    record = None if is_done(folder) else read_result(folder, config_hash)
+    return record if record is not None and record["status"] == "converged" else None
+
+
 def mark_done(folder: Path) -> None:
     """Say that everything of the job is on disk."""
     (folder / DONE).touch()
@@ -110,6 +120,13 @@ def clear(folder: Path) -> None:
     for name in (DONE, RESULT):
         (folder / name).unlink(missing_ok=True)
     remove_parts(folder)
+
+
+def make_way(request: Request) -> None:
+    """Take away what an earlier attempt left, but for what it computed, unless that is forced."""
+    if request.values["force"] or computed_record(request.folder, request.config_hash) is None:
+        clear(request.folder)
+    remove_parts(request.folder)
 
 
 def require_writable(folder: Path) -> None:
@@ -152,8 +169,15 @@ def nothing_empty(folder: Path, outputs: Path) -> Iterator[None]:
             pass
 
 
+def unwritten(folder: Path) -> str:
+    """What to say where the numbers of a job are on disk and something else could not be."""
+    return f"the estimate is in {folder / RESULT}, and the same command writes what is missing"
+
+
 def write_failure(request: Request, reason: str, started: float) -> dict[str, Any]:
     """Record that a job ended without anyone left to record it, and why.
+
+    What it had computed before it ended is not lost: that record stays, and the reason is said.
 
     Parameters
     ----------
@@ -165,13 +189,17 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
     Returns
     -------
     dict
-        The record, with the keys of a finished one.
+        The record that is there now, with the keys of a finished one.
 
     Raises
     ------
     InputError
         If it cannot be written.
     """
+    computed = computed_record(request.folder, request.config_hash)
+    if computed is not None:
+        print(f"warning: {reason}; {unwritten(request.folder)}", file=sys.stderr)
+        return computed
     record = stamp(
         request.values,
         request.config_hash,

@@ -21,10 +21,10 @@ from typing import Any
 
 import experiments
 from experiments.runner.folder import (
-    clear,
     finished_record,
     is_done,
     lock,
+    make_way,
     read_result,
     require_writable,
     result_time,
@@ -206,7 +206,7 @@ def run_apart(
             done = finished_record(request.folder, request.config_hash)
             if done is not None:
                 return done
-        clear(request.folder)
+        make_way(request)
         memory = values["memory_limit_gb"] or default_memory_gb(at_a_time)
         reason = worker.run(request, values["time_limit_s"], memory, aloud=aloud)
         if reason is None:

@@ -18,19 +18,22 @@ from experiments.runner.folder import (
     CONFIG,
     RESULT,
     FailedRunError,
-    clear,
+    computed_record,
     finished_record,
     lock,
+    make_way,
     mark_done,
     require_writable,
+    unwritten,
     write_failure,
 )
 from experiments.runner.guard import run_apart
 from experiments.runner.limits import MEMORY_LIMIT, default_memory_gb, held_memory
 from experiments.runner.request import Request
 from experiments.runner.tracking import require_no_password
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.provenance import write_json
+from mvest.reading.text import one_line
 
 __all__ = ["FailedRunError", "compute", "run_job"]
 
@@ -63,7 +66,7 @@ def run_job(request: Request) -> None:
     with lock(folder):
         done = None if values["force"] else finished_record(folder, request.config_hash)
         if done is None:
-            clear(folder)
+            make_way(request)
             _compute_here(request)
             return
     record = record_from(done, study.findings, str(folder / RESULT))
@@ -94,6 +97,9 @@ def _compute_here(request: Request) -> None:
 def compute(request: Request) -> None:
     """Run a job in its folder, which exists; its record and figures are then on disk.
 
+    The record comes first. Where something after it cannot be written, the next run of the job
+    writes that, and computes nothing again.
+
     Raises
     ------
     MvestError
@@ -105,16 +111,44 @@ def compute(request: Request) -> None:
     values, folder = request.values, request.folder
     study = load_study(values["study"])
     job = _job(study, request)
-    outcome = study.run(job)
-    if hash_of(values) != request.config_hash:
-        # Nobody can say of which content it is the result.
-        reason = "a file or folder that the settings name was changed before the job ended"
-        outcome = replace(outcome, status="failed", reason=reason)
-    record = stamp(values, request.config_hash, outcome, started)
+    record = _computed(study, request)
+    if record is None:
+        outcome = study.run(job)
+        if hash_of(values) != request.config_hash:
+            # Nobody can say of which content it is the result.
+            reason = "a file or folder that the settings name was changed before the job ended"
+            outcome = replace(outcome, status="failed", reason=reason)
+        record = stamp(values, request.config_hash, outcome, started)
+        write_json(folder / CONFIG, values)
+        write_record(folder / RESULT, record)
+    try:
+        _write_out(study, request, record)
+        study.finish(job, record)
+    except MemoryError:
+        raise
+    except Exception as error:
+        # Whatever a library for figures or texts raises: the numbers are not lost with it.
+        why = one_line(error) or type(error).__name__
+        raise InputError(f"{why}; {unwritten(folder)}") from error
+    _raise_failure(record.status, record.reason, record.detail, folder)
 
-    write_json(folder / CONFIG, values)
-    write_record(folder / RESULT, record)
-    if values["figures"]:
+
+def _computed(study: Study[Any, Any], request: Request) -> Record[Any] | None:
+    """What an earlier attempt computed, of which not everything could be written."""
+    folder = request.folder
+    data = computed_record(folder, request.config_hash)
+    if data is None:
+        return None
+    try:
+        return record_from(data, study.findings, str(folder / RESULT))
+    except InputError:
+        return None
+
+
+def _write_out(study: Study[Any, Any], request: Request, record: Record[Any]) -> None:
+    """All that follows from a record on disk, and the marker that says so."""
+    folder = request.folder
+    if request.values["figures"]:
         if study.write_run is not None:
             study.write_run(folder, record)
         else:
@@ -124,8 +158,6 @@ def compute(request: Request) -> None:
     _publish(study, request, record)
     if record.converged:
         mark_done(folder)
-    study.finish(job, record)
-    _raise_failure(record.status, record.reason, record.detail, folder)
 
 
 def require_checks(study: Study[Any, Any], values: Mapping[str, Any]) -> tuple[Check, ...]:

@@ -32,6 +32,8 @@ __all__ = [
 
 VERSION = 1
 """The version of the format that is read and written."""
+MAX_TEXT, MAX_NAME = 10_000, 200
+"""Characters of a text, and of what heads a page or names a file."""
 
 
 def _kind(value: Any) -> str:
@@ -47,9 +49,9 @@ def _kind(value: Any) -> str:
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_NUMBER, le=MAX_NUMBER)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_NUMBER)]
-Text = Annotated[str, Field(strict=True)]
-Name = Annotated[str, Field(strict=True, min_length=1)]
-Index = Annotated[int, Field(strict=True, ge=0)]
+Text = Annotated[str, Field(strict=True, max_length=MAX_TEXT)]
+Name = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_NAME)]
+Index = Annotated[int, Field(strict=True, ge=0, le=MAX_NUMBER)]
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Regions = Annotated[
     Annotated[list[Name], Field(min_length=1), Tag("<list>")]

@@ -104,7 +104,7 @@ def check_words(text: str, max_length: int = MAX_WORDS) -> str:
     wrong = _UNWRITABLE.search(text)
     if wrong is not None:
         code = f"U+{ord(wrong.group()):04X}"
-        raise InputError(f"character {code} at {wrong.start()} is no text; remove it")
+        raise InputError(f"the character {code} at {wrong.start()}, which is no text; remove it")
     return text
 
 

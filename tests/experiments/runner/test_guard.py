@@ -6,18 +6,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 import experiments.runner.worker as worker_module
-from experiments.common.record import SCHEMA
-from experiments.runner.folder import is_done, last_record, lock, mark_done
+from experiments.common.record import SCHEMA, Outcome, stamp
+from experiments.runner.folder import finished_record, is_done, last_record, lock, mark_done
 from experiments.runner.guard import WorkerProcess, run_apart
 from experiments.runner.job import FailedRunError
 from experiments.runner.request import Request
 from mvest.errors import ConfigurationError
-from mvest.provenance import THREAD_VARIABLES, write_json
+from mvest.provenance import THREAD_VARIABLES, canonical_json, write_json
 from tests.places import ROOT
 
 OBEDIENT = """
@@ -63,6 +64,11 @@ def request(folder: Path, **order) -> Request:
         "order": order,
     }
     return Request(values, "0" * 64, folder)
+
+
+def converged(asked: Request, config_hash: str = "0" * 64) -> dict:
+    record = stamp(asked.values, config_hash, Outcome(findings={"estimate": [1.0]}), 0.0)
+    return json.loads(canonical_json(asdict(record)))
 
 
 def said(folder: Path) -> dict:
@@ -122,12 +128,7 @@ def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypa
 
 def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
     asked = request(tmp_path, signal=9)
-    done = {
-        "schema": SCHEMA,
-        "status": "converged",
-        "reason": "",
-        "provenance": {"config_hash": "0" * 64},
-    }
+    done = converged(asked)
     write_json(tmp_path / "result.json", done)
     mark_done(tmp_path)
     assert run_apart(asked, worker) == done
@@ -137,20 +138,47 @@ def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
 
 
 def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
-    other = {"schema": SCHEMA, "status": "converged", "provenance": {"config_hash": "1" * 64}}
-    write_json(tmp_path / "result.json", other)
+    write_json(tmp_path / "result.json", converged(request(tmp_path), "1" * 64))
     mark_done(tmp_path)
     assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
 
 
 def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
-    record = {"schema": SCHEMA, "status": "converged", "provenance": {"config_hash": "0" * 64}}
+    record = converged(request(tmp_path))
     write_json(tmp_path / "result.json", record)
     assert last_record(tmp_path, "0" * 64) is None
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) == record
     write_json(tmp_path / "result.json", record | {"schema": SCHEMA - 1})
     assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
+
+
+@pytest.mark.parametrize("order", [{"signal": int(signal.SIGKILL)}, {"reason": "no space left"}])
+def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_path, order, capsys):
+    asked = request(tmp_path, **order)
+    record = converged(asked)
+    write_json(tmp_path / "result.json", record)
+    assert run_apart(asked, worker) == record
+    assert "the same command writes what is missing" in capsys.readouterr().err
+    assert last_record(tmp_path, "0" * 64) is None, "of which not everything is written"
+    asked.values["force"] = True
+    assert run_apart(asked, worker)["status"] == "failed"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("{}", "[]", "", "null", "NaN", "[" * 9999, '"\\ud800"', '{"schema": 2}'),
+        *('{"schema": 2, "status": "converged"}', '{"schema": 2, "provenance": 3}'),
+        '{"schema": ' + "9" * 5000 + "}",
+    ],
+)
+def test_a_damaged_result_is_none(worker, tmp_path, content):
+    (tmp_path / "result.json").write_text(content)
+    mark_done(tmp_path)
+    assert last_record(tmp_path, "0" * 64) is None
+    assert finished_record(tmp_path, "0" * 64) is None
+    assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
 
 
 def test_a_second_process_waits_for_the_folder(tmp_path):

@@ -14,6 +14,7 @@ from experiments.common.record import read_record
 from experiments.run import main
 from experiments.studies.twin.findings import Findings
 from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.files import PREFIX
 from tests.places import ROOT
@@ -296,6 +297,66 @@ def test_a_finished_run_is_told_again_and_not_repeated(run, tmp_path, instead_of
     assert again.splitlines()[:5] == first.splitlines()[:5]
     assert run(*usual, "force=true")[0] == 0
     assert len(calls) > once
+
+
+FAILURES = {
+    "figure": ("matplotlib.figure.Figure.savefig", ValueError("no glyph for U+D800")),
+    "table": ("pandas.DataFrame.to_csv", RuntimeError("quotes\nare open")),
+    "page": ("experiments.studies.twin.report.markdown_rows", KeyError("name")),
+    "words": ("experiments.studies.twin.study.text_table", "a\ud800".encode),
+    "results": ("experiments.runner.job._publish", InputError("records are damaged")),
+    "marker": ("experiments.runner.job.mark_done", OSError(28, "No space left on device")),
+}
+
+
+@pytest.mark.parametrize("step", FAILURES)
+def test_an_estimate_outlives_what_cannot_be_written_after_it(
+    run, tmp_path, instead_of_closing, monkeypatch, step
+) -> None:
+    place, error = FAILURES[step]
+    calls = []
+
+    def counted(m, rest) -> Prediction:
+        calls.append(m)
+        return shrinking(m, rest)
+
+    def fails(*_, **__):
+        raise error() if callable(error) else error
+
+    instead_of_closing(counted)
+    usual = ("experiment=debug", "tracking.enabled=false", "measure=false", "hydra.run.dir=here")
+    with monkeypatch.context() as patch:
+        patch.setattr(place, fails)
+        status, _, err = run(*usual)
+    assert status == 2
+    assert "the same command writes what is missing" in err.splitlines()[-1]
+    assert "Traceback" not in err
+    computed, count = (tmp_path / "here" / "result.json").read_bytes(), len(calls)
+    assert read_record(tmp_path / "here" / "result.json", Findings).findings.first.estimate
+    assert not (tmp_path / "here" / "done").exists()
+
+    status, out, err = run(*usual)
+    assert (status, len(calls)) == (0, count), err
+    assert "Written to here" in out
+    assert (tmp_path / "here" / "result.json").read_bytes() == computed
+    assert (tmp_path / "here" / "done").exists()
+    assert {"debug.csv", "debug.md", "iterates.png"} <= {
+        p.name for p in (tmp_path / "here").iterdir()
+    }
+
+
+def test_an_estimate_outlives_a_store_that_takes_no_tags(
+    run, tmp_path, instead_of_closing, monkeypatch
+) -> None:
+    def fails(*_, **__):
+        raise UnicodeEncodeError("utf-8", "a\ud800", 1, 2, "surrogates not allowed")
+
+    instead_of_closing(shrinking)
+    monkeypatch.setattr("mlflow.tracking.MlflowClient.create_run", fails)
+    status, _, err = run("experiment=debug", "measure=false", "hydra.run.dir=here")
+    assert status == 0
+    assert "warning: tracking store" in err
+    assert (tmp_path / "here" / "done").exists()
 
 
 def test_another_configurations_result_in_the_folder_is_not_taken(run, instead_of_closing) -> None:
