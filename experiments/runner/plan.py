@@ -189,7 +189,10 @@ class Plan:
             raise InputError(f"no sweep is planned in {folder}")
         try:
             data = read_mapping(place)
-            os.chdir(data["directory"])
+            directory = str(data["directory"])
+            if not os.access(directory, os.X_OK):
+                raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
+            os.chdir(directory)
             first = data["values"]
             jobs = tuple(
                 PlannedJob(

@@ -6,8 +6,8 @@ import numpy as np
 
 from experiments.common.record import read_record, write_record
 from experiments.runner.plan import Plan
-from mvest.cases.error_file import write_error_samples
 from mvest.cases.case import ErrorSamples
+from mvest.cases.error_file import write_error_samples
 from mvest.cases.folder import read_case
 from mvest.estimation.prediction import Prediction
 from mvest.external.contract import (
@@ -39,7 +39,7 @@ def case(folder: Path) -> Path:
     """A whole case: every reader of tables and arrays is behind it."""
     document = folders.plain_folder(folder)
     count = len(np.unique(folders.Template().valve(24, 8).surface.triangles))
-    samples = np.random.default_rng(0).normal(0, 0.1, (3, 2, count, 3))
+    samples = np.random.default_rng(0).normal(0, 0.1, (4, 2, count, 3))
     write_error_samples(
         folder / "errors.npz", ErrorSamples(samples, samples[:, :, :2]), ["open", "closed"]
     )

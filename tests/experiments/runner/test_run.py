@@ -337,7 +337,7 @@ def test_an_estimate_outlives_what_cannot_be_written_after_it(
 
     status, out, err = run(*usual)
     assert (status, len(calls)) == (0, count), err
-    assert "Written to here" in out
+    assert "Written to " in out
     assert (tmp_path / "here" / "result.json").read_bytes() == computed
     assert (tmp_path / "here" / "done").exists()
     assert {"debug.csv", "debug.md", "iterates.png"} <= {

@@ -1,0 +1,199 @@
+"""Arrays of others: declared sizes against the file's, and every damage one line."""
+
+import io
+import time
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.reading import bounded
+from mvest.reading.npz import check_array, read_npz
+
+
+def npy(descr="'<f8'", shape="(2,)", data=bytes(16), version=b"\x01\x00"):
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}"
+    header += " " * (-(len(header) + 11) % 64) + "\n"
+    return b"\x93NUMPY" + version + len(header).to_bytes(2, "little") + header.encode() + data
+
+
+def packed(path, content, method=zipfile.ZIP_STORED, names=("a.npy",)):
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name in names:
+            archive.writestr(name, content)
+    return path
+
+
+def test_arrays_are_those_that_were_written(tmp_path):
+    wanted = {
+        "real": np.arange(6.0).reshape(2, 3),
+        "columns": np.asfortranarray(np.arange(6).reshape(2, 3)),
+        "other": np.arange(3, dtype=">i4"),
+        "words": np.array(["ab", "é\U0001f600", ""]),
+        "flags": np.array(True),
+        "none": np.zeros((0, 5, 3)),
+    }
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", **wanted)
+        found = read_npz(tmp_path / "a.npz")
+        assert list(found) == list(wanted)
+        for name, array in wanted.items():
+            np.testing.assert_array_equal(found[name], array)
+            assert found[name].dtype == array.dtype.newbyteorder("=")
+    assert list(read_npz(tmp_path / "a.npz", ["words", "real"])) == ["words", "real"]
+    found["real"][0, 0] = 7.0
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (npy(shape="(10**12,)"), "malformed|shape"),
+        (npy(shape="(1000000000000,)"), "does not fit"),
+        (npy(shape="(1000000000000, 0)", data=b""), "does not fit"),
+        (npy(shape="(-1,)"), "shape"),
+        (npy(shape="(2, -1, -1)"), "shape"),
+        (npy(shape="(" + "1," * 40 + ")", data=bytes(8)), "shape"),
+        (npy("'|O'"), "plain arrays"),
+        (npy("[('a', '<f8')]"), "plain arrays"),
+        (npy("'<U2000000000'", "()", b""), "cannot be read"),
+        (npy("'<U0'", "(1000000000000,)", b""), "plain arrays"),
+        (npy("'<U2'", "(1,)", b"\xff" * 8), "no Unicode"),
+        (npy("'<U2'", "(1,)", b"\x00\xd8\x00\x00" * 2), "no Unicode"),
+        (npy("'<M8[s]'"), "plain arrays"),
+        (npy(data=bytes(15)), "does not fit"),
+        (npy(data=bytes(17)), "does not fit"),
+        (npy(descr="(" * 3000), "cannot be read"),
+        (npy(descr="'<f8"), "cannot be read"),
+        (npy(descr="'" + "x" * 5000 + "'"), "cannot be read"),
+        (npy(version=b"\x09\x00"), "cannot be read|version"),
+        (b"", "cannot be read"),
+        (b"\x93NUMPY", "cannot be read"),
+    ],
+)
+def test_what_no_array_can_be_is_one_line_that_names_it(tmp_path, content, words):
+    path = packed(tmp_path / "a.npz", content)
+    with pytest.raises(InputError, match=words) as caught:
+        read_npz(path)
+    said = str(caught.value)
+    assert said.startswith(str(path))
+    assert said.isprintable()
+    assert len(said) - len(str(path)) <= 250
+
+
+def encrypted(path):
+    content = bytearray(packed(path, npy()).read_bytes())
+    content[6] |= 1
+    at = content.index(b"PK\x01\x02")
+    content[at + 8] |= 1
+    path.write_bytes(content)
+
+
+def other_method(path):
+    packed(path, npy(), zipfile.ZIP_LZMA)
+
+
+def unknown_method(path):
+    content = bytearray(packed(path, npy()).read_bytes())
+    content[8] = content[content.index(b"PK\x01\x02") + 10] = 99
+    path.write_bytes(content)
+
+
+def twice(path):
+    with pytest.warns(UserWarning, match="Duplicate"):
+        packed(path, npy(), names=("a.npy", "a.npy"))
+
+
+def damaged_stream(path):
+    packed(path, npy(data=bytes(range(16))), zipfile.ZIP_DEFLATED)
+    content = bytearray(path.read_bytes())
+    content[60:70] = b"\xff" * 10
+    path.write_bytes(content)
+
+
+def wrong_checksum(path):
+    content = bytearray(packed(path, npy()).read_bytes())
+    content[content.index(b"PK\x01\x02") - 1] ^= 1
+    path.write_bytes(content)
+
+
+def cut_off(path):
+    path.write_bytes(packed(path, npy()).read_bytes()[:-30])
+
+
+def a_folder(path):
+    path.mkdir()
+
+
+def nothing(_path):
+    pass
+
+
+@pytest.mark.parametrize(
+    "make",
+    [encrypted, other_method, unknown_method, twice, damaged_stream, wrong_checksum, cut_off,
+     a_folder, nothing],
+)  # fmt: skip
+def test_a_damaged_archive_is_one_line(tmp_path, make):
+    path = tmp_path / "a.npz"
+    make(path)
+    with pytest.raises(InputError) as caught:
+        read_npz(path)
+    assert str(caught.value).startswith(str(path))
+    assert str(caught.value).isprintable()
+
+
+def test_a_small_file_makes_no_large_array(tmp_path, monkeypatch):
+    monkeypatch.setattr(bounded, "MAX_UNASKED", 10**6)
+    content = npy(shape="(4000000,)", data=bytes(32_000_000))
+    path = packed(tmp_path / "a.npz", content, zipfile.ZIP_DEFLATED)
+    assert path.stat().st_size < 40_000
+    start = time.process_time()
+    tracemalloc.start()
+    with pytest.raises(InputError, match="bytes of arrays, expected at most"):
+        read_npz(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10**6
+    assert time.process_time() - start < 1
+    # What is not asked for is not made either.
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("b.npy", npy())
+    assert read_npz(path, ["b"])["b"].tolist() == [0, 0]
+
+
+def test_arrays_that_are_missing_or_too_many_are_named(tmp_path):
+    path = packed(tmp_path / "a.npz", npy(), names=("a.npy", "b.npy"))
+    with pytest.raises(InputError, match="arrays c are missing"):
+        read_npz(path, ["a", "c"])
+    with pytest.raises(InputError, match="holds arrays b beside"):
+        read_npz(path, ["a"], exact=True)
+
+
+def test_a_stream_is_read_as_a_file(tmp_path):
+    content = packed(tmp_path / "a.npz", npy()).read_bytes()
+    assert read_npz(io.BytesIO(content), where="it")["a"].tolist() == [0, 0]
+    with pytest.raises(InputError, match=r"^it cannot be read"):
+        read_npz(io.BytesIO(content[:9]), where="it")
+
+
+@pytest.mark.parametrize(
+    ("array", "kind", "shape", "words"),
+    [
+        (np.zeros(3), "f", (2,), r"x is float64 of shape \(3,\), expected finite numbers"),
+        (np.zeros(3, int), "f", (3,), "int64"),
+        (np.array([1.0, np.nan]), "f", (2,), "x has values that are not finite"),
+        (np.array([2**63], np.uint64), "i", (1,), "64 bits"),
+        (np.array(["a"]), "i", (1,), "expected integers"),
+        (np.zeros((1, 2)), "f", (None,), r"\(any,\)"),
+    ],
+)
+def test_what_an_array_must_be(array, kind, shape, words):
+    with pytest.raises(InputError, match=words):
+        check_array(array, "x", kind, shape)
+
+
+def test_numbers_are_of_64_bits():
+    assert check_array(np.zeros((0, 2), ">f4"), "x", "f", (None, 2)).dtype == np.float64
+    assert check_array(np.array([3], np.uint8), "x", "i", (1,)).dtype == np.int64

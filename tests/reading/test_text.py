@@ -1,0 +1,192 @@
+"""Numbers, words, JSON, YAML and tables of others."""
+
+import json
+import math
+import os
+import time
+
+import pytest
+import yaml
+
+from mvest.errors import InputError
+from mvest.files import write_atomically
+from mvest.reading.json_file import parse_json, read_json, read_mapping
+from mvest.reading.table import read_columns, read_numbers
+from mvest.reading.text import check_words, number, one_line, read_bytes, read_text
+from mvest.reading.yaml_file import read_yaml
+
+ODD = (
+    "", " ", ".", "e5", "1e", "1_0", "0x10", "0b1", "1:30", "1:1:1:1", "nan", "inf", "-Infinity",
+    "1e309", "1e99999", "9" * 5000, "2e9", "-1e10", "٣", "１", "1,5", "1 2", "--1", "1j", "true",
+    "1\n2", "1\0",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ODD)
+def test_what_is_no_decimal_number_within_sense_is_refused(text):
+    with pytest.raises(InputError, match="expected a finite number") as caught:
+        number(text)
+    assert len(str(caught.value)) < 100
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "+5", "1.", ".5", "1e-3", "1E+5", " 12 ", "1e-320"])
+def test_decimal_numbers(text):
+    assert number(text) == float(text)
+    assert number(repr(math.pi * 1e200), math.inf) == math.pi * 1e200
+
+
+@pytest.mark.parametrize("text", ["a\ud800", "\x00", "\x1b[2J", "\x85", "\uffff", "a" * 20_001])
+def test_words_that_no_output_can_hold_are_refused(text):
+    with pytest.raises(InputError, match=r"U\+|characters"):
+        check_words(text)
+
+
+def test_words_and_lines():
+    text = "größer,\n\tzweite Zeile \u202e \U0001f600"
+    assert check_words(text) == text
+    assert one_line("a\n b\x1b[2J\ud800\u202e" + "c" * 500, 20).isprintable()
+    assert len(one_line("c" * 10**6)) == 300
+
+
+def test_files_are_read_within_bounds(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xef\xbb\xbf12")
+    assert read_text(path) == "12"
+    assert read_bytes(path, 5)
+    with pytest.raises(InputError, match="5 bytes, expected at most 4"):
+        read_bytes(path, 4)
+    path.write_bytes(b"\xff")
+    with pytest.raises(InputError, match="byte 0 is no UTF-8"):
+        read_text(path)
+    with pytest.raises(InputError, match="is missing"):
+        read_text(tmp_path / "none")
+    with pytest.raises(InputError, match="a folder"):
+        read_text(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="no regular file"):
+        read_text(tmp_path / "pipe")
+
+
+# --- JSON ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "not JSON"), ("{", "not JSON"), ("[" * 100_000, "not JSON"),
+        ("[" * 60 + "]" * 60, "deep"), ('{"a": ' * 60 + "1" + "}" * 60, "deep"),
+        ("NaN", "NaN"), ("[-Infinity]", "Infinity"), ("[1e999]", "finite"),
+        ("9" * 400, "64 bits"), ("18446744073709551616", "64 bits"), ("-" + "1" * 5000, "64 bits"),
+        ('{"a": 1, "a": 2}', "'a' occurs twice"), ('"\\ud800"', "surrogate"),
+        ('{"\\udfff": 1}', "surrogate"), ("0." + "1" * 10**5, "finite"),
+    ],
+)  # fmt: skip
+def test_json_that_is_refused(text, words):
+    start = time.process_time()
+    with pytest.raises(InputError, match=words) as caught:
+        parse_json(text, "it")
+    assert str(caught.value).startswith("it is not JSON: ")
+    assert len(str(caught.value)) < 200
+    assert time.process_time() - start < 1
+
+
+def test_json_that_is_read(tmp_path):
+    data = {"a": [1, 2.5e-300, None, True, "\U0001f600 \x1b"], "b": {}, "c": 2**64 - 1}
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    assert read_mapping(tmp_path / "a.json") == data
+    (tmp_path / "a.json").write_text("[]")
+    assert read_json(tmp_path / "a.json") == []
+    with pytest.raises(InputError, match="holds a list, expected a mapping"):
+        read_mapping(tmp_path / "a.json")
+
+
+# --- YAML ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["0xfff", "0x" + "f" * 5000, "1:1:1:1", "190:20:30.15", "017", "1_000", "1_0.5", ".inf",
+     "-.INF", ".nan", "9223372036854775808", "1" + "0" * 400, "1.0e+300", "2024-01-02",
+     '"a\\uD800"', '"\\0"', '"\\e[2J"', '"' + "a" * 20_001 + '"', "!!python/object:os.system a"],
+)  # fmt: skip
+def test_a_value_of_yaml_that_is_refused(tmp_path, value):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"name: a\nframes:\n- time: {value}\n")
+    with pytest.raises(InputError) as caught:
+        read_yaml(path)
+    said = str(caught.value)
+    assert said.startswith(str(path))
+    assert "frames.0.time" in said or "line 3" in said
+    assert said.isprintable()
+    assert len(said) - len(str(path)) <= 250
+
+
+def test_plain_values_of_yaml_are_as_another_reader_has_them(tmp_path):
+    text = (
+        "a: 1\nb: -2.5\nc: 1.0e-3\nd: 1e-3\ne: yes\nf: ~\ng: [0, [x, {y: 1}]]\nh: '0x10'\n"
+        "1: one\ni: |\n  two\n  lines\nj: ''\nk:\nl: \"1_0\"\nm: 0\nn: +.5\no: true\n"
+    )
+    (tmp_path / "a.yaml").write_text(text)
+    assert read_yaml(tmp_path / "a.yaml") == yaml.safe_load(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("a: 1\n---\nb: 2\n", "second document"), ("- 1\n", "holds a list"), ("", "holds a NoneType"),
+     ("a: [" + "0," * 60_000 + "0]\n", "more than 50000 values"), ("a: 1\na: 2\n", "occurs twice"),
+     ("1: a\n1: b\n", "occurs twice"), ("a: " + "[" * 30, "20 deep"), ("a: &x 1\n", "anchors")],
+)  # fmt: skip
+def test_a_document_that_is_refused(tmp_path, text, words):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_yaml(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize("piece", ["0,", "- 1\n", "a: 1\n", "[", "# x\n", "'", "  \n", "a", "? "])
+def test_long_documents_end_soon(tmp_path, piece):
+    # A list of 480 kB took 32 s.
+    (tmp_path / "a.yaml").write_text("a: [" * (piece == "0,") + piece * (480_000 // len(piece)))
+    start = time.process_time()
+    with pytest.raises(InputError):
+        read_yaml(tmp_path / "a.yaml")
+    assert time.process_time() - start < 5
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", [cell for cell in ODD if "\n" not in cell and "," not in cell])
+def test_a_cell_that_is_no_number_is_named(tmp_path, cell):
+    (tmp_path / "a.csv").write_text(f"x,y\n1,2\n3,{cell}\n")
+    with pytest.raises(InputError, match=r"a\.csv: y of row 1"):
+        read_numbers(tmp_path / "a.csv", ("x", "y"))
+
+
+def test_tables(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(' y , x \n\n 1,"2"\n3,4.5\n')
+    assert read_numbers(path, ("x", "y")).tolist() == [[2, 1], [4.5, 3]]
+    with pytest.raises(InputError, match="columns"):
+        read_columns(path, ("x", "y"), strict=True)
+    with pytest.raises(InputError, match="more than the 1 rows"):
+        read_columns(path, ("x", "y"), count=1)
+    path.write_text("x\na\x1bb\n")
+    with pytest.raises(InputError, match=r"x of row 0: the character U\+001B"):
+        read_columns(path, ["x"])
+
+
+def test_long_tables_end_soon(tmp_path):
+    (tmp_path / "a.csv").write_text("x\n" + "0\n" * 500_000)
+    start = time.process_time()
+    assert len(read_numbers(tmp_path / "a.csv", ["x"])) == 500_000
+    assert time.process_time() - start < 5
+
+
+# --- what is written ----------------------------------------------------------------------------
+
+
+def test_a_text_is_not_lost_for_one_character(tmp_path, capsys):
+    write_atomically(tmp_path / "a.md", "1.5 ± 0.1 MPa, a\ud800b")
+    assert (tmp_path / "a.md").read_text(encoding="utf-8") == "1.5 ± 0.1 MPa, a?b"
+    assert "U+D800 cannot be written" in capsys.readouterr().err
