@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 
 from mvest.errors import InputError
+from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.consistency import chi_square_band
 from mvest.estimation.noise import NoiseCovariance
@@ -124,6 +125,8 @@ class Estimate:
         How often the model was run, failed runs included.
     transformed_samples : (s, p), filter coordinates, or None
         Draws from the posterior, of a filter that makes them; intervals are then their quantiles.
+    learned : LearnedNoise or None
+        What was learned of the noise, if it was not given.
     """
 
     names: tuple[str, ...]
@@ -139,6 +142,7 @@ class Estimate:
     detail: str
     forward_solves: int
     transformed_samples: FloatArray | None = None
+    learned: LearnedNoise | None = None
 
     def __str__(self) -> str:
         return self.summary()

@@ -6,7 +6,7 @@ with a structure of its own (see `kronecker_noise`) is given factorised.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 import scipy
@@ -43,9 +43,23 @@ class ObservationNoise:
     whiten: Callable[[FloatArray], FloatArray]
 
 
-NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix | ObservationNoise"
+@runtime_checkable
+class UncertainNoise(Protocol):
+    """Noise that is not quite known: what is stated of it stands where nobody learns more."""
+
+    @property
+    def size(self) -> int:
+        """Number n of observations."""
+        ...
+
+    def stated(self) -> ObservationNoise:
+        """The noise as it is stated."""
+        ...
+
+
+NoiseCovariance: TypeAlias = "float | FloatArray | SparseMatrix | ObservationNoise | UncertainNoise"
 """R as one variance, n variances (n,), a sparse symmetric positive definite (n, n) matrix,
-or factorised already."""
+factorised already, or not quite known (see `mvest.estimation.noise_family`)."""
 
 
 def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
@@ -53,7 +67,7 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
 
     Parameters
     ----------
-    R : scalar, (n,), sparse (n, n) or ObservationNoise, in squared units of the observation
+    R : NoiseCovariance, in squared units of the observation
     size : int
         Number n of observations.
 
@@ -62,10 +76,10 @@ def observation_noise(R: NoiseCovariance, size: int) -> ObservationNoise:
     InputError
         If R is dense, has the wrong size, or is not symmetric positive definite.
     """
-    if isinstance(R, ObservationNoise):
+    if isinstance(R, ObservationNoise | UncertainNoise):
         if R.size != size:
             raise InputError(f"R is of {R.size} observations, expected {size}")
-        return R
+        return R if isinstance(R, ObservationNoise) else R.stated()
     if isinstance(R, scipy.sparse.sparray | scipy.sparse.spmatrix):
         return _sparse_noise(csc(R), size)
     variance = np.asarray(R, dtype=np.float64)

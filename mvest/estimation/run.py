@@ -7,6 +7,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, InnovationSummary, OnIterate, Reason
+from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance, observation_noise
 from mvest.estimation.prediction import (
@@ -128,13 +129,18 @@ class FilterRun:
         innovation: FloatArray,
         update: Update,
         samples: FloatArray | None = None,
+        learned: LearnedNoise | None = None,
     ) -> Estimate:
         """The estimate at the last recorded iterate, at which `prediction` was made.
 
-        ``samples (s, p)`` are draws from the posterior in filter coordinates, if there are any.
+        ``samples (s, p)`` are draws from the posterior in filter coordinates, if there are any;
+        what was ``learned`` of the noise widens the covariance.
         """
         summary = InnovationSummary.of(innovation, update)
-        return self._estimate(reason, detail, prediction, summary, samples)
+        if learned is not None:
+            self._covariances[-1] = self._covariances[-1] + learned.covariance
+        estimate = self._estimate(reason, detail, prediction, summary, samples)
+        return replace(estimate, learned=learned)
 
     def finish_with_slope(
         self,

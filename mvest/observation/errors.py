@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.noise import ObservationNoise, kronecker_noise
+from mvest.estimation.noise_family import matern
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
@@ -92,9 +93,7 @@ class WhiteNoise:
 class SpatialCorrelation:
     """Matérn correlation, of smoothness 3/2, between points of the leaflets at rest.
 
-    ``C(d) = (1 + sqrt(3) d / l) exp(-sqrt(3) d / l)`` with the straight distance d, which is
-    positive definite in space whatever the points (Rasmussen and Williams, Gaussian Processes for
-    Machine Learning, 2006, eq. 4.17); the fields are once differentiable. C(l) = 0.48.
+    `matern` of the straight distance; the fields are once differentiable. C(l) = 0.48.
 
     Attributes
     ----------
@@ -131,9 +130,7 @@ class SpatialCorrelation:
 
     def matrix(self) -> FloatArray:
         """C ``(n, n)``, with ones on the diagonal."""
-        d = cdist(self.points, self.points)
-        d *= np.sqrt(3.0) / self.length
-        C = (1.0 + d) * np.exp(-d)
+        C = matern(cdist(self.points, self.points), self.length)
         C *= 1.0 - NUGGET
         np.fill_diagonal(C, 1.0)
         return C

@@ -143,6 +143,14 @@ class ObservedSurface:
         scale = None if self.scale is None else self.scale[keep]
         return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
+    def apart(self, distance: float) -> FloatArray:
+        """The points ``(q, 3)`` with leaflets moved ``distance`` mm apart.
+
+        Errors of different leaflets are independent: so nothing is alike there.
+        """
+        extent = float(np.ptp(self.points, axis=0).max())
+        return self.points + (self.region * (extent + distance))[:, None]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedSurface:
@@ -258,7 +266,7 @@ class SurfaceObservation:
     @property
     def y(self) -> FloatArray:
         """Zeros: the seen points have no distance to the surface that was seen."""
-        return np.zeros(sum(self._size(seen) for seen in self.seen))
+        return np.zeros(sum(self.size_of(seen) for seen in self.seen))
 
     def of(
         self, model: ObservationModel, all_frames: Sequence[str] = FRAMES, /
@@ -340,7 +348,8 @@ class SurfaceObservation:
                 f"correlation length of {self.correlation_length_mm:g} mm say little that is new"
             )
 
-    def _size(self, seen: ObservedSurface) -> int:
+    def size_of(self, seen: ObservedSurface) -> int:
+        """How many numbers are observed in one of the frames."""
         return len(seen.points) + sum(2 * len(q) for q, _ in _curves(seen, self.surface))
 
     def _noise(self) -> NoiseCovariance:
@@ -349,16 +358,13 @@ class SurfaceObservation:
             q = len(seen.points)
             if q and self.correlation_length_mm:
                 length = self.correlation_length_mm
-                # Leaflets are independent: they are moved apart to where nothing is correlated.
-                extent = float(np.ptp(seen.points, axis=0).max())
-                apart = seen.region * (extent + 1000.0 * length)
-                points = seen.points + apart[:, None]
-                noise = SpatialCorrelation(points, length).noise(self.std_mm**2, 1)
+                apart = seen.apart(1000.0 * length)
+                noise = SpatialCorrelation(apart, length).noise(self.std_mm**2, 1)
             elif q:
                 noise = observation_noise(self.std_mm**2, q)
             if q:
                 parts.append(noise if seen.scale is None else scaled_noise(noise, seen.scale))
-            if rest := self._size(seen) - q:
+            if rest := self.size_of(seen) - q:
                 assert self.curve_std_mm is not None
                 parts.append(observation_noise(self.curve_std_mm**2, rest))
         return stacked_noise(parts)

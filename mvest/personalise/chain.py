@@ -13,17 +13,20 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.errors import GeometryError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
+from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import observation_noise
+from mvest.estimation.noise import ObservationNoise, observation_noise
+from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.update import kalman_update
 from mvest.estimation.wrappers import SharedStart, of_some
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.errors import SpatialCorrelation
+from mvest.observation.learned import error_family
 from mvest.observation.surfaces import (
     UNKNOWN,
     ObservedSurface,
@@ -159,7 +162,7 @@ def expect_case(
     Errors that samples of the frames tell of are left out: each sample would be a closure.
     """
     chain = _Chain(case, settings, store, on_step)
-    return expect(chain.problem(chain.filter), chain.plain_observation())
+    return expect(chain.problem(chain.filter), chain.observation())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,6 +210,7 @@ class _Chain:
         self.estimated = np.array([name not in considered for name in self.names])
         self.geometry: GeometryErrors | None = None
         self.errors: SampledErrors | None = None
+        self._family: NoiseFamily | None = None
 
     def sample_geometry(self, generic: FloatArray) -> None:
         """Find out what errors of the case's frames do to the observation.
@@ -223,27 +227,52 @@ class _Chain:
         if geometry.too_few:
             raise GeometryError(f"case {self.case.name}: {geometry.too_few}")
         observation = self.plain_observation()
-        base = observation_noise(observation.R, len(observation.y))
+        single = self.single_errors
+        base = observation_noise(observation.R if single is None else single, len(observation.y))
         self.errors = SampledErrors(base, errors_of(observation, self.closed, generic, geometry))
 
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""
-        plain = self.plain_observation()
+        plain, single = self.plain_observation(), self.single_errors
+        if single is not None:
+            if self.errors is not None:
+                columns = self.errors.samples / np.sqrt(self.errors.count)
+                single = single.plus(ErrorColumns("geometry", columns))
+            return WeighedObservation(plain, single)
         return plain if self.errors is None else WeighedObservation(plain, self.errors.noise)
 
-    def plain_observation(self, *, stated: bool = False) -> Observed:
+    @property
+    def single_errors(self) -> NoiseFamily | None:
+        """What is believed of the errors of single observations, where they are learned."""
+        if self.settings.errors is not None and self._family is None:
+            self._family = error_family(
+                self.plain_observation(),
+                self.settings.errors,
+                self.length(),
+                self.case.surface.vertices,
+            )
+        return self._family
+
+    def length(self, *, stated: bool = False) -> float:
+        """Over how many mm errors are alike: as the case states, always so if ``stated``.
+
+        Where samples tell how errors are alike, what is beside them is taken for independent. Were
+        it smooth too, the filter would trust the finest detail of a closed leaflet most, which no
+        mesh and no image have right: moduli of two simulated patients then came out two to four
+        times too high, and the fitted valve farther from the frame than the generic one.
+        """
+        sampled = self.case.error_samples is not None and not stated
+        return 0.0 if sampled else self.case.uncertainty.correlation_length_mm
+
+    def plain_observation(self, *, stated: bool = False) -> Observation | SurfaceObservation:
         """The closed frame, with the uncertainty of single observations.
 
-        That is what the case states, always so if ``stated``. But where samples tell how errors are
-        alike, what is beside them is taken for independent. Were it smooth too, the filter would
-        trust the finest detail of a closed leaflet most, which no mesh and no image have right:
-        moduli of two simulated patients then came out two to four times too high, and the fitted
-        valve farther from the frame than the generic one.
+        That is what the case states (see `length`); independent where it is to be learned.
         """
         uncertainty = self.case.uncertainty
         frame, std = self.closed, uncertainty.typical_mm
-        sampled = self.case.error_samples is not None and not stated
-        length = 0.0 if sampled else uncertainty.correlation_length_mm
+        learned = self.settings.errors is not None
+        length = 0.0 if learned else self.length(stated=stated)
         scale = uncertainty.std_mm / std if isinstance(uncertainty.std_mm, np.ndarray) else None
         kept = _thinned(len(frame.vertices))
         if self.corresponding:
@@ -259,7 +288,7 @@ class _Chain:
             frame.free_edge,
             scale=None if scale is None else scale[kept],
         )
-        if uncertainty.correlation_length_mm > 0:
+        if learned or uncertainty.correlation_length_mm > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
             border = BORDER * std * (1.0 if points.scale is None else points.scale)
             near = replace(points, annulus=frame.annulus).inner(border)
@@ -291,7 +320,7 @@ class _Chain:
     def _widened(self, result: StudyResult, observation: Observed) -> StudyResult:
         """The result with the covariance that the error samples give it, if there are any."""
         filtered = result.filtered
-        weighed = isinstance(observation, WeighedObservation)
+        weighed = self.errors is not None and isinstance(observation, WeighedObservation)
         if not weighed or filtered is None or filtered.prediction is None:
             return result
         covariances = np.array(filtered.transformed_iterate_covariances)
@@ -307,7 +336,19 @@ class _Chain:
         H = filtered.prediction.jacobian * filtered.transform.derivative(z)
         prior = to_filter(filtered.transform, filtered.prior)
         estimated = np.isin(filtered.names, np.array(self.names)[self.estimated])
-        return self.errors.posterior(H, prior.covariance, estimated)
+        learned = filtered.learned
+        if learned is None:
+            return self.errors.posterior(H, prior.covariance, estimated)
+        errors = replace(self.errors, base=self._single_noise(learned))
+        posterior = errors.posterior(H, prior.covariance, estimated)
+        covariance = np.array(posterior.covariance)
+        covariance[np.ix_(estimated, estimated)] += learned.covariance
+        return replace(posterior, covariance=covariance)
+
+    def _single_noise(self, learned: LearnedNoise) -> ObservationNoise:
+        """Noise of single observations as it was learned, without what was added to it."""
+        assert self._family is not None
+        return self._family.at(learned.posterior.mean[: len(self._family.names)])
 
     def image_share(self, result: StudyResult) -> FloatArray | None:
         """Share of the variance of each modulus' logarithm that errors of the image account for."""
@@ -430,7 +471,14 @@ class _Chain:
         prior = to_filter(self.transform, self.prior)
         z = filtered.transformed_iterates[-1]
         H = filtered.prediction.jacobian * self.transform.derivative(z)
-        plain = observation_noise(self.plain_observation(stated=True).R, len(H))
+        errors, learned = self.errors, filtered.learned
+        doubt = np.zeros_like(prior.covariance)
+        if learned is None:
+            plain = observation_noise(self.plain_observation(stated=True).R, len(H))
+        else:
+            plain = self._single_noise(learned)
+            errors = errors and replace(errors, base=plain)
+            doubt[np.ix_(self.estimated, self.estimated)] = learned.covariance
         groups = {
             "pressure known": ("pressure_scale",),
             "rest lengths known": ("chord_rest_length",),
@@ -441,12 +489,12 @@ class _Chain:
 
         def linear(P: FloatArray, scale: float = 1.0) -> FloatArray:
             update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
-            return update.posterior.std[moduli]
+            return np.sqrt(np.diag(update.posterior.covariance + doubt / scale**2))[moduli]
 
         def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
-            if self.errors is None:
+            if errors is None:
                 return linear(P, scale)
-            covariance = self.errors.posterior(H * scale, P).covariance
+            covariance = errors.posterior(H * scale, P).covariance + doubt / scale**2
             return np.sqrt(np.diag(covariance))[moduli]
 
         stds = {"now": std(prior.covariance)}

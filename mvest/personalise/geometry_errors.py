@@ -20,7 +20,7 @@ from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.displaced import displaced_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import MvestError
-from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
@@ -172,11 +172,11 @@ class WeighedObservation:
     Attributes
     ----------
     plain : Observed
-    R : ObservationNoise
+    R : NoiseCovariance
     """
 
     plain: Observed
-    R: ObservationNoise
+    R: NoiseCovariance
 
     @property
     def frames(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from mvest.errors import InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
+from mvest.observation.learned import ErrorBeliefs
 from mvest.problem.registration import REGISTRATION
 
 __all__ = ["CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
@@ -138,6 +139,9 @@ class PersonaliseSettings:
         Whether the fitted valve is closed anew from the open one.
     correspondence : bool
         Whether corresponding vertices are used as such; otherwise only where the surface is.
+    errors : ErrorBeliefs or None
+        How well the errors are known that the case states: they are learned with the unknowns;
+        None takes them as they are stated.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -150,6 +154,7 @@ class PersonaliseSettings:
     moduli_only: bool = False
     confirm: bool = False
     correspondence: bool = True
+    errors: ErrorBeliefs | None = None
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none

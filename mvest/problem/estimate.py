@@ -171,12 +171,11 @@ def estimate(
     Numerical failure is a result with its reason; only inadmissible input raises.
     """
     started = time.perf_counter()
-    R = observation.R
     filtered = problem.filter(
         observation.of(problem.model),
         problem.prior,
         observation.y,
-        R,
+        observation.R,
         names=problem.parameters,
         transform=problem.transform,
         on_iterate=on_iterate,
@@ -188,7 +187,7 @@ def estimate(
         # What is estimated near zero has its prior for a size.
         bound = identifiability(
             filtered.prediction.jacobian,
-            R,
+            observation.R if filtered.learned is None else filtered.learned.noise,
             np.maximum(np.abs(filtered.mean), problem.prior.std),
             names=problem.parameters,
         )

@@ -15,6 +15,7 @@ from mvest.estimation.noise import (
     low_rank_noise,
     observation_noise,
 )
+from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.prediction import ObservationModel, Prediction, predict, read_only
 from mvest.estimation.run import require_settings
 from mvest.estimation.transform import Identity, Transform, to_filter
@@ -93,13 +94,14 @@ class SchmidtFilter:
             names,
             among,
         )
-        base = observation_noise(R, np.size(y))
+        size = np.size(y)
+        base = R if isinstance(R, NoiseFamily) else observation_noise(R, size)
         estimated = problem.estimated
         start = problem(estimated.mean)
         if not start.converged:
             return problem.failed(start)
         filter_, solves = self.inner, 1
-        noise = low_rank_noise(base, problem.columns)
+        noise = _with_columns(base, problem.columns)
         last: Estimate | None = None
         for _ in range(self.max_rounds):
             result = filter_(
@@ -116,13 +118,23 @@ class SchmidtFilter:
                 break
             last = result
             problem(result.mean)
-            noise = low_rank_noise(base, problem.columns)
+            noise = _with_columns(base, problem.columns)
             filter_ = replace(self.inner, start=tuple(map(float, result.mean)))
-        return problem.whole(result, noise, solves)
+        final = noise if result.learned is None else result.learned.noise
+        return problem.whole(result, observation_noise(final, size), solves)
 
     def _settled(self, last: Estimate, new: Estimate) -> bool:
         change = np.abs(new.transformed_iterates[-1] - last.transformed_iterates[-1])
         return bool(np.all(change <= self.tolerance * new.transformed.std))
+
+
+def _with_columns(
+    base: ObservationNoise | NoiseFamily, columns: FloatArray
+) -> ObservationNoise | NoiseFamily:
+    """The noise with what the considered parameters add to it."""
+    if isinstance(base, NoiseFamily):
+        return base.plus(ErrorColumns("considered", columns))
+    return low_rank_noise(base, columns)
 
 
 class _Problem:
@@ -205,7 +217,10 @@ class _Problem:
         prediction = None
         if part.prediction is not None and self(part.mean).converged and self._last is not None:
             prediction = self._last[1]
-            covariances[-1] = self._with_cross(covariances[-1], iterates[-1], prediction, noise)
+            learned = 0.0 if part.learned is None else part.learned.covariance
+            covariances[-1] = self._with_cross(
+                covariances[-1], learned, iterates[-1], prediction, noise
+            )
         return replace(
             part,
             names=self.names,
@@ -218,14 +233,22 @@ class _Problem:
         )
 
     def _with_cross(
-        self, P: FloatArray, z: FloatArray, prediction: Prediction, noise: ObservationNoise
+        self,
+        P: FloatArray,
+        learned: float | FloatArray,
+        z: FloatArray,
+        prediction: Prediction,
+        noise: ObservationNoise,
     ) -> FloatArray:
-        """The covariance (p, p) with P_mc = −K C P_c."""
+        """The covariance (p, p) with P_mc = −K C P_c.
+
+        ``learned`` is the part of that of m that is due to the doubt of the noise.
+        """
         D = self.transform.derivative(z)
         WH = noise.whiten(prediction.jacobian * D)
         H, C = WH[:, self.kept], WH[:, self.considered]
         P = P.copy()
-        P_mm = P[np.ix_(self.kept, self.kept)]
+        P_mm = P[np.ix_(self.kept, self.kept)] - learned
         P_cc = P[np.ix_(self.considered, self.considered)]
         cross = -P_mm @ (H.T @ C) @ P_cc
         P[np.ix_(self.kept, self.considered)] = cross

@@ -1,14 +1,16 @@
 """The iterated extended Kalman filter: Gauss-Newton on one maximum-a-posteriori problem."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.evidence import NoiseLearner
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.noise_family import NoiseFamily
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.run import FilterRun, require_settings
 from mvest.estimation.transform import Transform
@@ -64,6 +66,11 @@ class IteratedFilter:
     way. The covariance is P* at the last iterate: the posterior's to the order of Gauss-Newton,
     that is without the second derivatives of h.
 
+    Where R is a `NoiseFamily`, it is learned anew at each iterate from the model linearised there,
+    which costs no further run, so that estimate and noise are the most probable ones for each
+    other. Its doubt widens the covariance (see `mvest.estimation.evidence`). After
+    ``max_learned`` iterates the noise is kept, so that the filter can come to an end.
+
     The run ends where the model has been run: the reported prediction belongs to the estimate, and
     the iterate is not changed any more once the next full step is below the tolerance.
 
@@ -81,6 +88,8 @@ class IteratedFilter:
         Largest number of rejected steps in a row.
     start : (p,) parameters or None
         First iterate; None starts at the prior's mean.
+    max_learned : int
+        Iterates at which a noise that is not quite known is learned.
 
     Raises
     ------
@@ -93,6 +102,7 @@ class IteratedFilter:
     max_iterations: int = 20
     max_rejections: int = 8
     start: tuple[float, ...] | None = None
+    max_learned: int = 12
 
     def __post_init__(self) -> None:
         require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
@@ -125,9 +135,13 @@ class IteratedFilter:
         if isinstance(point, Prediction):
             return run.fail(run.prior.mean + L @ x, run.prior.covariance, point)
 
+        learner = NoiseLearner(R) if isinstance(R, NoiseFamily) else None
         damping, iterations = 0.0, 0
         while True:
             innovation = run.y - point.prediction.y + point.H @ point.x
+            if learner is not None and iterations < self.max_learned:
+                run.noise = learner.learn(innovation, point.H)
+                point = replace(point, objective=_objective(run, point.x, point.prediction))
             update = kalman_update(unit, innovation, point.H, run.noise)
             P = L @ update.posterior.covariance @ L.T
             run.record(point.z, P, point.objective, update.log_likelihood)
@@ -154,7 +168,10 @@ class IteratedFilter:
                 else:
                     reason = Reason.NO_DECREASE
             if reason is not None:
-                return run.finish(reason, detail, point.prediction, innovation, update)
+                learned = None if learner is None else learner.learned(L)
+                return run.finish(
+                    reason, detail, point.prediction, innovation, update, learned=learned
+                )
 
     def _first(self, run: FilterRun, L: FloatArray) -> FloatArray:
         """Coordinates x of the first iterate."""
@@ -233,5 +250,10 @@ def _evaluate(run: FilterRun, L: FloatArray, x: FloatArray) -> _Point | Predicti
     prediction = run.predict(z)
     if not prediction.converged:
         return prediction
-    objective = run.misfit(prediction) + 0.5 * float(x @ x)
-    return _Point(x, z, prediction, run.jacobian(z, prediction) @ L, objective)
+    H = run.jacobian(z, prediction) @ L
+    return _Point(x, z, prediction, H, _objective(run, x, prediction))
+
+
+def _objective(run: FilterRun, x: FloatArray, prediction: Prediction) -> float:
+    """J with the noise as it is now."""
+    return run.misfit(prediction) + 0.5 * float(x @ x)

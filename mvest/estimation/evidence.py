@@ -1,0 +1,465 @@
+"""Learning the noise together with the parameters, from one linearisation of a model.
+
+With the innovation e = y − h(z) + H (z − m) of the prior N(m, P), linearised at z, and the noise
+R(θ) of quantities θ (see ``noise_family``)::
+
+    log p(e | θ) = log N(e; 0, S),   S = R(θ) + H P Hᵀ + C Cᵀ
+
+is the evidence of θ (MacKay 1992, Neural Comput. 4:415), maximised together with the prior of
+log θ. Everything is projected once on the basis of the smooth part and on what is across it, of
+which the triangular factor is kept: of n observations there remain a few hundred rows that are
+independent whatever θ is, so that an evaluation with derivatives costs p² times these.
+
+What is not known of θ widens the covariance of z (Kass and Steffey 1989, J. Am. Stat. Assoc.
+84:717), with the covariance of log θ from the second derivatives (Laplace) and the mean over it::
+
+    P⁺ = E P⁺(θ) + (dz/dθ) cov(θ) (dz/dθ)ᵀ
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from scipy.spatial.distance import cdist
+
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.noise_family import (
+    BANDS,
+    Basis,
+    LogNormal,
+    NoiseFamily,
+    VarianceRows,
+    matern,
+    spread_points,
+)
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["Evidence", "LearnedNoise", "LearnedQuantity", "NoiseLearner", "learn_noise"]
+
+TOLERANCE = 1e-3
+"""Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
+
+DIFFERENCE = 1e-4
+"""Step in differences of exact derivatives, in standard deviations of the prior."""
+
+SHELLS, CENTRES = 60, 60
+"""Distances at which the correlation of the smooth part is known, and points about which."""
+
+RANGE = 1.5
+"""Of these distances, in lengths of the reference correlation."""
+
+SMOOTH, LENGTH = "smooth part", "length of the smooth part"
+"""What the bands amount to."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedQuantity:
+    """One quantity of the noise, as it was believed and as it was learned."""
+
+    name: str
+    believed: LogNormal
+    learned: LogNormal
+
+    @property
+    def stretch(self) -> float:
+        """By how many standard deviations of what was believed it was moved; 0 if it is held."""
+        if self.believed.factor == 1.0:
+            return 0.0
+        return float(np.log(self.learned.median / self.believed.median) / self.believed.log_std)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedNoise:
+    """What was learned of the noise.
+
+    Attributes
+    ----------
+    names : tuple of str, (h,)
+    prior, posterior : Gaussian
+        Of the logarithms of the family's quantities.
+    quantities : tuple of LearnedQuantity
+        In a reader's terms: standard deviation and length of the smooth part (the length at which
+        its correlation is that of a Matérn one at its own), and all others.
+    noise : ObservationNoise
+        At the mean, added columns included.
+    log_likelihood : float
+        log p(e | θ) there.
+    log_evidence : float
+        log p(e): over all θ, to the order of Laplace.
+    covariance : (p, p) in filter coordinates
+        What the doubt of θ adds to the covariance of the estimate.
+    """
+
+    names: tuple[str, ...]
+    prior: Gaussian
+    posterior: Gaussian
+    quantities: tuple[LearnedQuantity, ...]
+    noise: ObservationNoise
+    log_likelihood: float
+    log_evidence: float
+    covariance: FloatArray
+
+    def __str__(self) -> str:
+        return "\n".join(
+            f"{q.name}: {q.learned.median:.3g} [{q.learned.interval()[0]:.3g}, "
+            f"{q.learned.interval()[1]:.3g}], believed {q.believed.median:.3g} "
+            f"[{q.believed.interval()[0]:.3g}, {q.believed.interval()[1]:.3g}]"
+            for q in self.quantities
+        )
+
+
+class NoiseLearner:
+    """Learns the noise of one estimation, again and again as its linearisation improves.
+
+    Parameters
+    ----------
+    family : NoiseFamily
+    """
+
+    def __init__(self, family: NoiseFamily) -> None:
+        self.family = family
+        self._evidence: Evidence | None = None
+        self._posterior: _Posterior | None = None
+
+    def learn(self, innovation: FloatArray, B: FloatArray) -> ObservationNoise:
+        """The noise at the mean of what is known of it; see `learn_noise`."""
+        self._evidence = Evidence.of(self.family, innovation, B)
+        start = None if self._posterior is None else self._posterior.mode
+        self._posterior = self._evidence.posterior(start)
+        return self.family.at(self._evidence.log(self._posterior.mean))
+
+    def learned(self, L: FloatArray) -> LearnedNoise:
+        """What is known of the noise, from the innovation that was given last.
+
+        Parameters
+        ----------
+        L : (p, p)
+            Root of the prior's covariance in filter coordinates.
+        """
+        assert self._evidence is not None
+        assert self._posterior is not None
+        return self._evidence.learned(self._posterior, L)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Posterior:
+    """Of coordinates u: the mode, the mean, a root of the covariance, and log det of that."""
+
+    mode: FloatArray
+    mean: FloatArray
+    spread: FloatArray
+    log_determinant: float
+
+
+def learn_noise(
+    family: NoiseFamily, innovation: FloatArray, B: FloatArray, L: FloatArray | None = None
+) -> LearnedNoise:
+    """The most probable noise of a linear model, and what is known of it.
+
+    Parameters
+    ----------
+    family : NoiseFamily
+    innovation : (n,)
+        e.
+    B : (n, p)
+        H L, with the prior's covariance P = L Lᵀ.
+    L : (p, p), optional
+        Default the unit matrix.
+    """
+    learner = NoiseLearner(family)
+    learner.learn(innovation, B)
+    return learner.learned(np.eye(B.shape[1]) if L is None else L)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """log p(e | θ) as a function, after everything is projected.
+
+    Coordinates u are those in which the prior of log θ is N(0, I): log θ = mean + L u.
+
+    Attributes
+    ----------
+    family : NoiseFamily
+    prior : Gaussian
+    root : (h, h)
+        L.
+    variances : VarianceRows
+    rows : (r, 1 + p + q)
+        Innovation, columns of the parameters, and added columns.
+    kind : (r,)
+        Which of the variances is that of a row.
+    count : (v,)
+        Observations of each variance, for the determinant.
+    added : tuple of (int, slice)
+        Which quantity is the factor of which columns.
+    log_scale : float
+        log det D².
+    """
+
+    family: NoiseFamily
+    prior: Gaussian
+    root: FloatArray
+    variances: VarianceRows
+    rows: FloatArray
+    kind: IntArray
+    count: FloatArray
+    added: tuple[tuple[int, slice], ...]
+    log_scale: float
+
+    @classmethod
+    def of(cls, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> Evidence:
+        """Project an innovation ``(n,)`` and B ``(n, p)``, see `learn_noise`."""
+        added, start = [], B.shape[1]
+        for k, columns in enumerate(family.columns, len(family.names) - len(family.columns)):
+            added.append((k, slice(start, start + columns.columns.shape[1])))
+            start += columns.columns.shape[1]
+        data = np.concatenate(
+            [innovation[:, None], B, *(columns.columns for columns in family.columns)], axis=1
+        )
+        width = data.shape[1]
+        variances = family.rows
+        rows, kind = [], []
+        count = np.zeros(sum(variances.sizes))
+        log_scale, at, first = 0.0, 0, 0
+        for block, size in zip(family.blocks, variances.sizes, strict=True):
+            k, copies, m = len(block.scale), block.coordinates, size - 1
+            part = data[at : at + block.size].reshape(k, -1) / block.scale[:, None]
+            at += block.size
+            log_scale += 2.0 * copies * float(np.sum(np.log(block.scale)))
+            if block.basis is not None:
+                inside = block.basis.U.T @ part
+                part = part - block.basis.U @ inside
+                rows.append(inside.reshape(-1, width))
+                kind.append(np.repeat(np.arange(first, first + m), copies))
+                count[first : first + m] = copies
+            if k > m:
+                triangle = np.asarray(np.linalg.qr(part.reshape(-1, width), mode="r"))
+                rows.append(triangle)
+                kind.append(np.full(len(triangle), first + m))
+                count[first + m] = (k - m) * copies
+            first += size
+        prior = family.prior
+        return cls(
+            family,
+            prior,
+            prior.factor,
+            variances,
+            np.concatenate(rows),
+            np.concatenate(kind),
+            count,
+            tuple(added),
+            log_scale,
+        )
+
+    def log(self, u: FloatArray) -> FloatArray:
+        """Logarithms of θ ``(h,)``."""
+        return np.asarray(self.prior.mean + self.root @ u)
+
+    def posterior(self, start: FloatArray | None = None) -> _Posterior:
+        """What is known of u, near normal about its mean.
+
+        Of a variance that few observations tell the most probable value is too small. The mean is
+        to first order ``u − ½ H⁻¹ d(log det H)/du`` with the second derivatives H (Tierney and
+        Kadane 1986, J. Am. Stat. Assoc. 81:82); with the columns s of a root of H⁻¹ and the slope g
+        of the objective that is ``u − ½ H⁻¹ Σ (g(u + s) − 2 g(u) + g(u − s))``.
+        """
+        h = self.prior.size
+        u = np.zeros(h) if start is None else start
+        if not self.root.any():
+            return _Posterior(u, u, np.zeros((h, h)), 0.0)
+        u = np.asarray(
+            scipy.optimize.minimize(
+                self.objective, u, jac=True, method="BFGS", options={"gtol": TOLERANCE}
+            ).x
+        )
+        hessian = np.empty((h, h))
+        for k in range(h):
+            step = DIFFERENCE * np.eye(h)[k]
+            hessian[k] = self.objective(u + step)[1] - self.objective(u - step)[1]
+        values, V = np.linalg.eigh((hessian + hessian.T) / (4.0 * DIFFERENCE))
+        # Data do not make less known what was known before.
+        values = np.maximum(values, 1.0)
+        spread = V / np.sqrt(values)
+        slope = self.objective(u)[1]
+        bend = sum(
+            self.objective(u + s)[1] - 2.0 * slope + self.objective(u - s)[1] for s in spread.T
+        )
+        moved = -0.5 * spread.T @ bend
+        moved /= max(1.0, float(np.linalg.norm(moved)))
+        return _Posterior(u, u + spread @ moved, spread, -float(np.sum(np.log(values))))
+
+    def objective(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """−log p(e | θ) − log p(θ) but for a constant, and its derivatives by u."""
+        value, slope = self.misfit(self.log(u))
+        return value + 0.5 * float(u @ u), self.root.T @ slope + u
+
+    def log_likelihood(self, log: FloatArray) -> float:
+        """Logarithm of p(e | θ) at the logarithms ``(h,)`` of θ."""
+        return -self.misfit(log)[0] - 0.5 * self.family.size * float(np.log(2.0 * np.pi))
+
+    def misfit(self, log: FloatArray) -> tuple[float, FloatArray]:
+        """−log p(e | θ) without its constant, and its derivatives by log θ.
+
+        With V the diagonal R, B all columns and M = I + Bᵀ V⁻¹ B::
+
+            log det S = log det V + log det M,   S⁻¹ = V⁻¹ − V⁻¹ B M⁻¹ Bᵀ V⁻¹
+            d/dθ (½ log det S + ½ eᵀ S⁻¹ e) = ½ tr(S⁻¹ dS/dθ) − ½ eᵀ S⁻¹ dS/dθ S⁻¹ e
+        """
+        v, smooth, rough = self.variances.variances(log)
+        e, B, root, mean = self._solved(log, v)
+        residual = e - B @ mean
+        half = _forward(root, B.T)
+        log_det = float(self.count @ np.log(v)) + self.log_scale
+        log_det += 2.0 * float(np.sum(np.log(np.diagonal(root))))
+        # Derivative by the logarithm of the standard deviation of each variance.
+        by_row = np.sum(half**2, axis=0) + residual**2
+        by_std = self.count - np.bincount(self.kind, by_row, len(v))
+        slope = np.zeros(len(log) + 1)
+        np.add.at(slope, self.variances.rough, by_std * rough)
+        # Without a frame's factor it is what is added to the end.
+        np.add.at(slope, self.variances.frame, by_std)
+        if self.family.bands is not None:
+            np.add.at(slope, self.variances.band, by_std * smooth)
+        for k, members in self.added:
+            # For unit variances Bᵀ S⁻¹ B = I − M⁻¹, and Bᵀ S⁻¹ e is the mean.
+            inverse = _forward(root, np.eye(len(mean))[:, members])
+            q = inverse.shape[1]
+            slope[k] = q - float(np.sum(inverse**2)) - float(mean[members] @ mean[members])
+        return 0.5 * (log_det + float(e @ residual)), slope[:-1]
+
+    def update(self, log: FloatArray, p: int) -> tuple[FloatArray, FloatArray]:
+        """Posterior mean ``(p,)`` and covariance of the first p unit quantities, for log θ."""
+        _, _, root, mean = self._solved(log, self.variances.variances(log)[0])
+        inverse = _forward(root, np.eye(len(mean))[:, :p])
+        return mean[:p], inverse.T @ inverse
+
+    def _solved(
+        self, log: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Weighed innovation and columns, the root of M, and M⁻¹ Bᵀ V⁻¹ e."""
+        weighed = self.rows / np.sqrt(v)[self.kind][:, None]
+        e, B = weighed[:, 0], weighed[:, 1:]
+        for k, members in self.added:
+            B[:, members] *= np.exp(log[k])
+        M = B.T @ B
+        M[np.diag_indices_from(M)] += 1.0
+        root = scipy.linalg.cholesky(M, lower=True, check_finite=False)
+        return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
+
+    def learned(self, posterior: _Posterior, L: FloatArray) -> LearnedNoise:
+        """What is known of the noise, in a reader's terms; L as in `learn_noise`."""
+        u, h, p = posterior.mean, self.prior.size, len(L)
+        P = self.update(self.log(u), p)[1]
+        more = np.zeros((p, p))
+        # Points of a cubature rule of third degree: those of h normal numbers are √h away.
+        for direction in np.sqrt(h) * posterior.spread.T:
+            up, P_up = self.update(self.log(u + direction), p)
+            down, P_down = self.update(self.log(u - direction), p)
+            more += np.outer(up - down, up - down) / (4.0 * h) + (P_up + P_down - 2.0 * P) / (2 * h)
+        spread = self.root @ posterior.spread
+        found = Gaussian(self.log(u), spread @ spread.T)
+        constant = 0.5 * self.family.size * float(np.log(2.0 * np.pi))
+        return LearnedNoise(
+            self.family.names,
+            self.prior,
+            found,
+            _in_words(self.family, self.prior, found),
+            self.family.at(found.mean),
+            self.log_likelihood(found.mean),
+            0.5 * posterior.log_determinant - self.objective(posterior.mode)[0] - constant,
+            L @ more @ L.T,
+        )
+
+
+def _forward(root: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray(scipy.linalg.solve_triangular(root, columns, lower=True, check_finite=False))
+
+
+def _in_words(
+    family: NoiseFamily, prior: Gaussian, posterior: Gaussian
+) -> tuple[LearnedQuantity, ...]:
+    """What the quantities of a family amount to."""
+    quantities = []
+    first = 0
+    basis = next((block.basis for block in family.blocks if block.basis is not None), None)
+    if basis is not None:
+        first = BANDS
+        correlation = _Correlation.of(basis)
+        for name, amount in ((SMOOTH, correlation.log_std), (LENGTH, correlation.log_length)):
+            believed, learned = (
+                _log_normal(amount, Gaussian(of.mean[:BANDS], of.covariance[:BANDS, :BANDS]))
+                for of in (prior, posterior)
+            )
+            quantities.append(LearnedQuantity(name, believed, learned))
+    for k, name in enumerate(family.names[first:], first):
+        believed, learned = (
+            LogNormal(float(np.exp(of.mean[k])), float(np.exp(of.std[k])))
+            for of in (prior, posterior)
+        )
+        quantities.append(LearnedQuantity(name, believed, learned))
+    return tuple(quantities)
+
+
+def _log_normal(amount: Callable[[FloatArray], float], of: Gaussian) -> LogNormal:
+    """The logarithm of an amount, to first order."""
+    step = 1e-3
+    slope = np.array(
+        [
+            (amount(of.mean + step * e) - amount(of.mean - step * e)) / (2.0 * step)
+            for e in np.eye(of.size)
+        ]
+    )
+    variance = max(0.0, float(slope @ of.covariance @ slope))
+    return LogNormal(float(np.exp(amount(of.mean))), float(np.exp(np.sqrt(variance))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Correlation:
+    """Covariance of the smooth part at the shells' distances ``(BANDS, SHELLS)`` per unit s_b²."""
+
+    distance: FloatArray
+    by_band: FloatArray
+
+    @classmethod
+    def of(cls, basis: Basis) -> _Correlation:
+        centres = spread_points(basis.points, min(len(basis.points), CENTRES))
+        apart = cdist(basis.points[centres], basis.points)
+        near = apart < RANGE * basis.length
+        apart = apart[near]
+        edges = np.linspace(0.0, float(apart.max()), SHELLS + 1)[1:-1]
+        shell = np.digitize(apart, edges)
+        count = np.bincount(shell, minlength=SHELLS)
+        filled = count > 0
+        k = len(basis.U)
+
+        def mean(values: FloatArray) -> FloatArray:
+            return np.bincount(shell, values, SHELLS)[filled] / count[filled]
+
+        own = np.sum(basis.U**2, axis=0) / k
+        table = np.zeros((BANDS, 1 + np.count_nonzero(filled)))
+        for band in np.unique(basis.band):
+            members = basis.band == band
+            U, w = basis.U[:, members], basis.w[members]
+            covariance = (U[centres] * w) @ U.T
+            table[band, 1:] = mean(covariance[near])
+            table[band, 0] = float(own[members] @ w)
+        return cls(np.append(0.0, mean(apart)), table)
+
+    def log_std(self, bands: FloatArray) -> float:
+        return float(0.5 * np.log(np.exp(2.0 * bands) @ self.by_band[:, 0]))
+
+    def log_length(self, bands: FloatArray) -> float:
+        """Of the distance at which the correlation is as a Matérn one's at its length."""
+        covariance = np.exp(2.0 * bands) @ self.by_band
+        level = float(matern(np.ones(1), 1.0)[0])
+        below = np.flatnonzero(covariance[1:] < level * covariance[0])
+        if not below.size:
+            return float(np.log(self.distance[-1]))
+        j = int(below[0]) + 1
+        share = covariance[j - 1 : j + 1] / covariance[0]
+        at = (share[0] - level) / (share[0] - share[1])
+        return float(np.log(self.distance[j - 1] + at * (self.distance[j] - self.distance[j - 1])))

@@ -1,0 +1,152 @@
+"""What is believed of errors, as the noise of each kind of observation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from mvest.errors import InputError
+from mvest.estimation import Gaussian, IteratedFilter, Prediction, observation_noise
+from mvest.estimation.noise_family import NoiseFamily, matern
+from mvest.observation.learned import CURVES, ROUGH, ErrorBeliefs, error_family
+from mvest.observation.surfaces import ObservedSurface, PredictedSurface, SurfaceObservation
+from mvest.observation.vertices import Observation
+from mvest.typing import FloatArray, IntArray
+
+SIDE = 16
+
+
+def sheet() -> tuple[FloatArray, IntArray]:
+    """Vertices (n, 3) mm of a flat sheet and its triangles."""
+    x, y = np.meshgrid(np.arange(SIDE) * 1.5, np.arange(SIDE) * 1.5)
+    k = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
+    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(SIDE**2)])
+    return points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+POINTS, TRIANGLES = sheet()
+N = len(POINTS)
+BELIEFS = ErrorBeliefs()
+
+
+def covariance(family: NoiseFamily) -> FloatArray:
+    """R as it is stated."""
+    W = family.stated().whiten(np.eye(family.size))
+    return np.asarray(np.linalg.inv(W.T @ W), dtype=np.float64)
+
+
+def test_frames_scales_and_unseen_vertices_are_those_of_the_observation() -> None:
+    positions = np.zeros((2, N, 3))
+    positions[0, :30] = np.nan
+    scale = np.linspace(0.5, 2.0, N)
+    seen = Observation(("open", "closed"), positions, np.array([0.16, 0.64]), None, scale)
+    family = error_family(seen, BELIEFS, 8.0, POINTS)
+    assert family.size == len(seen.y)
+    assert set(family.quantities) == {ROUGH, "frame open"}
+    assert family.quantities["frame open"].median == 1.0
+    variance = np.diag(covariance(family))
+    rough = (BELIEFS.other_share * 0.8) ** 2 + BELIEFS.resolution_mm**2
+    of_frame = np.split(variance / np.concatenate([np.repeat(s, 3) for s in
+                        (scale[30:] * 0.4 / 0.8, scale)]) ** 2, [3 * (N - 30)])  # fmt: skip
+    for values in of_frame:
+        # On average what is stated; a resolution apart, and the edges more than the middle.
+        assert values.mean() == pytest.approx(0.64 + rough, rel=0.1)
+    # Coordinates and frames are independent of each other.
+    R = covariance(family)
+    assert np.abs(R[0::3, 1::3]).max() < 1e-12
+    assert np.abs(R[: 3 * (N - 30), 3 * (N - 30) :]).max() < 1e-12
+
+
+def test_errors_stated_independent_are_mostly_rough() -> None:
+    seen = Observation(("closed",), np.zeros((1, N, 3)), np.array(0.25))
+    smooth, length, rough = BELIEFS.parts(0.5, 0.0)
+    assert (smooth.median, length.median, rough.median) == (0.1, BELIEFS.length_mm, 0.5)
+    family = error_family(seen, BELIEFS, 0.0, POINTS)
+    assert family.quantities[ROUGH] == rough
+    with pytest.raises(InputError, match="all vertices at rest"):
+        error_family(seen, BELIEFS, 0.0, POINTS[1:])
+    with pytest.raises(InputError, match="all vertices at rest"):
+        error_family(seen, BELIEFS, 0.0)
+
+
+def surface_observation(height: FloatArray, curve: FloatArray) -> SurfaceObservation:
+    """A sheet of two leaflets seen displaced by a height (n,), and its border."""
+    border = np.concatenate(
+        [np.arange(SIDE), np.arange(1, SIDE) * SIDE + SIDE - 1,
+         SIDE**2 - 2 - np.arange(SIDE - 1), SIDE * (SIDE - 2 - np.arange(SIDE - 2))]
+    )  # fmt: skip
+    inner = np.all((POINTS[:, :2] > 1.0) & (POINTS[:, :2] < 21.0), axis=1)
+    leaflet = (POINTS[TRIANGLES].mean(axis=1)[:, 0] > 11.25).astype(np.int64)
+    of_point = (POINTS[:, 0] > 11.25).astype(np.int64)
+    seen = ObservedSurface(
+        "closed",
+        (POINTS + np.outer(height, [0, 0, 1.0]))[inner],
+        of_point[inner],
+        free_edge=POINTS[border] + curve,
+    )
+    surface = PredictedSurface(N, TRIANGLES, leaflet, border)
+    return SurfaceObservation((seen,), surface, 0.5, 0.5)
+
+
+def test_points_of_different_leaflets_and_curves_are_independent() -> None:
+    observation = surface_observation(np.zeros(N), np.zeros((4 * SIDE - 4, 3)))
+    family = error_family(observation, BELIEFS, 8.0)
+    assert family.size == len(observation.y)
+    assert set(family.quantities) == {ROUGH, CURVES}
+    points = observation.seen[0]
+    R, q = covariance(family), len(points.points)
+    other = points.region[:, None] != points.region
+    assert np.abs(R[:q, :q][other]).max() < 1e-3 * 0.25
+    near = ~other & (cdist(points.points, points.points) < 2.0)
+    assert R[:q, :q][near].min() > 0.1
+    assert np.abs(R[:q, q:]).max() < 1e-12
+    np.testing.assert_allclose(np.diag(R)[q:], 0.25 + BELIEFS.resolution_mm**2)
+    assert observation_noise(family, family.size).log_determinant == pytest.approx(
+        np.linalg.slogdet(R)[1], rel=1e-9
+    )
+
+
+def test_a_filter_learns_the_errors_of_distances_and_of_curves() -> None:
+    rng = np.random.default_rng(6)
+    K = matern(cdist(POINTS, POINTS), 6.0) + 1e-9 * np.eye(N)
+    height = 0.3 * np.linalg.cholesky(K) @ rng.standard_normal(N) + 0.15 * rng.standard_normal(N)
+    curve = 0.8 * rng.standard_normal((4 * SIDE - 4, 3))
+    observation = surface_observation(height + 0.7, curve + np.array([0.0, 0.0, 0.7]))
+    motion = np.zeros((N, 3, 2))
+    motion[:, 2, 0] = 1.0
+    motion[:, 2, 1] = (POINTS[:, 0] - 11.25) / 10.0
+
+    def model(m: FloatArray) -> Prediction:
+        whole = POINTS + motion @ m
+        return Prediction(
+            np.concatenate([POINTS.ravel(), whole.ravel()]),
+            np.concatenate([np.zeros((3 * N, 2)), motion.reshape(3 * N, 2)]),
+        )
+
+    prior = Gaussian(np.zeros(2), np.eye(2))
+    family = error_family(observation, BELIEFS, 8.0)
+    found = IteratedFilter(1e-5)(observation.of(model), prior, observation.y, family)
+    assert found.converged
+    assert np.all(np.abs(found.mean - [0.7, 0.0]) < 3.0 * found.std)
+    assert found.std[0] > 0.05
+    assert found.learned is not None
+    by_name = {quantity.name: quantity.learned for quantity in found.learned.quantities}
+    for name, true in ((ROUGH, 0.15), (CURVES, 0.8), ("smooth part", 0.3)):
+        low, high = by_name[name].interval(0.99)
+        assert low < true < high, name
+
+
+BAD = (
+    ("std_factor", 0.5), ("length_factor", np.nan), ("deviation", 0.0), ("other_factor", -1.0),
+    ("frame_factor", 0.9), ("length_mm", 0.0), ("other_share", np.inf), ("resolution_mm", -0.1),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), BAD)
+def test_an_inadmissible_belief_is_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"errors {name} = {value}, expected"):
+        replace(BELIEFS, **{name: value})
