@@ -170,6 +170,37 @@ def write_json(path: Path, value: Any) -> None:
     write_atomically(path, text, sync=True)
 
 
+def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain data with a digest of their content, which `require_sealed` checks when they are read.
+
+    Raises
+    ------
+    InputError
+        If the data has no JSON form.
+    """
+    plain = _plain(value, "value")
+    return {"sha256": _sealing(plain), **{k: v for k, v in plain.items() if k != "sha256"}}
+
+
+def require_sealed(data: Mapping[str, Any], where: str) -> None:
+    """Check that data are those that were written; ``where`` names them in an error.
+
+    Raises
+    ------
+    InputError
+        If their digest is missing or that of others.
+    """
+    if data.get("sha256") != _sealing(data):
+        raise InputError(f"{where}: its content is not what was written (SHA-256 does not match)")
+
+
+def _sealing(data: Mapping[str, Any]) -> str:
+    """Of data that are plain already, as they are written: what has no UTF-8 is a ? there."""
+    content = {key: value for key, value in data.items() if key != "sha256"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.sha256(text.encode(errors="replace")).hexdigest()
+
+
 def _plain(value: Any, where: str) -> Any:
     # Not at the top: `experiments` caps the threads of numerical libraries before they are loaded.
     import numpy as np

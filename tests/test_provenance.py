@@ -12,7 +12,15 @@ import pytest
 
 from mvest import provenance as module
 from mvest.errors import InputError
-from mvest.provenance import canonical_json, config_hash, git_state, provenance, write_json
+from mvest.provenance import (
+    canonical_json,
+    config_hash,
+    git_state,
+    provenance,
+    require_sealed,
+    sealed,
+    write_json,
+)
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -178,3 +186,19 @@ def test_an_unwritable_place_is_named(tmp_path: Path) -> None:
     (tmp_path / "taken").mkdir()
     with pytest.raises(InputError, match=r"cannot write .*taken"):
         write_json(tmp_path / "taken", {})
+
+
+def test_sealed_data_are_known_again_and_every_change_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    # Half of a surrogate pair is written as a ?.
+    data = {"x": np.array([0.1, 1e-300]), "n": 1, "words": "σ \ud800", "none": None}
+    write_json(path, sealed(data))
+    read = json.loads(path.read_text(encoding="utf-8"))
+    require_sealed(read, "it")
+    assert sealed(read) == read
+    changes = [{"x": [0.1, 0.0]}, {"n": 1.0}, {"words": "s"}, {"more": 1}, {"sha256": "0" * 64}]
+    others = [read | change for change in changes]
+    others += [{k: v for k, v in read.items() if k != name} for name in ("none", "sha256")]
+    for other in others:
+        with pytest.raises(InputError, match="it: its content is not what was written"):
+            require_sealed(other, "it")

@@ -16,10 +16,12 @@ from typing import Any, Generic, Literal, TypeVar, cast
 from pydantic import TypeAdapter, ValidationError
 
 from mvest.errors import InputError
-from mvest.provenance import provenance, write_json
+from mvest.files import sha256_of
+from mvest.provenance import provenance, require_sealed, sealed, write_json
 from mvest.reading.json_file import read_mapping
 
 __all__ = [
+    "FIELDS",
     "SCHEMA",
     "GitState",
     "Mesh",
@@ -32,12 +34,16 @@ __all__ = [
     "model_of_values",
     "read_record",
     "record_from",
+    "require_written",
     "stamp",
     "write_record",
 ]
 
 SCHEMA = 2
 """Version of the layout of a record."""
+
+FIELDS = "fields.npz"
+"""What a run leaves of arrays beside its record."""
 
 HASH_DIGITS = 12
 """Digits of a hash that a line of text shows."""
@@ -293,14 +299,37 @@ def _source() -> dict[str, Any]:
 
 
 def write_record(path: Path, record: Record[Any]) -> None:
-    """Write a record as JSON, whole or not at all.
+    """Write a record as JSON, whole or not at all, with digests of itself and of its arrays.
 
     Raises
     ------
     InputError
         If it holds something without a JSON form, or cannot be written.
     """
-    write_json(path, asdict(record))
+    write_json(path, sealed({ARRAYS: _arrays_digest(path), **asdict(record)}))
+
+
+ARRAYS = "arrays_sha256"
+
+
+def _arrays_digest(path: Path) -> str | None:
+    """Of the arrays beside a record: those of a run, or those that the results keep."""
+    run = path.name == "result.json"
+    arrays = path.with_name(FIELDS) if run else path.with_suffix(".npz")
+    return sha256_of(arrays) if arrays.is_file() else None
+
+
+def require_written(data: Mapping[str, Any], path: Path) -> None:
+    """Check that the record in a file and the arrays beside it are those that were written.
+
+    Raises
+    ------
+    InputError
+        If they are not, or carry no digest.
+    """
+    require_sealed(data, str(path))
+    if data.get(ARRAYS) != _arrays_digest(path):
+        raise InputError(f"{path}: the arrays beside it are not those that it was written with")
 
 
 @cache
@@ -330,6 +359,9 @@ def read_record(path: Path, findings: type[F]) -> Record[F]:
     Raises
     ------
     InputError
-        If it cannot be read or is no such record.
+        If it cannot be read, is no such record, or is not as it was written.
     """
-    return record_from(read_mapping(path), findings, str(path))
+    data = read_mapping(path)
+    record = record_from(data, findings, str(path))
+    require_written(data, path)
+    return record

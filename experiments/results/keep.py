@@ -13,19 +13,16 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from experiments.common.record import Record, record_from, write_record
+from experiments.common.record import FIELDS, Record, read_record, write_record
 from experiments.common.study import Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
 from mvest.reading.json_file import read_mapping
 
-__all__ = ["FIELDS", "RECORDS", "arrays_of", "publish", "records_of", "regenerate"]
+__all__ = ["RECORDS", "arrays_of", "publish", "records_of", "regenerate"]
 
 RECORDS = "records"
 """Folder of the kept records within the results."""
-
-FIELDS = "fields.npz"
-"""What a run leaves of arrays in its folder."""
 
 
 def arrays_of(folder: Path, name: str) -> dict[str, Path]:
@@ -61,10 +58,10 @@ def publish(
         place.mkdir(parents=True, exist_ok=True)
         # Jobs of one experiment end in several processes at once.
         with FileLock(results / f".{record.table}.lock"):
-            write_record(place / f"{name}.json", study.keep(record))
             kept = study.keep_arrays(record, arrays[name]) if arrays else {}
             if kept:
                 write_atomically(place / f"{name}.npz", partial(np.savez_compressed, **kept))
+            write_record(place / f"{name}.json", study.keep(record))
             records = _read(place, study.findings)
             return study.write(results, records, _arrays(place) | arrays)
     except OSError as error:
@@ -77,7 +74,7 @@ def regenerate(results: Path) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no record, or one is damaged.
+        If there is no record, or one is damaged or not as it was written.
     """
     places = sorted({path.parent for path in (results / RECORDS).glob("*/*.json")})
     if not places:
@@ -107,7 +104,7 @@ def records_of(results: Path, table: str, findings: type) -> dict[str, Record[An
 def _read(place: Path, findings: type) -> dict[str, Record[Any]]:
     """The records of a table by name; the one that has the table's name comes first."""
     paths = sorted(place.glob("*.json"), key=lambda path: (path.stem != place.name, path.stem))
-    return {path.stem: record_from(read_mapping(path), findings, str(path)) for path in paths}
+    return {path.stem: read_record(path, findings) for path in paths}
 
 
 def _arrays(place: Path) -> dict[str, Path]:

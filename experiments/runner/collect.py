@@ -20,7 +20,9 @@ from experiments.runner.compared import Compared, last_compared
 from experiments.runner.folder import is_done, result_time
 from experiments.runner.plan import Plan, PlannedJob
 from experiments.sweeps.collected import SCHEMA, Cost, Sweep, SweepJob
-from mvest.provenance import config_hash
+from mvest.errors import InputError
+from mvest.provenance import config_hash, require_sealed
+from mvest.reading.json_file import parse_json
 
 __all__ = ["ENDS", "NOT_RUN", "End", "collect", "overheads", "read_ends"]
 
@@ -102,9 +104,12 @@ def read_ends(folder: Path) -> dict[str, End]:
     for path in sorted((folder / ENDS).glob("*.jsonl")):
         for line in path.read_bytes().splitlines():
             try:
-                end = _END.validate_json(line)
-            except ValidationError:
-                # Between two lines, cut off with the process that wrote it, or of another version.
+                data = parse_json(line, str(path))
+                end = _END.validate_python(data)
+                require_sealed(data, str(path))
+            except (ValidationError, InputError):
+                # Between two lines, cut off with the process that wrote it, of another version, or
+                # not as it was written.
                 continue
             if end.hash not in found or found[end.hash].finished < end.finished:
                 found[end.hash] = end

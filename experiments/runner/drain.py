@@ -17,6 +17,7 @@ from experiments.runner.folder import FailedRunError, result_time
 from experiments.runner.guard import StoppedError, WorkerProcess, new_worker, run_apart
 from experiments.runner.plan import Plan, PlannedJob
 from mvest.errors import ConfigurationError, MvestError
+from mvest.provenance import sealed
 
 __all__ = ["Shard", "drain_here", "drain_inline", "drain_shard"]
 
@@ -144,6 +145,6 @@ def _drain(plan: Plan, jobs: Iterable[PlannedJob], worker: WorkerProcess, name: 
                 continue
             failed += end.status != "converged"
             # In a line of its own, also after one that was cut off.
-            ends.write(f"\n{json.dumps(asdict(end))}\n")
+            ends.write(f"\n{json.dumps(sealed(asdict(end)))}\n")
             ends.flush()
     return failed

@@ -14,7 +14,14 @@ from typing import Any
 
 from filelock import FileLock
 
-from experiments.common.record import SCHEMA, Outcome, record_from, stamp, write_record
+from experiments.common.record import (
+    SCHEMA,
+    Outcome,
+    record_from,
+    require_written,
+    stamp,
+    write_record,
+)
 from experiments.runner.request import Request
 from mvest.errors import InputError
 from mvest.files import remove_parts
@@ -64,10 +71,11 @@ def lock(folder: Path) -> FileLock:
 
 
 def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
-    """The record in a folder if it is there, of this version, and of the configuration."""
+    """The record in a folder if it is of this version and configuration, and as it was written."""
     try:
         data = read_mapping(folder / RESULT)
         record = record_from(data, Any, str(folder / RESULT))
+        require_written(data, folder / RESULT)
     except InputError:
         return None
     same = record.schema == SCHEMA and record.provenance.config_hash == config_hash
@@ -116,7 +124,12 @@ def mark_done(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Take away what an earlier attempt left, its marker first."""
+    """Take away what an earlier attempt left, its marker first; say so if it was changed since."""
+    if is_done(folder) and (folder / RESULT).exists():
+        try:
+            require_written(read_mapping(folder / RESULT), folder / RESULT)
+        except InputError as error:
+            print(f"note: {error}; it is computed again", file=sys.stderr)
     for name in (DONE, RESULT):
         (folder / name).unlink(missing_ok=True)
     remove_parts(folder)

@@ -13,6 +13,7 @@ from experiments.runner.comparison import short_names
 from experiments.runner.tracking import Store, telling
 from experiments.sweeps.collected import Sweep, check_sweep
 from mvest.files import write_atomically
+from mvest.provenance import require_sealed
 from mvest.reading.json_file import read_mapping
 
 if TYPE_CHECKING:
@@ -39,7 +40,9 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
     """
     from mlflow.entities import Metric
 
-    sweep = check_sweep(read_mapping(folder / SWEEP), str(folder / SWEEP))
+    data = read_mapping(folder / SWEEP)
+    sweep = check_sweep(data, str(folder / SWEEP))
+    require_sealed(data, str(folder / SWEEP))
     result_hash = hashlib.sha256((folder / SWEEP).read_bytes()).hexdigest()
     with telling(store.place):
         chosen = f"tags.kind = '{IS_SWEEP}' and tags.sweep_id = '{sweep_id}'"

@@ -30,7 +30,7 @@ from experiments.runner.tracking import Store
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
-from mvest.provenance import write_json
+from mvest.provenance import sealed, write_json
 
 __all__ = ["collect_sweep", "run_sweep"]
 
@@ -176,7 +176,7 @@ def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
 def _write(plan: Plan) -> Sweep:
     path = plan.folder / SWEEP
     found = collect(plan, read_ends(plan.folder))
-    write_json(path, asdict(found))
+    write_json(path, sealed(asdict(found)))
     print(_outcome(plan, found))
     print(f"Written to {path}")
     return found
@@ -209,7 +209,7 @@ def _publish(plan: Plan, found: Sweep) -> None:
         return
     folder = results / "sweeps"
     require_writable(folder)
-    write_json(folder / f"{found.name}.json", asdict(found))
+    write_json(folder / f"{found.name}.json", sealed(asdict(found)))
     write_sweep(results, found)
     write_report(results)
     print(f"Results in {results}")

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from experiments.common.record import SCHEMA, Record
+from experiments.common.record import SCHEMA, Record, require_written
 from experiments.runner.compared import Compared, compared
 from experiments.runner.comparison import inputs, metrics, parameters
 from experiments.runner.folder import is_done
@@ -306,6 +306,7 @@ def upload(
     if data.get("schema") != SCHEMA:
         raise InputError(f"{place} was written by another version")
     record = compared(data, str(place))
+    require_written(data, place)
     result_hash = _digest(place)
     receipt = read_mapping(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
     config_hash = record.provenance.config_hash

@@ -35,6 +35,7 @@ from experiments.sweeps.start_figures import basin_figure, paths_figure
 from experiments.sweeps.tables import summary, table_note
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.provenance import require_sealed
 from mvest.reading.json_file import read_mapping
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import latex_rows, latex_text, markdown_rows, markdown_text
@@ -109,7 +110,9 @@ def read_sweeps(results: Path) -> list[Sweep]:
     """
     found = []
     for path in sorted((results / SWEEPS).glob("*.json")):
-        found.append(check_sweep(read_mapping(path), str(path)))
+        data = read_mapping(path)
+        found.append(check_sweep(data, str(path)))
+        require_sealed(data, str(path))
     return found
 
 

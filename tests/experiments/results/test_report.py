@@ -11,6 +11,7 @@ from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from experiments.tables import main
 from mvest.errors import InputError
+from mvest.provenance import sealed
 from tests.experiments.sweeps.synthetic_sweeps import (
     TRUTH,
     all_failed,
@@ -54,7 +55,7 @@ class Page(HTMLParser):
 def publish(results, whole: Sweep, *, files: bool = True) -> None:
     (results / "sweeps").mkdir(exist_ok=True)
     path = results / "sweeps" / f"{whole.name}.json"
-    path.write_text(json.dumps(asdict(whole)), encoding="utf-8")
+    path.write_text(json.dumps(sealed(asdict(whole))), encoding="utf-8")
     if files:
         write_sweep(results, whole)
 
@@ -171,7 +172,7 @@ def test_tables_are_made_again_from_published_sweeps_alone(tmp_path, capsys) -> 
     assert "report.html" in capsys.readouterr().out
     place = tmp_path / "records" / "table1"
     place.mkdir(parents=True)
-    (place / "table1.json").write_text(json.dumps(stored(record())), encoding="utf-8")
+    (place / "table1.json").write_text(json.dumps(sealed(stored(record()))), encoding="utf-8")
     assert main([str(tmp_path)]) == 0
     assert "Moduli of a synthetic valve" in (tmp_path / "report.html").read_text(encoding="utf-8")
     (tmp_path / "sweeps" / "filter.json").write_text("{", encoding="utf-8")

@@ -9,16 +9,17 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import experiments.runner.worker as worker_module
-from experiments.common.record import SCHEMA, Outcome, stamp
+from experiments.common.record import SCHEMA, Outcome, stamp, write_record
 from experiments.runner.folder import finished_record, is_done, last_record, lock, mark_done
 from experiments.runner.guard import WorkerProcess, run_apart
 from experiments.runner.job import FailedRunError
 from experiments.runner.request import Request
 from mvest.errors import ConfigurationError
-from mvest.provenance import THREAD_VARIABLES, canonical_json, write_json
+from mvest.provenance import THREAD_VARIABLES, sealed, write_json
 from tests.places import ROOT
 
 OBEDIENT = """
@@ -68,7 +69,7 @@ def request(folder: Path, **order) -> Request:
 
 def converged(asked: Request, config_hash: str = "0" * 64) -> dict:
     record = stamp(asked.values, config_hash, Outcome(findings={"estimate": [1.0]}), 0.0)
-    return json.loads(canonical_json(asdict(record)))
+    return sealed(asdict(record))
 
 
 def said(folder: Path) -> dict:
@@ -143,13 +144,38 @@ def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
     assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
 
 
+def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
+    asked = request(tmp_path)
+    done = converged(asked)
+    mark_done(tmp_path)
+    write_json(tmp_path / "result.json", done | {"findings": {"estimate": [6.0, 2.0]}})
+    assert last_record(tmp_path, "0" * 64) is None
+    run_apart(asked, worker)
+    assert said(tmp_path), "the worker was asked"
+    assert capsys.readouterr().err.splitlines() == [
+        f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
+        "match); it is computed again"
+    ]
+
+
+def test_other_arrays_beside_a_result_are_not_its_own(tmp_path):
+    np.savez(tmp_path / "fields.npz", x=np.ones(3))
+    asked = request(tmp_path)
+    outcome = Outcome(findings=None)
+    write_record(tmp_path / "result.json", stamp(asked.values, asked.config_hash, outcome, 0.0))
+    mark_done(tmp_path)
+    assert last_record(tmp_path, "0" * 64) is not None
+    np.savez(tmp_path / "fields.npz", x=np.zeros(3))
+    assert last_record(tmp_path, "0" * 64) is None
+
+
 def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
     record = converged(request(tmp_path))
     write_json(tmp_path / "result.json", record)
     assert last_record(tmp_path, "0" * 64) is None
     mark_done(tmp_path)
     assert last_record(tmp_path, "0" * 64) == record
-    write_json(tmp_path / "result.json", record | {"schema": SCHEMA - 1})
+    write_json(tmp_path / "result.json", sealed(record | {"schema": SCHEMA - 1}))
     assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
 
 

@@ -21,7 +21,7 @@ from experiments.runner.plan import Plan, PlannedJob
 from experiments.runner.progress import SweepBar
 from experiments.runner.request import Request
 from experiments.studies.twin import study
-from mvest.provenance import write_json
+from mvest.provenance import sealed, write_json
 from tests.places import ROOT
 
 QUICK = ("hydra/launcher=basic", "tracking.enabled=false")
@@ -364,7 +364,7 @@ def planned(folder: Path, seed: int) -> PlannedJob:
 def end(job: PlannedJob, status: str, reason: str) -> None:
     asked = Request(job.values, job.config_hash, job.folder)
     record = write_failure(asked, reason, time.time()) | {"status": status}
-    write_json(job.folder / "result.json", record)
+    write_json(job.folder / "result.json", sealed(record))
 
 
 def test_the_bar_counts_and_names_failures(tmp_path, monkeypatch, capsys):

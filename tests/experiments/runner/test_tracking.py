@@ -24,7 +24,7 @@ from experiments.runner.dashboard import last_comparison
 from experiments.runner.plan import PLAN, Plan, PlannedJob
 from experiments.runner.tracking import RECEIPT, TrackingError, open_store, upload
 from mvest.errors import ConfigurationError, InputError
-from mvest.provenance import write_json
+from mvest.provenance import sealed, write_json
 from tests.places import ROOT
 
 NAMES = ["E_f.anterior", "E_f.posterior"]
@@ -108,7 +108,7 @@ def written(record: dict) -> str:
     """A record as a job writes it: what the study found apart from what the runner stamps."""
     header = {key: value for key, value in record.items() if key in HEADER}
     findings = {key: value for key, value in record.items() if key not in HEADER}
-    return json.dumps({"schema": SCHEMA, **header, "findings": findings})
+    return json.dumps(sealed({"schema": SCHEMA, **header, "findings": findings}))
 
 
 def comparable(**changes) -> Record[Compared]:
@@ -493,7 +493,7 @@ def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> N
     for name in "abc":
         make_job(tmp_path, name)
     plan = make_plan(tmp_path, a={}, b={}, c={})
-    write_json(plan.folder / summary.SWEEP, swept("abc"))
+    write_json(plan.folder / summary.SWEEP, sealed(swept("abc")))
     sync.log_sweep(asked(tmp_path), plan, None)
 
     def kinds() -> list[str | None]:
@@ -520,7 +520,7 @@ def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> N
     # Once for each state of the sweep.
     sync.log_sweep(asked(tmp_path), plan, None)
     assert whole.info.run_id in {run.info.run_id for run in stored(tmp_path)}
-    write_json(plan.folder / summary.SWEEP, swept("abc", title="Anew"))
+    write_json(plan.folder / summary.SWEEP, sealed(swept("abc", title="Anew")))
     sync.log_sweep(asked(tmp_path), plan, None)
     assert kinds() == ["None", "None", "None", "sweep"]
     assert whole.info.run_id not in {run.info.run_id for run in stored(tmp_path)}
@@ -531,7 +531,7 @@ def test_of_very_many_jobs_only_the_whole_is_a_run_unless_asked(tmp_path, monkey
     for name in "abc":
         make_job(tmp_path, name)
     plan = make_plan(tmp_path, a={}, b={}, c={})
-    write_json(plan.folder / summary.SWEEP, swept("abc"))
+    write_json(plan.folder / summary.SWEEP, sealed(swept("abc")))
     config = asked(tmp_path)
     sync.log_sweep(config, plan, None)
     assert sync.main([str(tmp_path)]) == 0

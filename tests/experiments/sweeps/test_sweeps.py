@@ -7,6 +7,7 @@ import pytest
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import read_sweeps, write_sweep
 from mvest.errors import InputError
+from mvest.provenance import sealed
 from tests.experiments.sweeps.synthetic_sweeps import (
     ALL,
     TRUTH,
@@ -122,8 +123,12 @@ def test_an_unwritable_place_is_one_clear_error(tmp_path) -> None:
 def test_published_sweeps_are_read_back_and_damage_is_named(tmp_path) -> None:
     assert read_sweeps(tmp_path) == []
     (tmp_path / "sweeps").mkdir()
-    (tmp_path / "sweeps" / "noise.json").write_text(json.dumps(asdict(noise(2))), encoding="utf-8")
+    (tmp_path / "sweeps" / "noise.json").write_text(json.dumps(sealed(asdict(noise(2)))))
     assert read_sweeps(tmp_path) == [noise(2)]
+    changed = sealed(asdict(noise(2))) | {"title": "Better"}
+    (tmp_path / "sweeps" / "noise.json").write_text(json.dumps(changed))
+    with pytest.raises(InputError, match=r"noise\.json: its content is not what was written"):
+        read_sweeps(tmp_path)
     (tmp_path / "sweeps" / "a.json").write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match=r"a\.json is not JSON"):
         read_sweeps(tmp_path)
