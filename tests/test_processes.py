@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from mvest.processes import Program, run, side_by_side
 from tests.places import ROOT
+from tests.processes import alive, gone, linux, until
 
 MAY_START = {
     "mvest/_keeper.py",
@@ -81,36 +81,6 @@ def test_a_signal_to_the_keeper_reaches_the_program():
 def test_python_s_own_ignored_signals_are_not_handed_on():
     shell = run(["/bin/sh", "-c", "kill -PIPE $$; echo ignored"], stdout=-1, text=True)
     assert (shell.returncode, shell.stdout) == (-signal.SIGPIPE, "")
-
-
-linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
-
-
-def alive(folder: Path) -> list[str]:
-    """Command lines of the processes, not this one, that work in a folder."""
-    found = []
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            state = (place / "stat").read_text().rsplit(") ", 1)[1][0]
-            if state != "Z" and (place / "cwd").readlink() == folder.resolve():
-                found.append((place / "cmdline").read_text().replace("\0", " "))
-        except OSError:
-            continue
-    return found
-
-
-def until(condition: Callable[[], bool]) -> None:
-    stop = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < stop, "waited in vain"
-        time.sleep(0.05)
-
-
-def gone(folder: Path, within_s: float = 5.0) -> bool:
-    stop = time.monotonic() + within_s
-    while alive(folder) and time.monotonic() < stop:
-        time.sleep(0.05)
-    return not alive(folder)
 
 
 STUBBORN = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & (sleep 300 &) ; : > up; wait; wait"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import os
 import signal
@@ -54,6 +55,7 @@ def raised() -> Iterator[None]:
         nonlocal asked
         if not asked:
             asked = True
+            atexit.register(_ignore)
             raise Interruption(number)
         if number == signal.SIGINT:
             os._exit(128 + number)
@@ -64,8 +66,17 @@ def raised() -> Iterator[None]:
     try:
         yield
     finally:
+        # Whoever was asked to stop, here or within, is about to end; another signal may come until
+        # then.
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if not asked and signal.getsignal(number) is ask:
+                signal.signal(number, handler)
+
+
+def _ignore() -> None:
+    """Let no signal change the exit status of an interpreter that takes itself apart."""
+    for number in ASKING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def interruptible(command: Callable[P, int]) -> Callable[P, int]:

@@ -1,0 +1,80 @@
+"""``mvest`` and its worker, held at the stage that the file ``hold`` in the folder names.
+
+There it leaves a file ``at`` and waits for what comes.
+"""
+
+import ctypes
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from tests.experiments.runner import fake_worker
+
+PROGRAM = "trap '' TERM HUP INT; sleep 300 & setsid sleep 300 & : > ../../../at; wait; wait"
+"""An external program that does not listen, with two of its own."""
+
+HELD_FILE = {
+    "planning": "plan.json",
+    "writing": "result.json",
+    "collecting": "sweep.json",
+    "drawing": "sweep_debug.png",
+}
+"""Stage -> file that lies there whole, and has not got its name yet."""
+
+
+def stage() -> str:
+    place = Path("hold")
+    return place.read_text() if place.exists() else ""
+
+
+def hold() -> None:
+    Path("at").touch()
+    time.sleep(600)
+
+
+def held_replace(path, target, replaced=Path.replace):
+    if Path(target).name == HELD_FILE.get(stage()):
+        hold()
+    return replaced(path, target)
+
+
+def run(job):
+    match stage():
+        case "simulating":
+            from mvest.external import Command
+
+            Command(("/bin/sh", "-c", PROGRAM)).run(job.folder)
+        case "estimating":
+            Path("at").touch()
+            # As a long call of compiled code: no other thread of Python runs meanwhile.
+            ctypes.PyDLL(None).sleep(600)
+    return fake_worker.run(job)
+
+
+def main() -> int:
+    # Tests run in the background of a shell inherit that an interrupt is ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    from experiments import cli
+    from experiments.runner import guard, sync, tracking
+
+    def upload(*given, **named):
+        client = given[0].client
+        client.set_terminated = lambda *_, **__: hold()
+        return tracking.upload(*given, **named)
+
+    if stage() == "uploading":
+        sync.upload = upload
+    guard.WORKER = (sys.executable, __file__, "worker")
+    return cli.main(sys.argv[1:])
+
+
+if __name__ == "__main__":
+    Path.replace = held_replace
+    if sys.argv[1:] == ["worker"]:
+        room = fake_worker.room.__dict__
+        room["STUDY"] = replace(room["STUDY"], run=run)
+        fake_worker.worker.main()
+    else:
+        sys.exit(main())

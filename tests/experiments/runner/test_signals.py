@@ -1,0 +1,144 @@
+"""Every signal at every stage of a sweep: no orphan, no half file, the same answer afterwards.
+
+``pytest tests/experiments/runner/test_signals.py -s`` counts what was left of all kills.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.runner.tracking import open_store
+from tests.places import ROOT
+from tests.processes import alive, gone, linux, until
+
+pytestmark = linux
+
+HELD = str(Path(__file__).with_name("held.py"))
+SWEEP = ("run", "sweep=debug")
+PUBLISHED, UNTRACKED = "publish=true", "tracking.enabled=false"
+STATUS = {
+    "INT": 130, "TERM": 143, "HUP": 129, "KILL": -9, "INT INT": 130,
+}  # fmt: skip
+"""Signals -> exit status."""
+
+STAGES = "planning", "simulating", "estimating", "writing", "collecting", "uploading", "drawing"
+QUICK = {
+    ("planning", "HUP"), ("simulating", "KILL"), ("estimating", "TERM"), ("writing", "KILL"),
+    ("drawing", "INT INT"),
+}  # fmt: skip
+"""One signal for each stage that takes no database; all others are slow by their number."""
+
+CASES = [
+    pytest.param(stage, signals, marks=() if (stage, signals) in QUICK else pytest.mark.slow)
+    for stage in STAGES
+    for signals in STATUS
+]
+
+
+def start(folder: Path, *more: str) -> subprocess.Popen[str]:
+    places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    return subprocess.Popen(
+        [sys.executable, HELD, *SWEEP, *more],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": places},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finished(folder: Path, *more: str) -> str:
+    sweep = start(folder, *more)
+    out, _ = sweep.communicate(timeout=300)
+    assert sweep.returncode == 0, out
+    return out
+
+
+def answer(folder: Path) -> dict[str, object]:
+    """What a sweep found, without times and commits."""
+    found = json.loads((folder / "outputs" / "sweep_debug" / "sweep.json").read_text())
+    runs = [(job["hash"], job["status"], job["runs"][0]["estimate"]) for job in found["jobs"]]
+    tables = {path.name: path.read_bytes() for path in folder.glob("results/*.csv")}
+    cost = tables.pop("sweep_debug_cost.csv", b"")
+    return {"runs": runs, "tables": tables, "cost": bool(cost)}
+
+
+def require_whole(folder: Path) -> None:
+    """No file under its own name is cut off."""
+    for path in folder.rglob("*"):
+        if path.name.startswith(".") or not path.is_file():
+            continue
+        match path.suffix:
+            case ".json":
+                json.loads(path.read_text())
+            case ".png":
+                assert path.read_bytes().endswith(b"IEND\xaeB`\x82")
+            case ".csv" | ".html":
+                assert path.read_bytes().endswith(b"\n")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    finished(folder, PUBLISHED, UNTRACKED)
+    return answer(folder)
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("store")
+    open_store(None, folder, "another")
+    return folder / "mlflow.db"
+
+
+@pytest.mark.parametrize(("stage", "signals"), CASES)
+def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, request):
+    more = [UNTRACKED]
+    if stage == "drawing":
+        more.append(PUBLISHED)
+    if stage in ("simulating", "estimating"):
+        more.append("hydra.launcher.n_jobs=2")
+    if stage == "uploading":
+        (tmp_path / "outputs").mkdir()
+        shutil.copy(request.getfixturevalue("database"), tmp_path / "outputs" / "mlflow.db")
+        more = []
+    hold = tmp_path / "hold"
+    hold.write_text(stage)
+    sweep = start(tmp_path, *more)
+    try:
+        until(lambda: (tmp_path / "at").exists() or sweep.poll() is not None)
+        assert sweep.poll() is None, sweep.communicate()[0]
+        for name in signals.split():
+            sweep.send_signal(signal.Signals[f"SIG{name}"])
+            # Another one comes while the first is dealt with.
+            time.sleep(0.1)
+        sweep.wait(timeout=60)
+        left = [] if gone(tmp_path) else alive(tmp_path)
+    finally:
+        sweep.kill()
+        out, _ = sweep.communicate()
+    print(f"{stage}, {signals}: {len(left)} orphans")
+    assert not left
+    assert sweep.returncode == STATUS[signals], out
+    assert "Traceback" not in out
+    require_whole(tmp_path)
+
+    hold.unlink()
+    finished(tmp_path, *more)
+    require_whole(tmp_path)
+    if stage == "drawing":
+        assert answer(tmp_path) == undisturbed
+    else:
+        assert answer(tmp_path)["runs"] == undisturbed["runs"]
+    if stage == "uploading":
+        store = open_store(None, tmp_path / "outputs", "sweep_debug")
+        runs = store.list_runs()
+        assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
