@@ -530,7 +530,7 @@ CASES = {
     "path out of the folder": (
         put("frames", 0, "surface", "../case/open.vtp"), I, OPEN, "leads out of the folder"
     ),
-    "a long name": (put("chordae", "x" * 300), I, "chordae", "cannot be found"),
+    "a long name": (put("chordae", "x" * 300), I, "chordae", "expected a .csv file"),
     "a link to itself": (
         both(
             lambda folder, _: (folder / "a.csv").symlink_to(folder / "a.csv"),

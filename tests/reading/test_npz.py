@@ -174,7 +174,7 @@ def test_arrays_that_are_missing_or_too_many_are_named(tmp_path):
 def test_a_stream_is_read_as_a_file(tmp_path):
     content = packed(tmp_path / "a.npz", npy()).read_bytes()
     assert read_npz(io.BytesIO(content), where="it")["a"].tolist() == [0, 0]
-    with pytest.raises(InputError, match=r"^it cannot be read"):
+    with pytest.raises(InputError, match=r"^it: cannot be read"):
         read_npz(io.BytesIO(content[:9]), where="it")
 
 
