@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import lzma
 import random
 import re
 import struct
@@ -65,6 +66,7 @@ INTEGERS = (
     *(0xFFFFFFFE, 0xFFFFFFFF, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1),
 )
 REALS = (0.0, -0.0, 1e-320, 1e30, 1e308, -1e38, float("inf"), float("-inf"), float("nan"))
+BROKEN = (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 ENCODINGS = ("utf-16", "utf-16-le", "utf-32", "utf-8-sig", "cp037", "utf-7")
 Operator = Callable[[bytes, random.Random], bytes]
 
@@ -199,14 +201,14 @@ def inside(content: bytes, draw: random.Random) -> bytes:
     if content[:2] == b"\x1f\x8b":
         try:
             return gzip.compress(CHANGES[name](gzip.decompress(content), draw), 1)
-        except (OSError, EOFError, zlib.error):
+        except (OSError, EOFError, *BROKEN):
             return content
     if content[:2] != b"PK":
         return CHANGES[name](content, draw)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {item: archive.read(item) for item in archive.namelist()}
-    except (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error):
+    except (OSError, EOFError, ValueError, NotImplementedError, *BROKEN):
         return content
     chosen = draw.choice(sorted(members)) if members else ""
     members[chosen] = CHANGES[name](members.get(chosen, b""), draw)
