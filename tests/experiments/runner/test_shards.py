@@ -6,16 +6,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from experiments import cli
+from experiments.common.estimates import SeedRun
 from experiments.run import main
 from experiments.runner import collect, guard
 from experiments.runner.drain import Shard
 from experiments.runner.plan import Plan
 from mvest.errors import ConfigurationError, InputError
+from mvest.provenance import sealed
 from tests.places import ROOT
 
 FAKE = str(Path(__file__).with_name("fake_worker.py"))
@@ -231,3 +234,15 @@ def test_a_wrong_share_is_one_clear_line(planned, capsys, arguments, words):
     assert err.startswith("error: ")
     assert words in err
     assert len(err.splitlines()) == 1
+
+
+def test_an_end_that_was_changed_is_left_aside(tmp_path):
+    run = SeedRun(seed=1, status="converged", reason="", estimate=(6.0,))
+    end = collect.End(hash="abc", status="converged", reason="", runs=(run,))
+    place = tmp_path / collect.ENDS / "one.jsonl"
+    place.parent.mkdir()
+    line = json.dumps(sealed(asdict(end)))
+    place.write_text(f"\n{line}\n")
+    assert collect.read_ends(tmp_path) == {"abc": end}
+    place.write_text(f"\n{line.replace('6.0', '5.9')}\n")
+    assert collect.read_ends(tmp_path) == {}
