@@ -102,6 +102,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.valve",
         "mvest.imaging",
         "mvest.estimation",
+        "mvest.problem.verdict",
     ),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")

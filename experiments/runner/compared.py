@@ -34,6 +34,8 @@ class Compared:
         Name -> number, or what the name means.
     died : bool
         Whether the job ended before it had any findings.
+    verdict : str or None
+        How far the estimate of a case may be believed (see `mvest.problem.verdict`).
     """
 
     repeats: tuple[SeedRun, ...]
@@ -42,6 +44,7 @@ class Compared:
     data: Data | None = None
     measures: Mapping[str, float | str | None] = field(default_factory=dict)
     died: bool = False
+    verdict: str | None = None
 
 
 def compared(data: Mapping[str, Any], where: str) -> Record[Compared]:
@@ -63,7 +66,13 @@ def compared(data: Mapping[str, Any], where: str) -> Record[Compared]:
         "nis_band": innovation.get("nis_band"),
         "seconds": found.get("seconds", data.get("seconds_total")),
     }
-    findings = {**found, "repeats": found.get("repeats") or [alone], "died": not found}
+    verdict = ((found.get("case") or {}).get("verdict") or {}).get("trust")
+    findings = {
+        **found,
+        "repeats": found.get("repeats") or [alone],
+        "died": not found,
+        "verdict": verdict,
+    }
     return record_from({**data, "findings": findings}, Compared, where)
 
 

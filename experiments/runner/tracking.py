@@ -380,6 +380,7 @@ def _log(
         "seed": provenance.seed,
         "status": record.status,
         "reason": record.reason,
+        "verdict": record.findings.verdict,
         "folder": folder.name,
         "mlflow.source.name": "experiments.run",
         "mlflow.source.type": "LOCAL",

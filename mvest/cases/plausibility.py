@@ -21,7 +21,7 @@ from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_ann
 from mvest.valve.measure.coaptation import orifice_area
 from mvest.valve.measure.measurements import leaflet_length
 
-__all__ = ["RANGES", "Doubt", "HumanRange", "doubts", "require_plausible"]
+__all__ = ["RANGES", "Doubt", "HumanRange", "doubts", "free_orifice", "require_plausible"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +241,7 @@ def _arc(vertices: FloatArray, loop: IntArray, own: np.typing.NDArray[np.bool_])
 
 def _of_orifice(case: ValveCase) -> Iterator[Doubt]:
     reference, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
-    free = [_orifice(case, frame) for frame in (reference, closed)]
+    free = [free_orifice(case, frame) for frame in (reference, closed)]
     if free[0] is None or free[1] is None:
         return
     if free[1] > free[0]:
@@ -255,11 +255,25 @@ def _of_orifice(case: ValveCase) -> Iterator[Doubt]:
     yield from _outside(f"frames.{reference.name}", "the open orifice", free[0], "open_orifice")
 
 
-def _orifice(case: ValveCase, frame: Frame) -> float | None:
+def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = None) -> float | None:
+    """Area (mm²) that the leaflets leave free in a frame, seen along the normal of the annulus.
+
+    None where the annulus has no plane.
+
+    Parameters
+    ----------
+    case : ValveCase
+    frame : Frame
+    vertices : (n, 3) mm, optional
+        Where a model has the vertices of the reference frame, instead of what was seen.
+    """
     plane = _plane(case, frame)
     if plane is None:
         return None
     try:
+        if vertices is not None:
+            triangles = case.surface.triangles
+            return orifice_area(vertices, triangles, vertices[case.annulus], plane, 0.5)
         return orifice_area(frame.vertices, frame.triangles, frame.annulus, plane, 0.5)
     except GeometryError:
         return None

@@ -16,9 +16,11 @@ from experiments.common.record import Mesh, Model, Outcome
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
 from mvest.estimation.information.consistency import moran, zero_mean
+from mvest.personalise.indications import indications_of
 from mvest.personalise.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import unit_of
+from mvest.problem.verdict import judge
 from mvest.reporting.case.findings import (
     MODULUS,
     NUISANCE,
@@ -163,6 +165,7 @@ def _case_findings(
         confirmed_mm=fit.confirmed_mm,
         settings=settings,
         image_step=image_step,
+        verdict=judge(indications_of(fit)),
     )
 
 

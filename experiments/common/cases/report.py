@@ -11,6 +11,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.record import Record
 from mvest.files import write_atomically
+from mvest.problem.verdict import NONE
 from mvest.reporting.case.findings import CaseFindings, FrameDistances, UnknownRow
 from mvest.reporting.markup import MISSING, number
 
@@ -27,7 +28,16 @@ def case_text(record: Record[Findings]) -> str:
     """What a finished case says on the terminal."""
     case = record.findings.case
     title = f"{case.about.name}: {record.reason}"
-    return estimation_text(title, case.unknowns, case.distances)
+    verdict = case.verdict
+    if verdict is None:
+        return estimation_text(title, case.unknowns, case.distances)
+    lines = [f"{case.about.name}: {verdict.trust.upper()} ({len(verdict.passed)} checks passed)"]
+    lines += [f"  {ground.text}. Next: {ground.advice}" for ground in verdict.grounds]
+    if verdict.trust == NONE:
+        lines.append(f"  No modulus is stated; the run ended: {record.reason}")
+        return estimation_text("\n".join(lines), (), case.distances)
+    lines.append(title)
+    return estimation_text("\n".join(lines), case.unknowns, case.distances)
 
 
 def estimation_text(

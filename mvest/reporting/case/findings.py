@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from mvest.problem.verdict import Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
 __all__ = ["About", "CaseFindings", "FrameDistances", "ImageErrors", "ImageStep", "ModuliAlone",
@@ -215,6 +216,8 @@ class CaseFindings:
         Frame -> ``observed``, ``generic`` or ``personalised`` -> measurement -> value.
     confirmed_mm : float or None
         Largest distance of the fitted closed valve from the one closed anew.
+    verdict : Verdict or None
+        How far the estimate may be believed; None where it was not judged.
     """
 
     about: About
@@ -240,6 +243,7 @@ class CaseFindings:
     confirmed_mm: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     image_step: ImageStep | None = None
+    verdict: Verdict | None = None
 
     @property
     def title(self) -> str:

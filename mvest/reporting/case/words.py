@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.case.findings import (
     CaseFindings,
     ModulusRow,
@@ -25,9 +26,11 @@ from mvest.reporting.markup import MISSING, number
 __all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "frame_rows",
            "identifiability_words", "image_error_words", "innovation_words", "leaflet_names",
            "measurement_rows", "moduli_rows", "narrow_words", "parameter_rows", "percent",
-           "provenance_note", "setting_rows", "whiteness_rows"]  # fmt: skip
+           "provenance_note", "setting_rows", "verdict_words", "whiteness_rows"]  # fmt: skip
 
 Rows = list[dict[str, str]]
+
+VERDICT_BADGES = {TRUSTWORTHY: "TRUSTWORTHY", DOUBTFUL: "DOUBTFUL", NONE: "NOT TO BE BELIEVED"}
 
 MODULUS_NAMES = {
     "E_f": "stiffness along the fibres, E_f",
@@ -58,11 +61,37 @@ def leaflet_names(case: CaseFindings, regions: int) -> list[str]:
 
 
 def answer(case: CaseFindings) -> str:
-    """The result in one sentence."""
+    """The result in one sentence; of what is not to be believed there is no number."""
+    verdict = case.verdict
+    if verdict is not None and verdict.trust == NONE:
+        return f"No stiffness can be stated: {verdict.grounds[0].text}."
     if not case.moduli:
         return f"No stiffness was estimated: {case.reason or 'the run gives no reason'}."
     fibre = [m for m in case.moduli if m.name == "E_f"] or case.moduli
-    return "; ".join(f"{m.name} {m.region} {_interval(m)}" for m in fibre) + "."
+    numbers = "; ".join(f"{m.name} {m.region} {_interval(m)}" for m in fibre)
+    if verdict is not None and verdict.trust == DOUBTFUL:
+        return f"Doubtful, since {verdict.grounds[0].text}: {numbers}."
+    return f"{numbers}."
+
+
+def verdict_words(case: CaseFindings) -> tuple[str, list[str], list[str]]:
+    """The verdict, what speaks against the estimate with what to do next, and what was not seen."""
+    verdict = case.verdict
+    if verdict is None:
+        return "The run did not judge its estimate.", [], []
+    count = len(verdict.passed)
+    heads = {
+        TRUSTWORTHY: f"Trustworthy: all {count} checks were passed.",
+        DOUBTFUL: f"Doubtful: {count} checks were passed, and these were not.",
+        NONE: "No stiffness is to be taken from this run.",
+    }
+    against = [
+        ground.text[:1].upper()
+        + ground.text[1:]
+        + (f". Next: {ground.advice}." if ground.advice else ".")
+        for ground in verdict.grounds
+    ]
+    return heads[verdict.trust], against, list(verdict.missing)
 
 
 def _interval(modulus: ModulusRow) -> str:
@@ -83,6 +112,8 @@ def badges(case: CaseFindings) -> list[str]:
         labels.append("DONOR TRICUSPID" if "donor" in stated else "TRICUSPID")
     if not case.converged:
         labels.append(f"RUN {case.status.upper()}")
+    if case.verdict is not None:
+        labels.append(VERDICT_BADGES[case.verdict.trust])
     return [*labels, "NOT FOR DIAGNOSIS"]
 
 

@@ -1,0 +1,370 @@
+"""May an estimate be believed? What stands before every number of a case.
+
+That a filter has converged says that its iterations have ended. Whether moduli follow from what was
+seen is another question, and none of its answers need the truth: what is left over by the fit has
+the size and the looks of noise, nothing known beforehand had to be stretched, the fitted valve does
+what the observed one does, and the data have moved what was believed. Each is a `Ground` with its
+number and its limit. Limits are choices, made before the results that they judge were looked at;
+the calibration against wrong worlds says what they are worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+__all__ = [
+    "DOUBTFUL",
+    "NONE",
+    "TRUSTWORTHY",
+    "Ground",
+    "Held",
+    "Indications",
+    "Trust",
+    "Verdict",
+    "judge",
+]  # fmt: skip
+
+
+Trust: TypeAlias = Literal["trustworthy", "doubtful", "none"]
+"""How far an estimate may be believed; of ``none`` no number is stated."""
+
+TRUSTWORTHY: Trust = "trustworthy"
+DOUBTFUL: Trust = "doubtful"
+NONE: Trust = "none"
+RANK: Mapping[Trust, int] = {TRUSTWORTHY: 0, DOUBTFUL: 1, NONE: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """One reason for a verdict.
+
+    Attributes
+    ----------
+    check : str
+        What was looked at.
+    trust : Trust
+        The best verdict that it admits.
+    text : str
+        What was seen, with its number and what is expected.
+    advice : str
+        What to do next.
+    """
+
+    check: str
+    trust: Trust
+    text: str
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What may be believed of an estimate, and why.
+
+    Attributes
+    ----------
+    trust : Trust
+    grounds : tuple of Ground
+        Those that speak against it, the gravest first; empty for a trustworthy one.
+    passed : tuple of str
+        The checks that it passed.
+    missing : tuple of str
+        The checks for which there was nothing to look at.
+    """
+
+    trust: Trust
+    grounds: tuple[Ground, ...] = ()
+    passed: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if not self.grounds:
+            return f"{self.trust}: {len(self.passed)} checks passed"
+        return f"{self.trust}: " + "; ".join(ground.text for ground in self.grounds)
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Mean distances (mm) of a frame that was held out to the generic and the fitted valve.
+
+    The generic valve is moved rigidly to the closed frame, as the fitted one may be.
+    """
+
+    frame: str
+    generic: float
+    fitted: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Indications:
+    """What is seen of an estimate; None or empty where it is not known.
+
+    Attributes
+    ----------
+    estimated : bool
+        Whether there is an estimate with a prediction.
+    ended : str
+        Why the estimation ended.
+    converged : bool
+    approximation : str
+        What is wrong with the filter's approximation of the posterior, if that was looked into.
+    nis : float or None
+        Normalised innovation squared over the number of observations.
+    nis_band : (float, float) or None
+        Where 95 % of such numbers lie.
+    stretch : mapping
+        What was known beforehand -> by how many of its standard deviations it was moved.
+    narrowing : mapping
+        Modulus -> standard deviation of its logarithm after over before.
+    alike : float or None
+        Correlation of what is left over at neighbouring points, standardised (Moran's I).
+    residual_mm, generic_mm : float or None
+        Mean distance of the closed frame from the fitted, and from the generic valve.
+    held_out : tuple of Held
+    orifice_mm2, observed_orifice_mm2 : float or None
+        Free in the line of sight, of the fitted valve and of the observed one.
+    gate : bool or None
+        Whether the closed state is known to be the only one.
+    doubts, mistakes : tuple of str
+        About the case itself, see `mvest.cases.plausibility`.
+    """
+
+    estimated: bool
+    ended: str = ""
+    converged: bool = True
+    approximation: str = ""
+    nis: float | None = None
+    nis_band: tuple[float, float] | None = None
+    stretch: Mapping[str, float] = field(default_factory=dict)
+    narrowing: Mapping[str, float] = field(default_factory=dict)
+    alike: float | None = None
+    residual_mm: float | None = None
+    generic_mm: float | None = None
+    held_out: tuple[Held, ...] = ()
+    orifice_mm2: float | None = None
+    observed_orifice_mm2: float | None = None
+    gate: bool | None = None
+    doubts: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
+
+
+STRETCH = (2.5, 3.5)
+"""Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
+ones are), beyond the second it is contradicted (1 in 2000)."""
+NIS_FACTOR = 1.5
+"""Beyond its band by this factor the normalised innovation contradicts what is believed of errors:
+after they were learned, nothing but a model that cannot do what was seen takes it there."""
+NARROWING = (0.7, 0.9)
+"""Standard deviation after over before: above the first the estimate is half what was believed
+beforehand (0.7 squared), above the second the data have added next to nothing."""
+ALIKE = 0.25
+"""Correlation of whitened residuals at neighbouring points above which there is structure."""
+LEAK = (10.0, 30.0)
+"""mm² by which the fitted valve may be more open than the observed one: about the error of such an
+area from a jagged edge, and what no closed valve has."""
+WORSE = 1.05
+"""Distance of a held-out frame, fitted over generic, that counts as farther."""
+
+
+def judge(seen: Indications) -> Verdict:
+    """The verdict that indications lead to: the worst that any check admits."""
+    grounds: list[Ground] = []
+    passed: list[str] = []
+    missing: list[str] = []
+    for check, look in CHECKS.items():
+        found = list(look(seen))
+        if found and found[0] is None:
+            missing.append(check)
+            if check in NEEDED and seen.estimated:
+                grounds.append(Ground(check, DOUBTFUL, f"nothing is known of {check}", "record it"))
+            continue
+        against = [ground for ground in found if ground is not None]
+        grounds += against
+        if not against:
+            passed.append(check)
+    grounds.sort(key=lambda ground: -RANK[ground.trust])
+    trust = max((ground.trust for ground in grounds), key=lambda t: RANK[t], default=TRUSTWORTHY)
+    return Verdict(trust, tuple(grounds), tuple(passed), tuple(missing))
+
+
+Seen = Iterator[Ground | None]
+"""Grounds against an estimate; None first where there was nothing to look at."""
+
+
+def _ended(e: Indications) -> Seen:
+    if not e.estimated:
+        yield Ground(
+            "iterations",
+            NONE,
+            f"there is no estimate: {e.ended or 'the run gives no reason'}",
+            "close the valve with the generic moduli first (check=true); if that fails, look at "
+            "chordae and annulus; if only a trial fails, narrow the priors",
+        )
+    elif not e.converged:
+        yield Ground(
+            "iterations",
+            NONE,
+            f"the iterations did not come to their end: {e.ended}",
+            "let it iterate longer (personal.max_iterations), or start nearer",
+        )
+
+
+def _approximated(e: Indications) -> Seen:
+    if e.approximation:
+        yield Ground(
+            "approximation",
+            DOUBTFUL,
+            f"the interval is not that of the posterior: {e.approximation}",
+            "sample the posterior",
+        )
+
+
+def _plausible(e: Indications) -> Seen:
+    for text in e.mistakes:
+        yield Ground("case", NONE, text, "mend the case and run it again")
+    for text in e.doubts:
+        yield Ground("case", DOUBTFUL, text, "look at this part of the case")
+
+
+def _innovation(e: Indications) -> Seen:
+    if e.nis is None or e.nis_band is None:
+        yield None
+        return
+    low, high = e.nis_band
+    if low <= e.nis <= high:
+        return
+    far = e.nis > NIS_FACTOR * high or e.nis < low / NIS_FACTOR
+    yield Ground(
+        "size of what is left over",
+        NONE if far else DOUBTFUL,
+        f"what the fit leaves over is {np.sqrt(e.nis):.2f} times what its errors explain, "
+        f"expected {np.sqrt(low):.2f} to {np.sqrt(high):.2f}",
+        "state larger errors, or look where the model cannot follow (map of the innovation)",
+    )
+
+
+def _structure(e: Indications) -> Seen:
+    if e.alike is None:
+        yield None
+    elif abs(e.alike) > ALIKE:
+        yield Ground(
+            "pattern of what is left over",
+            DOUBTFUL,
+            f"what the fit leaves over is alike at neighbouring points (correlation "
+            f"{e.alike:.2f}, expected below {ALIKE:g})",
+            "errors are smoother than believed, or the model has another shape: see their map",
+        )
+
+
+def _stretched(e: Indications) -> Seen:
+    if not e.stretch:
+        yield None
+    doubtful, contradicted = STRETCH
+    for what, moved in e.stretch.items():
+        if abs(moved) > doubtful:
+            yield Ground(
+                "what was known beforehand",
+                NONE if abs(moved) > contradicted else DOUBTFUL,
+                f"{what} was moved by {abs(moved):.1f} of its standard deviations, expected at "
+                f"most {doubtful:g}",
+                f"check what the case says of it; if it is right, {what} makes up for something "
+                "else that is wrong",
+            )
+
+
+def _informed(e: Indications) -> Seen:
+    if not e.narrowing:
+        yield None
+    half, nothing = NARROWING
+    for modulus, ratio in e.narrowing.items():
+        if ratio > half:
+            yield Ground(
+                "what the data add",
+                NONE if ratio > nothing else DOUBTFUL,
+                f"the data narrow {modulus} to {100 * ratio:.0f} % of what was believed "
+                f"beforehand, expected at most {100 * half:.0f} %: the estimate is mostly that "
+                "belief",
+                "add closed frames under other pressures, or see what would narrow the interval",
+            )
+
+
+def _fits(e: Indications) -> Seen:
+    if e.residual_mm is None or e.generic_mm is None:
+        yield None
+    elif e.residual_mm > e.generic_mm:
+        yield Ground(
+            "distance",
+            NONE,
+            f"the fitted valve is farther from the closed frame ({e.residual_mm:.2f} mm) than the "
+            f"generic one ({e.generic_mm:.2f} mm)",
+            "errors or priors contradict the frame: check units, pressure and correspondence",
+        )
+
+
+def _predicts(e: Indications) -> Seen:
+    if not e.held_out:
+        yield None
+    for one in e.held_out:
+        if one.fitted > WORSE * one.generic:
+            yield Ground(
+                "frames held out",
+                DOUBTFUL,
+                f"frame {one.frame}, which was not fitted, is {one.fitted:.2f} mm from the fitted "
+                f"valve and {one.generic:.2f} mm from the generic one",
+                "the moduli do not predict; check that frame's pressure and annulus",
+            )
+
+
+def _closes(e: Indications) -> Seen:
+    if e.orifice_mm2 is None or e.observed_orifice_mm2 is None:
+        yield None
+        return
+    more = e.orifice_mm2 - e.observed_orifice_mm2
+    small, large = LEAK
+    if more > small:
+        yield Ground(
+            "closure",
+            NONE if more > large else DOUBTFUL,
+            f"the fitted valve leaves {e.orifice_mm2:.0f} mm² free, the observed one "
+            f"{e.observed_orifice_mm2:.0f} mm²",
+            "chordae too short, leaflets too small, or tips too far: check them",
+        )
+
+
+def _unique(e: Indications) -> Seen:
+    if e.gate is None:
+        yield None
+    elif not e.gate:
+        yield Ground(
+            "one closed state",
+            DOUBTFUL,
+            "the closed state is not known to be the only one: it was not reached again",
+            "run the gate for this valve",
+        )
+
+
+CHECKS = {
+    "iterations": _ended,
+    "approximation": _approximated,
+    "case": _plausible,
+    "size of what is left over": _innovation,
+    "pattern of what is left over": _structure,
+    "what was known beforehand": _stretched,
+    "what the data add": _informed,
+    "distance": _fits,
+    "frames held out": _predicts,
+    "closure": _closes,
+    "one closed state": _unique,
+}
+"""Check -> what it looks at."""
+
+NEEDED = (
+    "size of what is left over",
+    "what was known beforehand",
+    "what the data add",
+    "distance",
+)
+"""Checks without which no estimate is trustworthy."""

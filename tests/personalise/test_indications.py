@@ -1,0 +1,81 @@
+"""What is read from a personalised case of how far to believe it, with a formula for a closure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import Role, Uncertainty
+from mvest.observation.errors import SpatialCorrelation
+from mvest.personalise import personalise_case
+from mvest.personalise.indications import indications_of
+from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
+from tests.made_up_closure import PRIORS, made_up_case, settings, use
+
+INDEPENDENT = Uncertainty(0.3)
+
+
+@pytest.fixture
+def fit(monkeypatch):
+    """Personalise a case of which errors of 0.3 mm are seen."""
+    use(monkeypatch)
+
+    def run(stated=INDEPENDENT, **changes):
+        case = made_up_case(0.3, noise=np.random.default_rng(3))
+        return personalise_case(replace(case, uncertainty=stated), settings(**changes))
+
+    return run
+
+
+def test_a_world_as_stated_is_trusted(fit):
+    found = fit()
+    seen = indications_of(found)
+    assert seen.estimated
+    assert seen.converged
+    assert seen.nis_band[0] <= seen.nis <= seen.nis_band[1]
+    assert abs(seen.alike) < 0.1
+    assert seen.residual_mm < seen.generic_mm
+    assert [held.frame for held in seen.held_out] == ["late"]
+    assert set(seen.narrowing) == {"E_f.anterior", "E_f.posterior"}
+    # Of a factor, estimated by its logarithm: a prior of 1.00 and 10 %.
+    k = found.names.index("pressure_scale")
+    moved = np.log(found.result.estimate[k]) / np.sqrt(np.log(1.01))
+    assert seen.stretch["pressure_scale"] == pytest.approx(moved, abs=0.06)
+    k = found.names.index("shift.x")
+    assert seen.stretch["shift.x"] == pytest.approx(found.result.estimate[k] / PRIORS["shift.x"][1])
+    assert judge(replace(seen, mistakes=(), doubts=())).trust == TRUSTWORTHY
+
+
+def test_errors_three_times_those_that_are_stated_show_in_what_is_left_over(fit):
+    seen = indications_of(fit(Uncertainty(0.1)))
+    assert seen.nis == pytest.approx(9.0, rel=0.15)
+    verdict = judge(replace(seen, mistakes=(), doubts=()))
+    assert verdict.trust == NONE
+    assert "size of what is left over" in [ground.check for ground in verdict.grounds]
+
+
+def test_smooth_errors_that_are_stated_as_independent_show_as_a_pattern(monkeypatch):
+    use(monkeypatch)
+    case = replace(made_up_case(0.3), uncertainty=INDEPENDENT)
+    rough = SpatialCorrelation(case.surface.vertices, 8.0).factor
+    smooth = 0.3 * rough @ np.random.default_rng(3).standard_normal(case.surface.vertices.shape)
+    frames = tuple(
+        replace(f, vertices=f.vertices + smooth) if f.role is Role.CLOSED else f
+        for f in case.frames
+    )
+    assert indications_of(personalise_case(replace(case, frames=frames), settings())).alike > 0.4
+
+
+def test_a_fit_by_distances_is_looked_at_as_well(fit):
+    seen = indications_of(fit(correspondence=False))
+    assert seen.nis is not None
+    assert abs(seen.alike) < 0.15
+
+
+def test_without_an_estimate_there_is_its_reason(monkeypatch):
+    use(monkeypatch, fails_above=1.0)
+    found = personalise_case(made_up_case(0.3), settings())
+    seen = indications_of(found)
+    assert not seen.estimated
+    assert found.result.reason in seen.ended
+    assert judge(seen).trust == NONE

@@ -1,0 +1,113 @@
+"""What each check of an estimate lets through and what it stops."""
+
+from dataclasses import replace
+
+import pytest
+
+from mvest.problem.verdict import (
+    ALIKE,
+    DOUBTFUL,
+    LEAK,
+    NARROWING,
+    NEEDED,
+    NIS_FACTOR,
+    NONE,
+    STRETCH,
+    TRUSTWORTHY,
+    Held,
+    Indications,
+    judge,
+)
+
+GOOD = Indications(
+    estimated=True,
+    nis=1.01,
+    nis_band=(0.96, 1.04),
+    stretch={"pressure_scale": -1.2, "smooth part of the errors": 0.4},
+    narrowing={"E_f.anterior": 0.4, "E_f.posterior": 0.3},
+    alike=0.05,
+    residual_mm=0.9,
+    generic_mm=1.6,
+    held_out=(Held("late", 1.5, 1.1),),
+    orifice_mm2=3.0,
+    observed_orifice_mm2=2.0,
+    gate=True,
+)
+
+
+def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
+    verdict = judge(GOOD)
+    assert verdict.trust == TRUSTWORTHY
+    assert verdict.grounds == ()
+    assert len(verdict.passed) == 11
+    assert verdict.missing == ()
+    assert str(verdict) == "trustworthy: 11 checks passed"
+
+
+CASES = {
+    "no estimate": ({"estimated": False, "ended": "it did not close"}, NONE, "it did not close"),
+    "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
+    "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
+    "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
+    "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
+    "innovation beyond its band": ({"nis": 1.06}, DOUBTFUL, "1.03 times"),
+    "innovation below its band": ({"nis": 0.9}, DOUBTFUL, "0.95 times"),
+    "innovation far beyond": ({"nis": 1.01 * NIS_FACTOR * 1.04}, NONE, "times what its errors"),
+    "innovation far below": ({"nis": 0.99 / NIS_FACTOR * 0.96}, NONE, "times what its errors"),
+    "structure": ({"alike": 1.1 * ALIKE}, DOUBTFUL, "alike at neighbouring points"),
+    "stretched": ({"stretch": {"pressure_scale": -1.01 * STRETCH[0]}}, DOUBTFUL, "pressure_scale"),
+    "contradicted": ({"stretch": {"chord_rest_length": 3.7}}, NONE, "3.7 of its standard"),
+    "half believed": ({"narrowing": {"E_f.anterior": 0.8}}, DOUBTFUL, "80 % of what was believed"),
+    "nothing added": ({"narrowing": {"E_f.anterior": 1.01 * NARROWING[1]}}, NONE, "91 %"),
+    "farther": ({"residual_mm": 1.7}, NONE, "farther from the closed frame"),
+    "held out": ({"held_out": (Held("late", 1.0, 1.06),)}, DOUBTFUL, "frame late"),
+    "ajar": ({"orifice_mm2": 2.1 + LEAK[0]}, DOUBTFUL, "leaves 12 mm"),
+    "open": ({"orifice_mm2": 121.0}, NONE, "leaves 121 mm² free, the observed one 2 mm²"),
+    "another closed state": ({"gate": False}, DOUBTFUL, "not known to be the only one"),
+}
+
+
+@pytest.mark.parametrize(("changes", "trust", "words"), CASES.values(), ids=CASES)
+def test_each_ground_counts_and_says_its_number(changes, trust, words):
+    verdict = judge(replace(GOOD, **changes))
+    assert verdict.trust == trust
+    (ground,) = verdict.grounds
+    assert words in ground.text
+    assert ground.advice
+    assert ground.check not in verdict.passed
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"nis": 0.96},
+        {"nis": 1.04},
+        {"stretch": {"x": STRETCH[0]}},
+        {"narrowing": {"x": NARROWING[0]}},
+        {"alike": -ALIKE},
+        {"residual_mm": 1.6},
+        {"held_out": (Held("late", 1.0, 1.05),)},
+        {"orifice_mm2": 2.0 + LEAK[0]},
+        {"orifice_mm2": 0.0, "observed_orifice_mm2": 80.0},
+    ],
+)
+def test_limits_themselves_are_admitted(changes):
+    assert judge(replace(GOOD, **changes)).trust == TRUSTWORTHY
+
+
+def test_the_worst_ground_decides_and_stands_first():
+    verdict = judge(replace(GOOD, alike=0.5, gate=False, orifice_mm2=121.0))
+    assert verdict.trust == NONE
+    assert [ground.trust for ground in verdict.grounds] == [NONE, DOUBTFUL, DOUBTFUL]
+    assert str(verdict).startswith("none: the fitted valve leaves 121 mm²")
+
+
+def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
+    verdict = judge(Indications(estimated=True))
+    assert len(verdict.missing) == 8
+    # Of these, four are needed.
+    assert verdict.trust == DOUBTFUL
+    assert [ground.check for ground in verdict.grounds] == list(NEEDED)
+    assert judge(replace(GOOD, alike=None, gate=None, held_out=())).trust == TRUSTWORTHY
+    assert set(verdict.missing).isdisjoint(verdict.passed)
+    assert "what the data add" in verdict.missing
