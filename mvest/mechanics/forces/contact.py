@@ -138,6 +138,45 @@ class Contact:
             self.settings.reference_pressure,
         )
 
+    def forces_change(
+        self,
+        pairs: ContactPairs,
+        y: FloatArray,
+        moved: FloatArray,
+        areas: FloatArray | None,
+        thickness: FloatArray | None,
+    ) -> FloatArray:
+        """Change ``(k, 3)`` N of the forces at fixed positions if the sheets change at rest.
+
+        The force of a pair is a function of r and h that is homogeneous of degree -2, since r_0 is
+        a fixed part of h: its derivative by h follows from that by r (Euler).
+
+        Parameters
+        ----------
+        pairs, y
+            As for `forces`.
+        moved : ndarray
+            ``(k, 3)`` mm, displacement at rest.
+        areas, thickness : ndarray or None
+            ``(k,)`` changes of them, mm^2 and mm.
+        """
+        none = np.zeros(len(y))
+        return _forces_change(
+            y,
+            pairs.first,
+            pairs.second,
+            pairs.reach,
+            pairs.reference,
+            self.areas,
+            self.thickness,
+            self.rest,
+            moved,
+            none if areas is None else areas,
+            none if thickness is None else thickness,
+            self.settings.activation_distance,
+            self.settings.reference_pressure,
+        )
+
     def energy(self, pairs: ContactPairs, y: FloatArray) -> float:
         """Contact energy in N mm."""
         r = np.linalg.norm(y[pairs.first] - y[pairs.second], axis=1)
@@ -257,6 +296,47 @@ def _forces(
         out[j, 0] -= f * d0
         out[j, 1] -= f * d1
         out[j, 2] -= f * d2
+    return out
+
+
+@nb.njit(cache=True)
+def _forces_change(
+    y: FloatArray,
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
+    reach: FloatArray,
+    reference: FloatArray,
+    areas: FloatArray,
+    thickness: FloatArray,
+    rest: FloatArray,
+    moved: FloatArray,
+    d_areas: FloatArray,
+    d_thickness: FloatArray,
+    activation: float,
+    p0: float,
+) -> FloatArray:
+    out = np.zeros_like(y)
+    for k in range(len(first)):
+        i, j, h = first[k], second[k], reach[k]
+        rr = 0.0
+        for c in range(3):
+            rr += (y[i, c] - y[j, c]) ** 2
+        if rr >= h * h:
+            continue
+        r = np.sqrt(rr)
+        value, slope = _kernel(r, h, reference[k], p0)
+        dh = 0.5 * activation * (d_thickness[i] + d_thickness[j])
+        if h < 0.5 * activation * (thickness[i] + thickness[j]):
+            apart, toward = 0.0, 0.0
+            for c in range(3):
+                apart += (rest[i, c] - rest[j, c]) ** 2
+                toward += (rest[i, c] - rest[j, c]) * (moved[i, c] - moved[j, c])
+            dh = h * toward / apart
+        f = value * (d_areas[i] * areas[j] + areas[i] * d_areas[j])
+        f -= areas[i] * areas[j] * (2.0 * value + r * slope) * dh / h
+        for c in range(3):
+            out[i, c] += f * (y[i, c] - y[j, c]) / r
+            out[j, c] -= f * (y[i, c] - y[j, c]) / r
     return out
 
 

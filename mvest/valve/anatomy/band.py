@@ -18,7 +18,7 @@ from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.geometry.triangles import directed_edges
 
-__all__ = ["Band"]
+__all__ = ["Band", "leaflet_normals"]
 
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of either is read."""
@@ -62,9 +62,7 @@ class Band:
         a, b = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
         self._sign = -1.0 if np.median(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 0 else 1.0
         self._lines = self._leaflet_lines(surface)
-        self._normals = smooth_vertex_normals(
-            surface.vertices, surface.triangles, _rounds(surface, NORMAL_SMOOTHING_MM)
-        )
+        self._normals = leaflet_normals(surface)
 
     def _leaflet_lines(self, surface: LeafletSurface) -> tuple[FloatArray, FloatArray]:
         """The two lines between the leaflets as ``(k, 2)`` of s and theta, that to phi = 0 first.
@@ -244,11 +242,18 @@ def _mean(
     return np.asarray(np.einsum("...c,...ci->...i", weights, corners))
 
 
-def _rounds(surface: LeafletSurface, length: float) -> int:
-    """Rounds of averaging over neighbours that spread over about ``length`` mm.
+def leaflet_normals(surface: LeafletSurface, vertices: FloatArray | None = None) -> FloatArray:
+    """Smooth unit normals ``(n, 3)`` along which leaflets are thick, to the ventricle.
 
-    The spread of a random walk grows with the root of its steps.
+    Parameters
+    ----------
+    surface : LeafletSurface
+    vertices : (n, 3) mm, optional
+        Where its vertices are instead; over as many neighbours is averaged as where they were.
     """
     corner = surface.vertices[surface.triangles]
     edge = float(np.median(np.linalg.norm(corner[:, 1] - corner[:, 0], axis=1)))
-    return max(1, round((length / edge) ** 2))
+    # The spread of a random walk grows with the root of its steps.
+    rounds = max(1, round((NORMAL_SMOOTHING_MM / edge) ** 2))
+    at = surface.vertices if vertices is None else vertices
+    return smooth_vertex_normals(at, surface.triangles, rounds)

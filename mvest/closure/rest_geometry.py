@@ -1,0 +1,159 @@
+"""How errors of a valve's geometry move its closed state: open shape, boundary, thickness, fibres.
+
+A change of the surface at rest is carried into the mesh and to the points where contact is sampled:
+each of them keeps its place on the surface and its share of the thickness. All embeddings stay as
+they are, so that the same material points are observed, touch and are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
+from mvest.mechanics.reference import RestVariation, vary_equilibrium
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.band import leaflet_normals
+from mvest.valve.anatomy.valve import lumped_areas
+from mvest.valve.geometry.proximity import ClosestPoints, closest_points
+from mvest.valve.geometry.triangles import unit_rows
+
+__all__ = ["RestGeometry"]
+
+SMALL = 1e-3
+"""mm, by which vertices are moved to differentiate normals and areas, which are smooth."""
+
+
+class RestGeometry:
+    """The geometry at rest of a closing valve, and what changes of it do to its closed state.
+
+    Parameters
+    ----------
+    model : ClosureModel
+        Its protocol must end in an equilibrium.
+
+    Raises
+    ------
+    InputError
+        If it does not: a valve that still moves has a history, which depends on the geometry too.
+    """
+
+    def __init__(self, model: ClosureModel) -> None:
+        if not model.settings.protocol.equilibrium:
+            raise InputError("derivatives by the geometry need a closure that ends in equilibrium")
+        self.model = model
+        self.surface = model.valve.surface
+        self._normals = leaflet_normals(self.surface)
+        self._closest = closest_points(
+            model.mesh.nodes, self.surface.vertices, self.surface.triangles
+        )
+        self._normal = unit_rows(self._at(self._closest, self._normals))
+        self._height, self._nodes = self._feet()
+
+    def _feet(self) -> tuple[FloatArray, ClosestPoints]:
+        """Heights ``(n,)`` mm of the mesh's nodes, and where along the normals they stand.
+
+        Feet lie in the plane of the closest triangle, and possibly beyond its sides: with them a
+        node is exactly foot plus height times normal, so that it turns as the surface does.
+        """
+        surface, nodes, normal = self.surface, self.model.mesh.nodes, self._normal
+        a, b, c = np.moveaxis(surface.vertices[surface.triangles[self._closest.triangle]], 1, 0)
+        across = np.cross(b - a, c - a)
+        height = np.sum((nodes - a) * across, axis=1) / np.sum(normal * across, axis=1)
+        foot = nodes - height[:, None] * normal
+        area = np.sum(across**2, axis=1)
+        at_b = np.sum(np.cross(foot - a, c - a) * across, axis=1) / area
+        at_c = np.sum(np.cross(b - a, foot - a) * across, axis=1) / area
+        weights = np.stack([1.0 - at_b - at_c, at_b, at_c], axis=1)
+        return height, replace(self._closest, barycentric=weights)
+
+    @cached_property
+    def _samples(self) -> ClosestPoints:
+        """Where the samples of contact are on the surface."""
+        points = self.model.contact_valve.surface.vertices
+        return closest_points(points, self.surface.vertices, self.surface.triangles)
+
+    def _at(self, points: ClosestPoints, values: FloatArray) -> FloatArray:
+        return points.interpolate(values, self.surface.triangles)
+
+    def _still(self, q: int) -> FloatArray:
+        return np.zeros((q, *self.model.mesh.nodes.shape))
+
+    def shape(self, moves: FloatArray) -> RestVariation:
+        """Of the open shape, by displacements ``(q, n, 3)`` mm of the surface's vertices.
+
+        The annulus and the papillary tips of the closed valve stay where they are.
+        """
+        surface, contact = self.surface, self.model.contact_valve.surface
+        nodes, areas = [], []
+        for move in moves:
+            tilt = (
+                leaflet_normals(surface, surface.vertices + SMALL * move)
+                - leaflet_normals(surface, surface.vertices - SMALL * move)
+            ) / (2 * SMALL)
+            turn = self._at(self._closest, tilt)
+            turn /= np.linalg.norm(self._at(self._closest, self._normals), axis=1)[:, None]
+            turn -= np.sum(turn * self._normal, axis=1)[:, None] * self._normal
+            nodes.append(self._at(self._nodes, move) + self._height[:, None] * turn)
+            there = SMALL * self._at(self._samples, move)
+            ahead, behind = (
+                lumped_areas(contact.vertices + sign * there, contact.triangles) for sign in (1, -1)
+            )
+            areas.append((ahead - behind) / (2 * SMALL))
+        return RestVariation(np.array(nodes), areas=np.array(areas))
+
+    def thickness(self, factors: FloatArray) -> RestVariation:
+        """Of the thickness, by relative changes ``(q, n)`` at the surface's vertices."""
+        nodes = [
+            (self._height * self._at(self._closest, factor))[:, None] * self._normal
+            for factor in factors
+        ]
+        own = self.model.contact_valve.surface.thickness
+        thickness = [own * self._at(self._samples, factor) for factor in factors]
+        return RestVariation(np.array(nodes), thickness=np.array(thickness))
+
+    def fibres(self, angles: FloatArray) -> RestVariation:
+        """Of the fibres, by turns ``(q, regions)`` rad of each region's about its normals."""
+        mesh = self.model.mesh
+        across = np.cross(self._normal[mesh.elements], mesh.fibre)
+        turned = [angle[mesh.region][:, None, None] * across for angle in angles]
+        return RestVariation(self._still(len(angles)), fibre=np.array(turned))
+
+    def annulus(self, moves: FloatArray) -> RestVariation:
+        """Of the closed annulus, by displacements ``(q, a, 3)`` mm of the contact valve's."""
+        copies = 2 if self.model.settings.support == "clamp" else 1
+        return RestVariation(self._still(len(moves)), supports=np.tile(moves, (1, copies, 1)))
+
+    def tips(self, moves: FloatArray, rest_length: FloatArray | None = None) -> RestVariation:
+        """Of the closed valve's papillary tips, by displacements ``(q, t, 3)`` mm.
+
+        ``rest_length (q, c)`` is how much longer the chordae then are at rest, relative, where that
+        follows from the tips.
+        """
+        return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
+
+    def change(self, m: FloatArray, variation: RestVariation) -> FloatArray | str:
+        """Derivatives ``(2, n, 3, q)`` of the observed open and closed valve, or why none.
+
+        Parameters
+        ----------
+        m : (p,)
+            Parameters of the closure; it is gone to from the last closed state, if that is another.
+        variation : RestVariation
+        """
+        model = self.model
+        if model.closed is None or not np.array_equal(model.closed.at, m):
+            simulation = model.close(m, sensitivities=False).simulation
+            if not simulation.converged:
+                return simulation.reason.value
+        assert model.closed is not None
+        system, _ = model.tuned(m)
+        loading = boundary_loading(system, model.valve, model.contact_valve, model.settings)
+        loads = loading(model.settings.protocol.end)
+        dx = vary_equilibrium(system, model.solver, model.closed.positions, loads, variation)
+        both = [[model.observed(move) for move in moves] for moves in (variation.nodes, dx)]
+        return np.moveaxis(np.array(both), 1, -1)
