@@ -67,8 +67,10 @@ def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tupl
 
 
 def settings(*given: Unknown, **changes: Any) -> PersonaliseSettings:
-    """Settings with some unknowns, all of them estimated if none are given."""
-    return PersonaliseSettings(given or unknowns(), MECHANICS, CaseMesh(), **changes)
+    """Settings with some unknowns, all of them estimated if none are given; errors as stated."""
+    return PersonaliseSettings(
+        given or unknowns(), MECHANICS, CaseMesh(), **{"errors": None} | changes
+    )
 
 
 def _fields() -> dict[str, np.ndarray]:

@@ -140,13 +140,15 @@ RANGES = (
     Range(0, 20, "", "multiples of the thickness", "reference_distance activation_distance"),
     Range(
         0, 100, "", "factors and exponents",
+        "errors.*_factor errors.deviation "
         "*_slack dt_factor finer_dt_factor growth factor scale *exponent stretch orifice "
         "pressure_scale* chord_stiffness* chord_rest_length chord_rest_length.* largest_r_hat",
     ),
     # Shares, statistics and numerics.
     Range(
         0, 1, "", "shares of a whole",
-        "share share_* anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
+        "share share_* other_share "
+        "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
         "marginal_s *confidence dropout rate held_relaxation held_pressure",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),

@@ -58,11 +58,16 @@ SMOOTH, LENGTH = "smooth part", "length of the smooth part"
 
 @dataclass(frozen=True, slots=True)
 class LearnedQuantity:
-    """One quantity of the noise, as it was believed and as it was learned."""
+    """One quantity of the noise, as it was believed and as it was learned.
+
+    It is a factor, as of a frame or of added columns, or has the unit of the observation (a length
+    that of the points).
+    """
 
     name: str
     believed: LogNormal
     learned: LogNormal
+    is_factor: bool = False
 
     @property
     def stretch(self) -> float:
@@ -385,6 +390,7 @@ def _in_words(
     """What the quantities of a family amount to."""
     quantities = []
     first = 0
+    factors = {block.frame for block in family.blocks} | {c.name for c in family.columns}
     basis = next((block.basis for block in family.blocks if block.basis is not None), None)
     if basis is not None:
         first = BANDS
@@ -400,7 +406,7 @@ def _in_words(
             LogNormal(float(np.exp(of.mean[k])), float(np.exp(of.std[k])))
             for of in (prior, posterior)
         )
-        quantities.append(LearnedQuantity(name, believed, learned))
+        quantities.append(LearnedQuantity(name, believed, learned, name in factors))
     return tuple(quantities)
 
 

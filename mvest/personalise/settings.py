@@ -154,7 +154,7 @@ class PersonaliseSettings:
     moduli_only: bool = False
     confirm: bool = False
     correspondence: bool = True
-    errors: ErrorBeliefs | None = None
+    errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none

@@ -11,6 +11,7 @@ from mvest.estimation import Prediction, observation_noise
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ClosureProtocol
 from mvest.observation.errors import SpatialCorrelation
+from mvest.observation.learned import ErrorBeliefs
 from mvest.observation.surfaces import UNKNOWN
 from mvest.personalise import (
     CaseMesh,
@@ -637,3 +638,54 @@ def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
     assert found.result.estimate[2] == 0.0
     assert found.moduli_only.parameters == MODULI
     assert np.all(found.moduli_only.std > 0)
+
+
+# --- errors that are learned --------------------------------------------------------------------
+
+
+def rougher(case, std, seed=9):
+    """The case with white noise on its closed frame, of which it states nothing."""
+    rng = np.random.default_rng(seed)
+    frames = tuple(
+        replace(f, vertices=f.vertices + std * rng.standard_normal(f.vertices.shape))
+        if f.role is Role.CLOSED
+        else f
+        for f in case.frames
+    )
+    return replace(case, frames=frames)
+
+
+@pytest.mark.parametrize("correspondence", [True, False])
+def test_errors_rougher_than_stated_are_learned(monkeypatch, correspondence):
+    use(monkeypatch)
+    case = rougher(made_up_case(0.3, 8.0, np.random.default_rng(4)), 0.2)
+    wanted = settings(correspondence=correspondence)
+    as_stated = personalise_case(case, wanted).result.filtered
+    found = personalise_case(case, replace(wanted, errors=ErrorBeliefs()))
+    learned = found.result.filtered
+    assert as_stated.learned is None
+    assert as_stated.innovation.nis > 5.0 * as_stated.innovation.size
+    assert learned.innovation.consistent
+    # The case states that its 0.3 mm are alike over 8 mm; they are independent, and 0.2 mm more.
+    rough = next(q for q in learned.learned.quantities if q.name == "rough part")
+    low, high = rough.learned.interval()
+    assert low < np.hypot(0.3, 0.2) < high < 1.3 * low
+    assert rough.stretch > 1.0
+    z = (learned.mean - true_of(found)) / learned.std
+    assert np.sqrt(np.mean(z**2)) < 1.6
+    # What would be known if more were known starts from what is.
+    moduli = [found.names.index(name) for name in MODULI]
+    np.testing.assert_allclose(found.narrower["now"], learned.transformed.std[moduli], rtol=1e-6)
+
+
+def test_learned_errors_and_error_samples_widen_together(monkeypatch):
+    use_geometry(monkeypatch)
+    case = rougher(made_up_case(0.3, 0.0, np.random.default_rng(1), displaced=False), 0.3)
+    wanted = settings(*right_nuisances(), errors=ErrorBeliefs())
+    plain = personalise_case(case, wanted)
+    told = personalise_case(seen_in_error(case, std=1.2), wanted)
+    assert told.result.filtered.learned.names[-1] == "geometry"
+    assert np.all(told.result.std > 1.5 * plain.result.std)
+    np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
+    rough = [r.result.filtered.learned.quantities[2].learned.median for r in (plain, told)]
+    np.testing.assert_allclose(rough, np.hypot(0.3, 0.3), rtol=0.1)

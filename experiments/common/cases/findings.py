@@ -26,6 +26,7 @@ from mvest.reporting.case.findings import (
     NUISANCE,
     About,
     CaseFindings,
+    ErrorRow,
     FrameDistances,
     ImageErrors,
     ImageStep,
@@ -157,6 +158,7 @@ def _case_findings(
         objective=tuple(v if np.isfinite(v) else None for v in objective),
         innovation=innovation_of(result.filtered),
         whiteness=_whiteness(fit),
+        errors=_errors(result),
         identifiability=identified_of(result),
         observation_std_mm=fit.case.uncertainty.typical_mm,
         narrow=_narrow(fit),
@@ -316,6 +318,29 @@ def _whiteness(fit: Personalised) -> tuple[WhitenessTest, ...]:
         WhitenessTest(name, test.statistic, test.p_value, white[bool(test.p_value > 0.05)])
         for name, test in tests
     )
+
+
+def _errors(result: StudyResult) -> tuple[ErrorRow, ...]:
+    """What was learned of the errors of the closed frame."""
+    learned = None if result.filtered is None else result.filtered.learned
+    rows = []
+    for quantity in () if learned is None else learned.quantities:
+        low, high = quantity.learned.interval()
+        before = quantity.believed.interval()
+        rows.append(
+            ErrorRow(
+                name=quantity.name,
+                unit="" if quantity.is_factor else "mm",
+                believed=quantity.believed.median,
+                believed_low=before[0],
+                believed_high=before[1],
+                learned=quantity.learned.median,
+                low=low,
+                high=high,
+                stretch=quantity.stretch,
+            )
+        )
+    return tuple(rows)
 
 
 def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:

@@ -62,6 +62,7 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         personal.moduli_only,
         personal.confirm,
         personal.correspondence,
+        personal.errors,
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from experiments.common.schema import InputFile, Reads, contents
+from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.settings import CaseMesh, PaperSettings
 
 __all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
@@ -55,6 +56,7 @@ class PersonalSettings:
     moduli_only: bool = False  # estimate also with all nuisances fixed
     confirm: bool = False  # close the fitted valve anew from the open one
     correspondence: bool = True  # use corresponding vertices as such, where there are any
+    errors: ErrorBeliefs | None = None  # learn the errors that the case states
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

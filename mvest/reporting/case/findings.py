@@ -13,9 +13,9 @@ from typing import Any
 from mvest.problem.verdict import Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
-__all__ = ["About", "CaseFindings", "FrameDistances", "ImageErrors", "ImageStep", "ModuliAlone",
-           "ModulusRow", "Narrower", "Picture", "ToTruth", "UnknownRow", "VolumeAbout",
-           "WhitenessTest"]  # fmt: skip
+__all__ = ["About", "CaseFindings", "ErrorRow", "FrameDistances", "ImageErrors", "ImageStep",
+           "ModuliAlone", "ModulusRow", "Narrower", "Picture", "ToTruth", "UnknownRow",
+           "VolumeAbout", "WhitenessTest"]  # fmt: skip
 
 MODULUS, NUISANCE = "modulus", "nuisance"
 """Kinds of an unknown."""
@@ -127,6 +127,25 @@ class FrameDistances:
     to_truth: ToTruth | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorRow:
+    """What was learned of the errors of the observed frame, beside what was believed before.
+
+    In ``unit``, or a factor if that is empty. It was moved by ``stretch`` standard deviations of
+    what was believed.
+    """
+
+    name: str
+    unit: str
+    believed: float
+    believed_low: float
+    believed_high: float
+    learned: float
+    low: float
+    high: float
+    stretch: float
+
+
 @dataclass(frozen=True, slots=True)
 class WhitenessTest:
     """A test of the standardised innovation."""
@@ -210,8 +229,10 @@ class CaseFindings:
     iterates, iterate_std : (i, p)
     objective : (i,)
         None where a prediction failed.
+    errors : tuple of ErrorRow
+        Empty where errors were taken as they are stated.
     observation_std_mm : float or None
-        Of an observed coordinate.
+        Of an observed coordinate, as stated.
     measurements : mapping
         Frame -> ``observed``, ``generic`` or ``personalised`` -> measurement -> value.
     confirmed_mm : float or None
@@ -233,6 +254,7 @@ class CaseFindings:
     objective: tuple[float | None, ...] = ()
     innovation: Innovation | None = None
     whiteness: tuple[WhitenessTest, ...] = ()
+    errors: tuple[ErrorRow, ...] = ()
     identifiability: Identified | None = None
     observation_std_mm: float | None = None
     narrow: tuple[Narrower, ...] = ()

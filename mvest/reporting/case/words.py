@@ -13,6 +13,7 @@ from typing import Any
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.case.findings import (
     CaseFindings,
+    ErrorRow,
     ModulusRow,
     Narrower,
     UnknownRow,
@@ -23,10 +24,11 @@ from mvest.reporting.expectation import alike_words
 from mvest.reporting.findings import Innovation, Spread
 from mvest.reporting.markup import MISSING, number
 
-__all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "frame_rows",
-           "identifiability_words", "image_error_words", "innovation_words", "leaflet_names",
-           "measurement_rows", "moduli_rows", "narrow_words", "parameter_rows", "percent",
-           "provenance_note", "setting_rows", "verdict_words", "whiteness_rows"]  # fmt: skip
+__all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "error_rows",
+           "frame_rows", "identifiability_words", "image_error_words", "innovation_words",
+           "leaflet_names", "measurement_rows", "moduli_rows", "narrow_words", "parameter_rows",
+           "percent", "provenance_note", "setting_rows", "verdict_words",
+           "whiteness_rows"]  # fmt: skip
 
 Rows = list[dict[str, str]]
 
@@ -277,6 +279,20 @@ def innovation_words(innovation: Innovation | None) -> list[str]:
         f"Normalised innovation squared {_large(nis)}, "
         f"{'inside' if low <= nis <= high else 'OUTSIDE'} its 95 % band {_large(low)} to "
         f"{_large(high)}.",
+    ]
+
+
+def error_rows(errors: Sequence[ErrorRow]) -> Rows:
+    """What was learned of the errors of the frame, beside what was believed."""
+    return [
+        {
+            "errors of the closed frame": f"{row.name} [{row.unit}]" if row.unit else row.name,
+            "believed": number(row.believed),
+            "95 %": f"{number(row.believed_low)} to {number(row.believed_high)}",
+            "learned": number(row.learned),
+            "its 95 % interval": f"{number(row.low)} to {number(row.high)}",
+        }
+        for row in errors
     ]
 
 
