@@ -89,7 +89,13 @@ RANGES = (
     ),
     Range(0.1, 20, "mm", "edges of the cells of a leaflet", "edge_length"),
     # The heart.
-    Range(0, 500, "mmHg", "no heart makes more", "*pressure_mmHg *pressures_mmHg"),
+    Range(
+        -100,
+        500,
+        "mmHg",
+        "no heart makes more; below zero it opens the valve",
+        "*pressure_mmHg *pressures_mmHg",
+    ),
     Range(0, 10_000, "", "a frame and, in mmHg, its pressure", "imaged.held_out imaged.landmarks"),
     Range(0.01, 10, "mm", "no leaflet is thicker", "*thickness *thickness_mm"),
     Range(1e-5, 10, "s", "time steps of a beat", "dt cycle_dt time_steps"),

@@ -16,6 +16,7 @@ from experiments.common.estimates import SeedRun
 from experiments.common.record import Outcome
 from experiments.common.study import Job
 from experiments.runner.compose import expand, grids, make_plan
+from experiments.runner.limits import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
 from experiments.studies.twin.findings import Findings
 from experiments.studies.twin.settings import Settings
@@ -102,6 +103,8 @@ def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, 
     assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
     for job in plan.jobs[::step]:
         config_hash, values = composed(*job.overrides)
+        # Which a job by itself does not have.
+        values["time_limit_s"] = TIME_LIMIT_S
         assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
         assert job.config_hash == config_hash
         assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
