@@ -1,3 +1,4 @@
+from .check import ApproximationCheck as ApproximationCheck
 from .estimate import Estimate as Estimate
 from .estimate import Filter as Filter
 from .estimate import InnovationSummary as InnovationSummary

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 
 from mvest.errors import InputError
+from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.consistency import chi_square_band
@@ -40,7 +41,11 @@ class Reason(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InnovationSummary:
-    """The innovation e = y − h and how well its covariance S explains it.
+    """The innovation of the prior and how well its covariance S explains it.
+
+    It is what the prior leaves unexplained, e = y − h(z) + H (z − m), linearised at the estimate z:
+    with a linear model y less what the prior's mean m predicts. What the estimate leaves is the
+    residual y − h(z), and smaller (`Estimate.residual_rms`).
 
     The paper's filter sees the same y again in each round, so that there y is not independent of
     the state it is compared with, and its `nis` is smaller than a chi-square number.
@@ -127,6 +132,8 @@ class Estimate:
         Draws from the posterior, of a filter that makes them; intervals are then their quantiles.
     learned : LearnedNoise or None
         What was learned of the noise, if it was not given.
+    check : ApproximationCheck or None
+        Whether the posterior is what the filter took it for; None where nothing was compared.
     """
 
     names: tuple[str, ...]
@@ -143,6 +150,7 @@ class Estimate:
     forward_solves: int
     transformed_samples: FloatArray | None = None
     learned: LearnedNoise | None = None
+    check: ApproximationCheck | None = None
 
     def __str__(self) -> str:
         return self.summary()
@@ -164,12 +172,27 @@ class Estimate:
         ]
         counts = f"{self.iterations} iterations, {self.forward_solves} forward solves"
         detail = "" if self.converged or not self.detail else f" ({self.detail})"
-        return "\n".join([*rows, f"{self.reason.value}{detail}; {counts}"])
+        return "\n".join([*rows, f"{self.why}{detail}; {counts}"])
 
     @property
     def converged(self) -> bool:
-        """Whether the filter stopped because it had converged."""
+        """Whether the filter stopped because it had converged; this is about iterations only."""
         return self.reason.converged
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the filter converged, and no check of its posterior fails."""
+        return self.converged and (self.check is None or self.check.holds)
+
+    @property
+    def why(self) -> str:
+        """Why the filter stopped, and what is wrong with its posterior if anything is."""
+        if self.check is None or self.check.holds:
+            return self.reason.value
+        return (
+            f"{self.reason.value}, but the posterior is not what the filter assumes: "
+            f"{self.check.sentence}"
+        )
 
     @property
     def iterations(self) -> int:

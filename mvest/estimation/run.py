@@ -6,6 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.estimation.check import (
+    ApproximationCheck,
+    Run,
+    check_against_runs,
+    principal_points,
+    worst,
+)
 from mvest.estimation.estimate import Estimate, InnovationSummary, OnIterate, Reason
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
@@ -37,6 +44,8 @@ class FilterRun:
     transform : Transform
     names : tuple of str, (p,)
     forward_solves : int
+    check_runs : int
+        Runs of the model that are made at the end to check the posterior.
     """
 
     def __init__(
@@ -48,7 +57,11 @@ class FilterRun:
         names: Sequence[str] | None,
         transform: Transform | None,
         on_iterate: OnIterate | None,
+        check_runs: int = 0,
     ) -> None:
+        if check_runs < 0:
+            raise InputError(f"check_runs must not be negative; got {check_runs}")
+        self.check_runs = check_runs
         self.y = read_only(y)
         if self.y.ndim != 1 or self.y.size == 0:
             raise InputError(f"the observation y must have shape (n,), n > 0; got {self.y.shape}")
@@ -66,6 +79,7 @@ class FilterRun:
         self._model = model
         self._on_iterate = on_iterate
         self._last: tuple[FloatArray, Prediction] | None = None
+        self._runs: list[Run] = []
         self._iterates: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self._objectives: list[float] = []
@@ -89,6 +103,9 @@ class FilterRun:
         self.forward_solves += 1
         prediction = predict(self._model, m, self.y.size, derivatives=derivatives)
         self._last = (z.copy(), prediction)
+        if prediction.converged:
+            H = self.jacobian(z, prediction) if prediction.differentiated else None
+            self._runs.append(Run(z.copy(), prediction.y, H))
         return prediction
 
     def jacobian(self, z: FloatArray, prediction: Prediction) -> FloatArray:
@@ -128,19 +145,53 @@ class FilterRun:
         prediction: Prediction,
         innovation: FloatArray,
         update: Update,
-        samples: FloatArray | None = None,
         learned: LearnedNoise | None = None,
+        prior: Gaussian | None = None,
     ) -> Estimate:
         """The estimate at the last recorded iterate, at which `prediction` was made.
 
-        ``samples (s, p)`` are draws from the posterior in filter coordinates, if there are any;
-        what was ``learned`` of the noise widens the covariance.
+        What was ``learned`` of the noise widens the covariance. ``prior`` is what was updated last,
+        if that is not the prior of the problem.
         """
         summary = InnovationSummary.of(innovation, update)
+        # Of the posterior with the noise as it is; what widens it has no part in the model's form.
+        check = self.check(prediction, prior=prior)
         if learned is not None:
             self._covariances[-1] = self._covariances[-1] + learned.covariance
-        estimate = self._estimate(reason, detail, prediction, summary, samples)
+        estimate = self._estimate(reason, detail, prediction, summary, check=check)
         return replace(estimate, learned=learned)
+
+    def check(
+        self,
+        prediction: Prediction,
+        *,
+        others: Sequence[ApproximationCheck] = (),
+        prior: Gaussian | None = None,
+    ) -> ApproximationCheck | None:
+        """The worst check of the last iterate's posterior, at whose mean `prediction` was made.
+
+        All runs of the model are compared with, and `check_runs` more at ± 1 standard deviation.
+        ``others`` are what the filter itself has compared.
+        """
+        z, P = self._iterates[-1], self._covariances[-1]
+        if not np.all(np.isfinite(P)) or not np.any(P):
+            return worst(others)
+        posterior = Gaussian(z, P)
+        made = 0
+        for point in principal_points(posterior, self.check_runs):
+            self.predict(point, derivatives=False)
+            made += 1
+        checks = check_against_runs(
+            y=self.y,
+            noise=self.noise,
+            prior=self.prior if prior is None else prior,
+            posterior=posterior,
+            predicted=prediction.y,
+            H=self.jacobian(z, prediction),
+            runs=self._runs,
+            extra_runs=made,
+        )
+        return worst([*checks, *others])
 
     def finish_with_slope(
         self,
@@ -150,6 +201,7 @@ class FilterRun:
         reason: Reason,
         detail: str,
         samples: FloatArray | None = None,
+        checks: Sequence[ApproximationCheck] = (),
     ) -> Estimate:
         """Run the model at the estimate N(z, P), record it, and end there.
 
@@ -160,8 +212,12 @@ class FilterRun:
         P : (p, p)
         slope : (n, p)
             dh/dz as the filter's points say. The model's own derivative is used where it has one.
-        reason, detail, samples
-            See `finish`.
+        reason, detail
+        samples : (s, p), optional
+            Draws from the posterior in filter coordinates. Their posterior may have any form, and
+            is checked by ``checks`` alone.
+        checks
+            What the filter itself has compared.
         """
         prediction = self.predict(z, derivatives=False)
         if not prediction.converged:
@@ -174,7 +230,9 @@ class FilterRun:
         update = kalman_update(self.prior, innovation, H, self.noise)
         objective = self.misfit(prediction) + self.prior_term(z)
         self.record(z, P, objective, update.log_likelihood)
-        return self.finish(reason, detail, prediction, innovation, update, samples)
+        summary = InnovationSummary.of(innovation, update)
+        check = worst(checks) if samples is not None else self.check(prediction, others=checks)
+        return self._estimate(reason, detail, prediction, summary, samples, check)
 
     def prior_term(self, z: FloatArray) -> float:
         """½ (z − m)ᵀ P⁻¹ (z − m), of what the prior does not hold fixed."""
@@ -194,6 +252,7 @@ class FilterRun:
         prediction: Prediction | None,
         innovation: InnovationSummary | None,
         samples: FloatArray | None = None,
+        check: ApproximationCheck | None = None,
     ) -> Estimate:
         return Estimate(
             names=self.names,
@@ -209,6 +268,7 @@ class FilterRun:
             detail=detail,
             forward_solves=self.forward_solves,
             transformed_samples=None if samples is None else read_only(samples),
+            check=check,
         )
 
 

@@ -197,7 +197,7 @@ def estimate(
         observation=observation,
         filtered=filtered,
         identifiability=bound,
-        reason=filtered.reason.value,
+        reason=filtered.why,
         detail=filtered.detail,
         converged=filtered.converged,
         seconds=time.perf_counter() - started,

@@ -37,3 +37,25 @@ def saturating(m):
     """Two numbers that tell little of a large m and much of a small one."""
     x = np.exp(-m)
     return Prediction(np.concatenate([x, 2.0 * x]), np.concatenate([-x, -2.0 * x])[:, None])
+
+
+def banana(m):
+    """h(m) = m₁ + m₀², exactly quadratic: where little noise is, m lies on a parabola."""
+    return Prediction(np.array([m[1] + m[0] ** 2]), np.array([[2.0 * m[0], 1.0]]))
+
+
+def wings(m):
+    """h(m) = m² + m/10, which two values of m answer equally well."""
+    return Prediction(m**2 + 0.1 * m, (2.0 * m + 0.1)[:, None])
+
+
+def gridded(model, prior, y, R, reach=5.0, points=201):
+    """Mean and standard deviation (p,) of a posterior of one or two parameters, on a grid."""
+    axis = np.linspace(-reach, reach, points)
+    u = np.stack(np.meshgrid(*[axis] * prior.size, indexing="ij"), axis=-1).reshape(-1, prior.size)
+    at = prior.mean + u @ prior.factor.T
+    misfit = np.array([0.5 * np.sum((y - model(m).y) ** 2 / R) for m in at])
+    weights = np.exp(misfit.min() - misfit - 0.5 * np.sum(u**2, axis=1))
+    weights /= weights.sum()
+    mean = weights @ at
+    return mean, np.sqrt(weights @ (at - mean) ** 2)

@@ -180,7 +180,7 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated
     draws = estimate.transformed_samples
     return Estimated(
         converged=estimate.converged,
-        reason=estimate.reason.value,
+        reason=estimate.why,
         detail=estimate.detail,
         forward_solves=estimate.forward_solves,
         iterations=estimate.iterations,

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.estimation.check import STEP_LIMIT, ApproximationCheck
 from mvest.estimation.estimate import Estimate, OnIterate, Reason
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, Prediction
 from mvest.estimation.run import FilterRun
 from mvest.estimation.transform import Transform
+from mvest.estimation.update import kalman_update
 from mvest.typing import FloatArray
 
 __all__ = ["EnsembleFilter", "exact_ensemble"]
@@ -64,6 +66,9 @@ class EnsembleFilter:
         ``square_root`` or ``perturbed``.
     seed : int
         Of all random numbers.
+    check_runs : int
+        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
+        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
 
     Raises
     ------
@@ -75,6 +80,7 @@ class EnsembleFilter:
     steps: int = 1
     kind: str = "square_root"
     seed: int = 1
+    check_runs: int = 0
 
     def __post_init__(self) -> None:
         if self.members < 3 or self.steps < 1:
@@ -97,7 +103,7 @@ class EnsembleFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Condition an ensemble; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
         if self.members < prior.size + 2:
             raise InputError(
                 f"{prior.size} parameters need at least {prior.size + 2} members; got "
@@ -113,11 +119,13 @@ class EnsembleFilter:
             D = run.noise.whiten((run.y - predicted).T)
             x, d = X.mean(axis=0), D.mean(axis=1)
             run.record(z, P, 0.5 * float(d @ d + x @ x), np.nan)
-            slope = _slope(L @ (X - x).T, (predicted - predicted.mean(axis=0)).T)
+            members = X
             X = self._condition(X, D, float(self.steps), rng)
         z, P = _moments(run, L, X)
         detail = f"{len(X)} of {self.members} members, {self.steps} steps"
-        return run.finish_with_slope(z, P, slope, Reason.COMPLETED, detail)
+        slope = _slope(run, L, members, predicted)
+        checks = _halves(run, L, members, predicted, Gaussian(z, P))
+        return run.finish_with_slope(z, P, slope, Reason.COMPLETED, detail, checks=checks)
 
     def _condition(
         self, X: FloatArray, D: FloatArray, alpha: float, rng: np.random.Generator
@@ -173,6 +181,36 @@ def _moments(run: FilterRun, L: FloatArray, X: FloatArray) -> tuple[FloatArray, 
     return run.prior.mean + L @ x, A @ A.T
 
 
-def _slope(Z: FloatArray, Y: FloatArray) -> FloatArray:
-    """Regression (n, p) of anomalies ``Y (n, N)`` of the prediction on ``Z (p, N)``."""
-    return np.asarray(np.linalg.lstsq(Z.T, Y.T, rcond=None)[0].T)
+def _slope(run: FilterRun, L: FloatArray, X: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Regression dh/dz (n, p) of predictions (N, n) on their members (N, p)."""
+    Z = (X - X.mean(axis=0)) @ L.T
+    return np.asarray(np.linalg.lstsq(Z, predicted - predicted.mean(axis=0), rcond=None)[0].T)
+
+
+def _halves(
+    run: FilterRun, L: FloatArray, X: FloatArray, predicted: FloatArray, posterior: Gaussian
+) -> list[ApproximationCheck]:
+    """What either half of the members makes of the prior, against each other.
+
+    A linear model has one slope, whichever members tell it; that of a non-linear one is known to
+    what the members leave to chance.
+    """
+    half = len(X) // 2
+    if half < X.shape[1] + 2:
+        return []
+    means = []
+    for part in (slice(None, half), slice(half, 2 * half)):
+        H = _slope(run, L, X[part], predicted[part])
+        e = run.y - predicted[part].mean(axis=0) + H @ L @ X[part].mean(axis=0)
+        means.append(kalman_update(run.prior, e, H, run.noise).posterior.mean)
+    apart = np.linalg.lstsq(posterior.factor, means[1] - means[0], rcond=None)[0]
+    # The whole ensemble is off by about half of what its halves are apart.
+    return [
+        ApproximationCheck(
+            "estimates by the two halves of the ensemble, half their distance in standard "
+            "deviations",
+            0.5 * float(np.linalg.norm(apart)),
+            STEP_LIMIT,
+            2 * half,
+        )
+    ]

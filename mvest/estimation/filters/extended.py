@@ -30,11 +30,19 @@ class ExtendedFilter:
     It is the first step of `IteratedFilter`, kept to be compared with: what it lacks is what a
     non-linear model needs.
 
+    Attributes
+    ----------
+    check_runs : int
+        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
+        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
+
     Raises
     ------
     InputError
         If a shape or a covariance is not admissible; never for a failing model.
     """
+
+    check_runs: int = 0
 
     def __call__(
         self,
@@ -48,7 +56,7 @@ class ExtendedFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Update once; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
         m, P = run.prior.mean, run.prior.covariance
         prediction = run.predict(m)
         if not prediction.converged:

@@ -90,6 +90,9 @@ class IteratedFilter:
         First iterate; None starts at the prior's mean.
     max_learned : int
         Iterates at which a noise that is not quite known is learned.
+    check_runs : int
+        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
+        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
 
     Raises
     ------
@@ -103,6 +106,7 @@ class IteratedFilter:
     max_rejections: int = 8
     start: tuple[float, ...] | None = None
     max_learned: int = 12
+    check_runs: int = 0
 
     def __post_init__(self) -> None:
         require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
@@ -125,7 +129,7 @@ class IteratedFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Find the posterior mode; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
         # With P = L Lᵀ and z = m + L x the prior of x is N(0, I): P may be singular, and the
         # damping of the steps does not depend on the units of the parameters.
         L = run.prior.factor

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 
 from mvest.errors import InputError
+from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.estimate import Estimate, OnIterate, Reason
 from mvest.estimation.filters.sampler import Draws, LogDensity, SamplerSettings, draw
 from mvest.estimation.filters.surrogate import (
@@ -149,6 +150,7 @@ class MonteCarloFilter:
             f"{rounds} rounds; log-likelihood of the surrogate ± {error:.2g}; "
             f"{draws.effective.min():.0f} effective draws, R-hat {draws.r_hat.max():.3f}",
             run.prior.mean + draws.points @ L.T,
+            self._checks(draws, error),
         )
 
     def _explore(
@@ -167,13 +169,42 @@ class MonteCarloFilter:
             misfit = surrogate.misfit(runs.run.y, runs.run.noise)
             points = draw(log_posterior(misfit), at, look, rng).points
             at = Gaussian(points.mean(axis=0), np.cov(points.T).reshape(at.size, -1))
-            if np.mean(~region.holds(points, EDGE)) > ALMOST_NONE:
-                region, error = _around(points), np.inf
-                runs.fill(region, self.runs, rng)
-            else:
+            cut = np.mean(~region.holds(points, EDGE)) > ALMOST_NONE
+            last = rounds == self.max_rounds
+            # A surrogate that is used is measured, also where its region still cuts draws off.
+            if not cut or last:
                 error = runs.check(misfit, rng.choice(points, self.checks, replace=False))
-            if error <= self.tolerance or rounds == self.max_rounds:
+            if (error <= self.tolerance and not cut) or last:
                 return surrogate, at, error, rounds
+            if cut:
+                region = _around(points)
+                runs.fill(region, self.runs, rng)
+
+    def _checks(self, draws: Draws, error: float) -> list[ApproximationCheck]:
+        """The surrogate against the model where the draws are, and the draws against each other."""
+        count = self.checks
+        return [
+            ApproximationCheck(
+                "log-likelihoods by the surrogate and by the model at draws, standard deviation",
+                error,
+                self.tolerance,
+                count,
+                count,
+            ),
+            ApproximationCheck(
+                f"effective draws ({draws.effective.min():.0f}, autocorrelation over "
+                f"{draws.autocorrelation_time.max():.0f} steps), how many times too few",
+                self.sampler.least_effective / float(draws.effective.min()),
+                1.0,
+                len(draws.points),
+            ),
+            ApproximationCheck(
+                "disagreement of chains, R-hat",
+                float(draws.r_hat.max()),
+                self.sampler.largest_r_hat,
+                len(draws.points),
+            ),
+        ]
 
     def _reason(self, draws: Draws, error: float) -> Reason:
         good = error <= self.tolerance and draws.enough(self.sampler)

@@ -58,6 +58,9 @@ class UnscentedFilter:
         Distance of the points from their mean, in parts of the simplex whose covariance is P.
     max_rejections : int
         How often the points are drawn together in one round.
+    check_runs : int
+        Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
+        axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
 
     Raises
     ------
@@ -69,6 +72,7 @@ class UnscentedFilter:
     max_iterations: int = 15
     spread: float = 1.0
     max_rejections: int = 6
+    check_runs: int = 0
 
     def __post_init__(self) -> None:
         require_settings(tolerance=self.tolerance, max_iterations=self.max_iterations)
@@ -89,7 +93,7 @@ class UnscentedFilter:
         on_iterate: OnIterate | None = None,
     ) -> Estimate:
         """Estimate without derivatives; see `Filter` for the arguments."""
-        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate, self.check_runs)
         L = run.prior.factor
         unit = Gaussian(np.zeros(prior.size), np.eye(prior.size))
         at, before = unit, unit

@@ -1,0 +1,217 @@
+"""Is a posterior what a filter took it for? Its Gaussian against runs of the model themselves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mvest.errors import InputError
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.update import kalman_update
+from mvest.typing import FloatArray
+
+__all__ = ["ApproximationCheck", "check_against_runs", "principal_points", "worst"]
+
+DISTANCE_LIMIT = 0.25
+"""Error of a distance of one standard deviation. Twice as far a distance is wrong by about four
+times as much: an end of a 95 % interval by a fifth of the interval."""
+
+STEP_LIMIT = 0.5
+"""Standard deviations by which one more update may move an estimate."""
+
+TIMES_LIMIT = 2.0
+"""How many times too far from the estimate, or too near, a place may be in the posterior, where it
+is not beyond `BEYOND` both there and by the model."""
+
+BEYOND = 6.0
+"""Standard deviations further than which a place is out of the question."""
+
+NEAREST, FURTHEST = 0.2, 10.0
+"""Standard deviations between which a run tells of the curvature: rounding hides it nearer by, and
+further away it is that of another place."""
+
+LEVEL = 0.95
+"""Probability of the region in which a posterior is to be a Gaussian."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One run of the model: filter coordinates (p,), prediction (n,) and, if known, H (n, p)."""
+
+    z: FloatArray
+    y: FloatArray
+    H: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ApproximationCheck:
+    """One statement of a filter about its own posterior, against what it should be.
+
+    Attributes
+    ----------
+    compared : str
+        What was compared with what.
+    value : float
+        How far they differ; infinite where that could not even be told.
+    limit : float
+        Largest value at which the estimate's interval means what it says.
+    runs : int
+        Runs of the model that it rests on.
+    extra_runs : int
+        Of these, how many were made for it.
+    """
+
+    compared: str
+    value: float
+    limit: float
+    runs: int
+    extra_runs: int = 0
+
+    def __post_init__(self) -> None:
+        if np.isnan(self.value) or not self.limit > 0.0:
+            raise InputError(
+                f"a check needs a value and a positive limit; got {self.value} and {self.limit}"
+            )
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is within the limit."""
+        return self.value <= self.limit
+
+    @property
+    def sentence(self) -> str:
+        """The comparison in words."""
+        verdict = "within" if self.holds else "above"
+        return (
+            f"{self.compared}: {self.value:.2g}, {verdict} {self.limit:g} "
+            f"({self.runs} {'run' if self.runs == 1 else 'runs'})"
+        )
+
+
+def worst(checks: Sequence[ApproximationCheck]) -> ApproximationCheck | None:
+    """The check that is furthest beyond, or nearest to, its limit; None of none."""
+    return max(checks, key=lambda check: check.value / check.limit, default=None)
+
+
+def check_against_runs(
+    *,
+    y: FloatArray,
+    noise: ObservationNoise,
+    prior: Gaussian,
+    posterior: Gaussian,
+    predicted: FloatArray,
+    H: FloatArray,
+    runs: Sequence[Run],
+    extra_runs: int = 0,
+) -> list[ApproximationCheck]:
+    """Compare N(z, P) with the objective J at runs of the model, and with one more update.
+
+    Were the posterior N(z, P), a point at the distance δ = |C⁻¹ (zₖ − z)|, P = C Cᵀ, would have
+    τ = √(2 (J(zₖ) − J(z))) = δ, the profile of Bates and Watts (Nonlinear Regression Analysis and
+    Its Applications, 1988, section 6.1). Two comparisons are made at every run:
+
+    * τ with δ, wherever either says that the point is probable, and roughly where either says that
+      it is not out of the question. A place that is as likely as the estimate, but lies far beyond
+      its intervals, is seen so.
+    * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², brought
+      to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)) and
+      a = W H (zₖ − z)/δ it changes J at a distance of ± 1 by −(q/δ²)·(e ∓ a) + ½ |q/δ²|².
+      A run with derivatives tells ½ W (Hₖ − H) C u/δ of other directions u as well.
+
+    Further, with H and e an update of the prior should lead to N(z, P) itself.
+
+    Parameters
+    ----------
+    y : (n,)
+    noise : ObservationNoise
+    prior, posterior : Gaussian
+        In filter coordinates.
+    predicted : (n,)
+        At the posterior's mean.
+    H : (n, p)
+        Derivative, or slope, of the prediction there.
+    runs : sequence of Run
+    extra_runs : int
+        How many of the runs were made for the check.
+    """
+    z, C = posterior.mean, posterior.factor
+    e = noise.whiten(y - predicted)
+    WH = noise.whiten(H)
+
+    def objective(at: FloatArray, residual: FloatArray) -> float:
+        x = _coordinates(prior.factor, at - prior.mean)[0]
+        return 0.5 * float(residual @ residual + x @ x)
+
+    here = objective(z, e)
+    probable = float(np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * z.size, LEVEL)))
+    compared = 0
+    apart: list[float] = []
+    times: list[float] = []
+    curved: list[float] = []
+    for run in runs:
+        d = run.z - z
+        u, fixed = _coordinates(C, d)
+        delta = float(np.linalg.norm(u))
+        if delta < NEAREST or fixed:
+            continue
+        compared += 1
+        residual = noise.whiten(y - run.y)
+        tau = _signed_root(2.0 * (objective(run.z, residual) - here))
+        if min(delta, tau) <= probable:
+            apart.append(abs(tau - delta) / max(delta, 1.0))
+        if min(delta, tau) <= BEYOND:
+            times.append(max(delta, tau) / max(min(delta, tau), NEAREST) - 1.0)
+        if delta <= FURTHEST:
+            q = (e - residual - WH @ d) / delta**2
+            curved.append(_change_of_distance(q, e, WH @ d / delta))
+            if run.H is not None:
+                M = noise.whiten(run.H - H) @ C * (0.5 / delta)
+                for v in np.linalg.svd(M, full_matrices=False)[2]:
+                    curved.append(_change_of_distance(M @ v, e, WH @ (C @ v)))
+
+    checks = []
+    for values, limit, what in (
+        (apart, DISTANCE_LIMIT, "error of distances from the estimate in the posterior"),
+        (times, TIMES_LIMIT, "times too far or too near that the posterior holds a place to be"),
+        (curved, DISTANCE_LIMIT, "curvature of the model over one posterior standard deviation"),
+    ):
+        if values:
+            checks.append(ApproximationCheck(what, max(values), limit, compared, extra_runs))
+    update = kalman_update(prior, y - predicted + H @ (z - prior.mean), H, noise)
+    step = _coordinates(C, update.posterior.mean - z)[0]
+    checks.append(
+        ApproximationCheck(
+            "one more update moves the estimate by standard deviations",
+            float(np.linalg.norm(step)),
+            STEP_LIMIT,
+            1,
+        )
+    )
+    return checks
+
+
+def principal_points(posterior: Gaussian, count: int) -> FloatArray:
+    """Points (count, p) at ± 1 standard deviation along the principal axes, widest axis first."""
+    values, axes = np.linalg.eigh(posterior.covariance)
+    steps = (axes * np.sqrt(np.maximum(values, 0.0))).T[::-1]
+    both = np.stack([steps, -steps], axis=1).reshape(-1, posterior.size)
+    return posterior.mean + both[: min(count, len(both))]
+
+
+def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray) -> float:
+    """Error of the distance 1 in the direction a (n,), to either side, by the curvature q (n,)."""
+    changes = [0.5 * float(q @ q) - float(q @ (e - sign * a)) for sign in (1.0, -1.0)]
+    return max(abs(_signed_root(1.0 + 2.0 * change) - 1.0) for change in changes)
+
+
+def _coordinates(factor: FloatArray, offset: FloatArray) -> tuple[FloatArray, bool]:
+    """C⁻¹ d (p,), and whether part of d lies where the Gaussian holds everything fixed."""
+    u = np.asarray(np.linalg.lstsq(factor, offset, rcond=None)[0], dtype=np.float64)
+    left = np.linalg.norm(factor @ u - offset)
+    return u, bool(left > 1e-6 * np.linalg.norm(offset))
+
+
+def _signed_root(value: float) -> float:
+    return float(np.sign(value) * np.sqrt(abs(value)))

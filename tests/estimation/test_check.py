@@ -1,0 +1,191 @@
+"""Filters say where their posterior is not what they take it for, and only there."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.estimation import (
+    ApproximationCheck,
+    EnsembleFilter,
+    ExtendedFilter,
+    Gaussian,
+    IteratedFilter,
+    Log,
+    MonteCarloFilter,
+    PaperFilter,
+    Prediction,
+    Reason,
+    SamplerSettings,
+    UnscentedFilter,
+)
+from tests.estimation.problems import Linear, banana, gridded, wings
+
+BENT = Gaussian(np.array([0.3, 0.0]), np.eye(2))
+"""Prior of the banana, not quite on its axis of symmetry."""
+
+
+@pytest.mark.parametrize(("y", "R"), [(0.0, 0.01), (1.0, 0.05), (2.0, 0.01)])
+@pytest.mark.parametrize(
+    "filter_",
+    [
+        IteratedFilter(check_runs=2),
+        ExtendedFilter(check_runs=2),
+        UnscentedFilter(),
+        EnsembleFilter(members=30),
+        EnsembleFilter(members=30, steps=4),
+    ],
+    ids=["iterated", "extended", "unscented", "ensemble", "smoother"],
+)
+def test_no_gaussian_filter_passes_a_banana_for_an_ellipse(filter_, y, R) -> None:
+    found = filter_(banana, BENT, np.array([y]), R)
+    assert found.converged
+    assert not found.trusted
+    assert found.check is not None
+    assert not found.check.holds
+    assert "but the posterior is not what the filter assumes: " in found.why
+    assert found.check.sentence in str(found)
+
+
+def test_a_filter_that_sits_in_one_of_two_wings_says_so() -> None:
+    # h = x² + x/10 of a normal x: wings about ± 1.1, in one of which the filter ends.
+    prior = Gaussian(np.array([0.05]), np.eye(1))
+    y, R = np.array([1.3]), 0.05
+    mean, std = gridded(wings, prior, y, R)
+    found = UnscentedFilter()(wings, prior, y, R)
+    assert found.reason is Reason.CONVERGED
+    assert abs(found.mean[0] - mean[0]) > 5 * found.std[0]
+    assert found.std[0] < 0.3 * std[0]
+    assert not found.trusted
+    # What gives it away is a run far from the estimate that is as likely.
+    assert found.check is not None
+    assert "times too far" in found.check.compared
+
+
+@pytest.mark.parametrize("p", [1, 2, 5])
+def test_nobody_cries_wolf_on_linear_models(p) -> None:
+    filters = [
+        IteratedFilter(check_runs=2 * p),
+        ExtendedFilter(check_runs=2 * p),
+        UnscentedFilter(check_runs=2 * p),
+        EnsembleFilter(check_runs=2 * p),
+        EnsembleFilter(steps=4),
+        PaperFilter(),
+    ]
+    for seed in range(20):
+        problem = Linear(p=p, seed=seed)
+        for filter_ in filters:
+            found = filter_(problem.differentiated, problem.prior, problem.y, problem.R)
+            assert found.trusted, (seed, filter_, found.why)
+            assert found.check is not None
+            # An exact quadratic; the paper's filter stops a little before its fixed point.
+            if not isinstance(filter_, PaperFilter):
+                assert found.check.value < 1e-6 * found.check.limit
+
+
+TIMES = np.linspace(0.1, 3.0, 12)
+
+
+def decays(m):
+    """A hyperbola and an exponential, each of one positive parameter."""
+    a, b = m
+    if min(m) <= 0.0:
+        return Prediction.failed("not positive")
+    falling, dying = 8.0 / (1.0 + a * TIMES), 3.0 * np.exp(-b * TIMES / 3.0)
+    none = np.zeros_like(TIMES)
+    jacobian = np.column_stack(
+        [np.r_[-(falling**2) * TIMES / 8.0, none], np.r_[none, -TIMES / 3.0 * dying]]
+    )
+    return Prediction(np.r_[falling, dying], jacobian)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.3])
+def test_false_alarms_on_mildly_nonlinear_models_are_rare(noise) -> None:
+    # On a grid both filters are within 0.3 standard deviations and 25 % of the posterior for every
+    # one of these seeds, so that every alarm would be false.
+    prior = Gaussian(np.array([6.0, 2.0]), np.diag([1.8, 0.6]) ** 2)
+    alarms = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        truth = np.array([6.0, 2.0]) * np.exp(0.3 * rng.standard_normal(2))
+        y = decays(truth).y + noise * rng.standard_normal(24)
+        for filter_ in (IteratedFilter(check_runs=4), UnscentedFilter(check_runs=4)):
+            found = filter_(decays, prior, y, noise**2, transform=Log())
+            alarms += not found.trusted
+    assert alarms <= 1
+
+
+def lorenz(states):
+    """Lorenz 63 from states (k, 3): the first component at ten times within 1.5 units, (k, 10)."""
+
+    def rate(s):
+        x, y, z = s
+        return np.array([10.0 * (y - x), x * (28.0 - z) - y, x * y - 8.0 / 3.0 * z])
+
+    s, step, seen = np.array(states, dtype=float).T, 0.01, []
+    for k in range(150):
+        a = rate(s)
+        b = rate(s + 0.5 * step * a)
+        c = rate(s + 0.5 * step * b)
+        s = s + step / 6.0 * (a + 2.0 * b + 2.0 * c + rate(s + step * c))
+        if k % 15 == 14:
+            seen.append(s[0])
+    return np.array(seen).T
+
+
+def test_an_ensemble_on_lorenz_63_says_that_it_failed() -> None:
+    truth, rng = np.array([1.5, -1.5, 25.5]), np.random.default_rng(2)
+    prior = Gaussian(truth + rng.standard_normal(3), np.eye(3))
+    y = lorenz(truth[None])[0] + rng.standard_normal(10)
+    found = EnsembleFilter(members=100)(
+        lambda m: Prediction.undifferentiated(lorenz(m[None])[0]), prior, y, 1.0
+    )
+    assert found.reason is Reason.COMPLETED
+    # The posterior by weighted draws from the prior, some 3000 of 50 000 effective.
+    drawn = prior.mean + rng.standard_normal((50_000, 3))
+    misfit = 0.5 * np.sum((y - lorenz(drawn)) ** 2, axis=1)
+    weights = np.exp(misfit.min() - misfit)
+    weights /= weights.sum()
+    mean = weights @ drawn
+    std = np.sqrt(weights @ (drawn - mean) ** 2)
+    assert np.max(np.abs(found.mean - mean) / std) > 0.6
+    assert not found.trusted
+
+
+def test_check_runs_are_as_many_as_asked_for_and_counted() -> None:
+    problem = Linear(p=3)
+    without, with_two = (
+        IteratedFilter(check_runs=n)(problem.differentiated, problem.prior, problem.y, problem.R)
+        for n in (0, 2)
+    )
+    assert with_two.forward_solves == without.forward_solves + 2
+    np.testing.assert_array_equal(with_two.mean, without.mean)
+    # There are 2 p points and no more.
+    all_ = IteratedFilter(check_runs=100)(problem.differentiated, problem.prior, problem.y, 1.0)
+    assert all_.forward_solves == 2 + 6
+
+
+def test_a_number_of_check_runs_must_not_be_negative() -> None:
+    problem = Linear(p=1)
+    with pytest.raises(InputError, match="check_runs must not be negative; got -1"):
+        IteratedFilter(check_runs=-1)(problem.differentiated, problem.prior, problem.y, 1.0)
+
+
+def test_a_check_is_about_its_limit() -> None:
+    assert ApproximationCheck("a", 0.2, 0.25, 1).holds
+    assert not ApproximationCheck("a", np.inf, 0.25, 1).holds
+    with pytest.raises(InputError, match="a check needs a value"):
+        ApproximationCheck("a", np.nan, 0.25, 1)
+
+
+def test_a_surrogate_that_never_holds_its_draws_ends_loudly() -> None:
+    # The likelihood of a hundredth of the prior's width, along a curve: no box about the draws of
+    # one round holds those of the next.
+    few = SamplerSettings(chains=2, walkers=16, steps=200)
+    found = MonteCarloFilter(max_rounds=3, degree=2, sampler=few)(
+        banana, BENT, np.array([0.0]), 1e-4
+    )
+    assert found.reason is Reason.NOT_SAMPLED
+    assert not found.trusted
+    assert found.check is not None
+    assert np.isfinite(found.check.value)
+    assert "inf" not in found.why + found.detail
