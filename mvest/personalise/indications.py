@@ -48,6 +48,9 @@ def indications_of(fit: Personalised) -> Indications:
         estimated=True,
         ended=f"{result.reason} ({result.detail})" if result.detail else result.reason,
         converged=result.converged,
+        approximation=None
+        if filtered.check is None
+        else ("" if filtered.check.holds else filtered.check.sentence),
         nis=None if innovation is None else innovation.nis / innovation.size,
         nis_band=None
         if innovation is None

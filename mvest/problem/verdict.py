@@ -109,8 +109,8 @@ class Indications:
     ended : str
         Why the estimation ended.
     converged : bool
-    approximation : str
-        What is wrong with the filter's approximation of the posterior, if that was looked into.
+    approximation : str or None
+        What is wrong with the filter's approximation of the posterior; empty if nothing is.
     nis : float or None
         Normalised innovation squared over the number of observations.
     nis_band : (float, float) or None
@@ -135,7 +135,7 @@ class Indications:
     estimated: bool
     ended: str = ""
     converged: bool = True
-    approximation: str = ""
+    approximation: str | None = None
     nis: float | None = None
     nis_band: tuple[float, float] | None = None
     stretch: Mapping[str, float] = field(default_factory=dict)
@@ -213,7 +213,9 @@ def _ended(e: Indications) -> Seen:
 
 
 def _approximated(e: Indications) -> Seen:
-    if e.approximation:
+    if e.approximation is None:
+        yield None
+    elif e.approximation:
         yield Ground(
             "approximation",
             DOUBTFUL,

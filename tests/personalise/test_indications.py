@@ -32,6 +32,8 @@ def test_a_world_as_stated_is_trusted(fit):
     seen = indications_of(found)
     assert seen.estimated
     assert seen.converged
+    assert seen.approximation == ""
+    assert found.result.filtered.check is not None
     assert seen.nis_band[0] <= seen.nis <= seen.nis_band[1]
     assert abs(seen.alike) < 0.1
     assert seen.residual_mm < seen.generic_mm
@@ -79,3 +81,12 @@ def test_without_an_estimate_there_is_its_reason(monkeypatch):
     assert not seen.estimated
     assert found.result.reason in seen.ended
     assert judge(seen).trust == NONE
+
+
+def test_a_posterior_that_is_not_the_filters_is_named(fit):
+    found = fit()
+    filtered = found.result.filtered
+    bent = replace(filtered, check=replace(filtered.check, value=3 * filtered.check.limit))
+    seen = indications_of(replace(found, result=replace(found.result, filtered=bent)))
+    assert seen.approximation == bent.check.sentence
+    assert "approximation" in [ground.check for ground in judge(seen).grounds]

@@ -21,6 +21,7 @@ from mvest.problem.verdict import (
 
 GOOD = Indications(
     estimated=True,
+    approximation="",
     nis=1.01,
     nis_band=(0.96, 1.04),
     stretch={"pressure_scale": -1.2, "smooth part of the errors": 0.4},
@@ -104,7 +105,7 @@ def test_the_worst_ground_decides_and_stands_first():
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(Indications(estimated=True))
-    assert len(verdict.missing) == 8
+    assert len(verdict.missing) == 9
     # Of these, four are needed.
     assert verdict.trust == DOUBTFUL
     assert [ground.check for ground in verdict.grounds] == list(NEEDED)
