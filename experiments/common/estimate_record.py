@@ -61,11 +61,18 @@ def moduli_error(result: StudyResult) -> Spread | None:
 
 
 def innovation_of(filtered: Estimate | None) -> Innovation | None:
-    """What of the observation the first prediction leaves over."""
+    """What of the observation the prior leaves over, and what the estimate."""
     summary = None if filtered is None else filtered.innovation
     if summary is None:
         return None
-    return Innovation(summary.size, summary.rms, summary.max_abs, summary.nis, summary.nis_band)
+    return Innovation(
+        summary.size,
+        summary.rms,
+        summary.max_abs,
+        summary.nis,
+        summary.nis_band,
+        summary.residual_rms,
+    )
 
 
 def identified_of(result: StudyResult) -> Identified | None:

@@ -56,6 +56,8 @@ class InnovationSummary:
         Number n of observations.
     rms, max_abs : float, in units of the observation
         Root mean square and largest absolute value of e.
+    residual_rms : float, in units of the observation
+        Root mean square of the residual y − h(z), of the estimate itself.
     nis : float
         eᵀ S⁻¹ e, chi-square with n degrees of freedom if the model and its covariances are right.
     nis_band : (float, float)
@@ -69,18 +71,22 @@ class InnovationSummary:
     size: int
     rms: float
     max_abs: float
+    residual_rms: float
     nis: float
     nis_band: tuple[float, float]
     log_likelihood: float
     standardised: FloatArray
 
     @classmethod
-    def of(cls, innovation: FloatArray, update: Update) -> "InnovationSummary":
-        """Summarise the innovation of one update."""
+    def of(
+        cls, innovation: FloatArray, update: Update, residual: FloatArray
+    ) -> "InnovationSummary":
+        """Summarise the innovation of one update, and the residual of what came of it."""
         return cls(
             size=innovation.size,
             rms=float(np.sqrt(np.mean(innovation**2))),
             max_abs=float(np.max(np.abs(innovation))),
+            residual_rms=float(np.sqrt(np.mean(residual**2))),
             nis=update.nis,
             nis_band=chi_square_band(innovation.size),
             log_likelihood=update.log_likelihood,

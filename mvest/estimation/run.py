@@ -153,7 +153,7 @@ class FilterRun:
         What was ``learned`` of the noise widens the covariance. ``prior`` is what was updated last,
         if that is not the prior of the problem.
         """
-        summary = InnovationSummary.of(innovation, update)
+        summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
         # Of the posterior with the noise as it is; what widens it has no part in the model's form.
         check = self.check(prediction, prior=prior)
         if learned is not None:
@@ -230,7 +230,7 @@ class FilterRun:
         update = kalman_update(self.prior, innovation, H, self.noise)
         objective = self.misfit(prediction) + self.prior_term(z)
         self.record(z, P, objective, update.log_likelihood)
-        summary = InnovationSummary.of(innovation, update)
+        summary = InnovationSummary.of(innovation, update, self.y - prediction.y)
         check = worst(checks) if samples is not None else self.check(prediction, others=checks)
         return self._estimate(reason, detail, prediction, summary, samples, check)
 

@@ -47,9 +47,10 @@ def spread(values: FloatArray | None) -> Spread | None:
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """What of the ``size`` numbers observed the first prediction leaves over, in their unit.
+    """What of the ``size`` numbers observed the prior leaves over, in their unit.
 
-    ``nis`` is the normalised innovation squared; 95 % of such values lie in ``nis_band``.
+    It is linearised at the estimate. ``nis`` is the normalised innovation squared; 95 % of such
+    values lie in ``nis_band``. ``residual_rms`` is what the estimate itself leaves over.
     """
 
     size: int
@@ -57,6 +58,7 @@ class Innovation:
     max_abs: float
     nis: float
     nis_band: tuple[float, float]
+    residual_rms: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

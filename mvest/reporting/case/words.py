@@ -274,7 +274,9 @@ def innovation_words(innovation: Innovation | None) -> list[str]:
     # About 1 if all is as assumed.
     over_expected = number(math.sqrt(nis / size)) if size else MISSING
     return [
-        f"Root mean square of the {_large(size)} innovations: {number(innovation.rms)} mm; over "
+        f"Root mean square of the {_large(size)} innovations (observed less what the prior "
+        f"predicts, linearised at the estimate): {number(innovation.rms)} mm, of the residuals "
+        f"(observed less fitted) {number(innovation.residual_rms)} mm; innovations over "
         f"what is expected of each where model and noise are as assumed: {over_expected}.",
         f"Normalised innovation squared {_large(nis)}, "
         f"{'inside' if low <= nis <= high else 'OUTSIDE'} its 95 % band {_large(low)} to "

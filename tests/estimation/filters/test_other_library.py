@@ -1,0 +1,70 @@
+"""The filters beside filterpy's, which was written by others from other books."""
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
+
+from mvest.estimation import (
+    EnsembleFilter,
+    ExtendedFilter,
+    Gaussian,
+    IteratedFilter,
+    PaperFilter,
+    Prediction,
+    UnscentedFilter,
+)
+from tests.estimation.problems import Linear, saturating
+
+
+def test_on_a_linear_model_all_filters_are_filterpys_kalman_filter() -> None:
+    problem = Linear(n=12, p=4, seed=5)
+    other = KalmanFilter(dim_x=4, dim_z=12)
+    other.x, other.P = problem.prior.mean.copy(), problem.prior.covariance.copy()
+    other.H, other.R = problem.H, np.diag(problem.R)
+    other.update(problem.y)
+    for filter_ in (
+        IteratedFilter(),
+        ExtendedFilter(),
+        UnscentedFilter(),
+        EnsembleFilter(members=12),
+        EnsembleFilter(members=12, steps=3),
+    ):
+        found = filter_(problem.differentiated, problem.prior, problem.y, problem.R)
+        np.testing.assert_allclose(found.mean, np.ravel(other.x), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, other.P, rtol=1e-8, atol=1e-12)
+        assert found.innovation is not None
+    # The innovation and its likelihood are those of the prior, not of the posterior.
+    found = IteratedFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    assert found.innovation is not None
+    np.testing.assert_allclose(found.innovation.log_likelihood, other.log_likelihood, rtol=1e-9)
+    innovation = np.ravel(other.y)
+    np.testing.assert_allclose(found.innovation.rms, np.sqrt(np.mean(innovation**2)), rtol=1e-9)
+    left = problem.y - problem.H @ np.ravel(other.x)
+    np.testing.assert_allclose(found.residual_rms(problem.y), np.sqrt(np.mean(left**2)), rtol=1e-9)
+
+
+def test_one_update_of_a_nonlinear_model_is_filterpys_extended_filter() -> None:
+    prior, y, R = Gaussian(np.array([0.7]), np.array([[0.3]])), np.array([0.3, 0.9]), 0.04
+    other = ExtendedKalmanFilter(dim_x=1, dim_z=2)
+    other.x, other.P, other.R = prior.mean.copy(), prior.covariance.copy(), R * np.eye(2)
+    other.update(y, lambda m: saturating(m).jacobian, lambda m: saturating(m).y)
+    found = ExtendedFilter()(saturating, prior, y, R)
+    np.testing.assert_allclose(found.mean, np.ravel(other.x), rtol=1e-12)
+    np.testing.assert_allclose(found.covariance, other.P, rtol=1e-12)
+
+
+def test_rounds_of_the_papers_filter_are_filterpys_predictions_and_updates() -> None:
+    rng = np.random.default_rng(2)
+    H = rng.standard_normal((9, 3))
+    prior, Q, R = Gaussian(np.ones(3), 0.5 * np.eye(3)), 0.01, 0.2
+    y = H @ np.array([2.0, -1.0, 0.5]) + rng.standard_normal(9)
+    other = KalmanFilter(dim_x=3, dim_z=9)
+    other.x, other.P, other.F = prior.mean.copy(), prior.covariance.copy(), np.eye(3)
+    other.H, other.R, other.Q = H, R * np.eye(9), Q * np.eye(3)
+    found = PaperFilter(Q=Q, tolerance=1e-12, max_iterations=6)(
+        lambda m: Prediction(H @ m, H), prior, y, R
+    )
+    for mean, covariance in zip(found.iterates, found.iterate_covariances, strict=True):
+        np.testing.assert_allclose(mean, np.ravel(other.x), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(covariance, other.P, rtol=1e-8, atol=1e-12)
+        other.predict()
+        other.update(y)
