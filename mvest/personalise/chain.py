@@ -18,7 +18,7 @@ from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import ObservationNoise, observation_noise
+from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
 from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import Log, to_filter
@@ -35,6 +35,7 @@ from mvest.observation.surfaces import (
     surface_distance,
 )
 from mvest.observation.vertices import Observation
+from mvest.personalise.considered_geometry import geometry_columns
 from mvest.personalise.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
@@ -93,9 +94,12 @@ def personalise_case(
     start = chain.shared.start
     generic = chain.shared(start)
     seconds = {"generic": time.perf_counter() - started}
-    if case.error_samples is not None and generic.converged:
+    doubtful = case.error_samples is not None or settings.considered_geometry is not None
+    if generic.converged and doubtful:
         began = time.perf_counter()
-        chain.sample_geometry(generic.y)
+        chain.consider_geometry(start, generic.y)
+        if case.error_samples is not None:
+            chain.sample_geometry(generic.y)
         seconds["geometry"] = time.perf_counter() - began
 
     def timed(part: str, began: float) -> None:
@@ -105,7 +109,7 @@ def personalise_case(
     began = time.perf_counter()
     before = chain.closed_frames(start, generic.y) if generic.converged else {}
     timed("held_out", began)
-    result = chain.estimate(chain.filter, chain.observation())
+    result = chain.renewed(chain.estimate(chain.filter, chain.observation()))
     seconds["estimate"] = result.seconds
     frames = _Frames({}, {}, {}, ())
     narrower: Mapping[str, FloatArray] = {}
@@ -162,6 +166,9 @@ def expect_case(
     Errors that samples of the frames tell of are left out: each sample would be a closure.
     """
     chain = _Chain(case, settings, store, on_step)
+    generic = chain.shared(chain.shared.start)
+    if generic.converged:
+        chain.consider_geometry(chain.shared.start, generic.y)
     return expect(chain.problem(chain.filter), chain.observation())
 
 
@@ -210,7 +217,80 @@ class _Chain:
         self.estimated = np.array([name not in considered for name in self.names])
         self.geometry: GeometryErrors | None = None
         self.errors: SampledErrors | None = None
+        self.considered: tuple[ErrorColumns, ...] = ()
         self._family: NoiseFamily | None = None
+
+    def consider_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
+        """Find out what the geometry, as far as it is not known, does to the observation at ``m``.
+
+        Parameters
+        ----------
+        m : (p,)
+        predicted : array
+            Both frames there, stacked.
+        """
+        if self.settings.considered_geometry is None:
+            return
+        columns = geometry_columns(
+            self.case,
+            self.settings.considered_geometry,
+            self.registered,
+            self.plain_observation(),
+            m,
+            predicted,
+        )
+        if isinstance(columns, str):
+            return  # what is known of them from elsewhere serves
+        self.considered = columns
+        if self.errors is not None:
+            self.errors = replace(self.errors, base=self.noise())
+
+    def renewed(self, result: StudyResult) -> StudyResult:
+        """The estimation once more, with the geometry's errors as they are at its estimate."""
+        if not self.considered or result.estimate is None:
+            return result
+        prediction = self.registered(result.estimate)
+        if not prediction.converged:
+            return result
+        self.consider_geometry(result.estimate, prediction.y)
+        filter_ = self.filter
+        if isinstance(filter_, IteratedFilter):
+            filter_ = replace(filter_, start=tuple(result.estimate.tolist()))
+        again = self.estimate(filter_, self.observation())
+        if again.estimate is None:
+            return result
+        return replace(again, seconds=result.seconds + again.seconds)
+
+    def noise(
+        self, learned: LearnedNoise | None = None, *, geometry: float = 1.0, stated: bool = False
+    ) -> ObservationNoise:
+        """Noise of the observation without that of error samples.
+
+        Parameters
+        ----------
+        learned : LearnedNoise, optional
+            By which it is known, and not as it is stated.
+        geometry : float
+            Factor on what the considered geometry adds.
+        stated : bool
+            See `plain_observation`.
+        """
+        family, count = self.single_errors, len(self.considered)
+        scales: FloatArray = np.ones(count)
+        if family is None:
+            observation = self.plain_observation(stated=stated)
+            base = observation_noise(observation.R, len(observation.y))
+        else:
+            log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
+            base = family.without_columns().at(log[: len(log) - count])
+            scales = np.exp(log[len(log) - count :])
+        if not self.considered or not geometry:
+            return base
+        columns = [
+            geometry * scale * own.columns
+            for scale, own in zip(scales, self.considered, strict=True)
+        ]
+        return low_rank_noise(base, np.concatenate(columns, axis=1))
 
     def sample_geometry(self, generic: FloatArray) -> None:
         """Find out what errors of the case's frames do to the observation.
@@ -226,10 +306,8 @@ class _Chain:
         )
         if geometry.too_few:
             raise GeometryError(f"case {self.case.name}: {geometry.too_few}")
-        observation = self.plain_observation()
-        single = self.single_errors
-        base = observation_noise(observation.R if single is None else single, len(observation.y))
-        self.errors = SampledErrors(base, errors_of(observation, self.closed, generic, geometry))
+        errors = errors_of(self.plain_observation(), self.closed, generic, geometry)
+        self.errors = SampledErrors(self.noise(), errors)
 
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""
@@ -239,19 +317,26 @@ class _Chain:
                 columns = self.errors.samples / np.sqrt(self.errors.count)
                 single = single.plus(ErrorColumns("geometry", columns))
             return WeighedObservation(plain, single)
-        return plain if self.errors is None else WeighedObservation(plain, self.errors.noise)
+        if self.errors is not None:
+            return WeighedObservation(plain, self.errors.noise)
+        return WeighedObservation(plain, self.noise()) if self.considered else plain
 
     @property
     def single_errors(self) -> NoiseFamily | None:
-        """What is believed of the errors of single observations, where they are learned."""
-        if self.settings.errors is not None and self._family is None:
+        """What is believed of the errors of single observations, where they are learned.
+
+        Those of the considered geometry are added.
+        """
+        if self.settings.errors is None:
+            return None
+        if self._family is None:
             self._family = error_family(
                 self.plain_observation(),
                 self.settings.errors,
                 self.length(),
                 self.case.surface.vertices,
             )
-        return self._family
+        return replace(self._family, columns=self.considered)
 
     def length(self, *, stated: bool = False) -> float:
         """Over how many mm errors are alike: as the case states, always so if ``stated``.
@@ -339,16 +424,11 @@ class _Chain:
         learned = filtered.learned
         if learned is None:
             return self.errors.posterior(H, prior.covariance, estimated)
-        errors = replace(self.errors, base=self._single_noise(learned))
+        errors = replace(self.errors, base=self.noise(learned))
         posterior = errors.posterior(H, prior.covariance, estimated)
         covariance = np.array(posterior.covariance)
         covariance[np.ix_(estimated, estimated)] += learned.covariance
         return replace(posterior, covariance=covariance)
-
-    def _single_noise(self, learned: LearnedNoise) -> ObservationNoise:
-        """Noise of single observations as it was learned, without what was added to it."""
-        assert self._family is not None
-        return self._family.at(learned.posterior.mean[: len(self._family.names)])
 
     def image_share(self, result: StudyResult) -> FloatArray | None:
         """Share of the variance of each modulus' logarithm that errors of the image account for."""
@@ -473,11 +553,8 @@ class _Chain:
         H = filtered.prediction.jacobian * self.transform.derivative(z)
         errors, learned = self.errors, filtered.learned
         doubt = np.zeros_like(prior.covariance)
-        if learned is None:
-            plain = observation_noise(self.plain_observation(stated=True).R, len(H))
-        else:
-            plain = self._single_noise(learned)
-            errors = errors and replace(errors, base=plain)
+        if learned is not None:
+            errors = errors and replace(errors, base=self.noise(learned))
             doubt[np.ix_(self.estimated, self.estimated)] = learned.covariance
         groups = {
             "pressure known": ("pressure_scale",),
@@ -487,7 +564,9 @@ class _Chain:
             "all nuisances known": tuple(n for n in self.names if not n.startswith("E_f.")),
         }
 
-        def linear(P: FloatArray, scale: float = 1.0) -> FloatArray:
+        def linear(P: FloatArray, scale: float = 1.0, geometry: float = 1.0) -> FloatArray:
+            # Errors of the geometry stay what they are where the frame is seen better.
+            plain = self.noise(learned, geometry=scale * geometry, stated=True)
             update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
             return np.sqrt(np.diag(update.posterior.covariance + doubt / scale**2))[moduli]
 
@@ -507,8 +586,8 @@ class _Chain:
                 stds[words] = std(P)
         stds["half the error of the image"] = std(prior.covariance, 2.0)
         stds["a frame without error"] = std(prior.covariance, 1e3)
-        if self.errors is not None:
-            stds["geometry known exactly"] = linear(prior.covariance)
+        if self.errors is not None or self.considered:
+            stds["geometry known exactly"] = linear(prior.covariance, geometry=0.0)
         return stds
 
     def confirm(self, result: StudyResult) -> float | None:

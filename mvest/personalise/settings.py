@@ -12,6 +12,7 @@ from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.learned import ErrorBeliefs
+from mvest.personalise.considered_geometry import ConsideredGeometry
 from mvest.problem.registration import REGISTRATION
 
 __all__ = ["CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
@@ -142,6 +143,9 @@ class PersonaliseSettings:
     errors : ErrorBeliefs or None
         How well the errors are known that the case states: they are learned with the unknowns;
         None takes them as they are stated.
+    considered_geometry : ConsideredGeometry or None
+        How well the geometry is known that the model is built from: what is not counts as an error
+        of the observation. None takes it as it was seen.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -155,6 +159,7 @@ class PersonaliseSettings:
     confirm: bool = False
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
+    considered_geometry: ConsideredGeometry | None = None
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none

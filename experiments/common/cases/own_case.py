@@ -63,6 +63,7 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         personal.confirm,
         personal.correspondence,
         personal.errors,
+        considered_geometry=personal.considered_geometry,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from experiments.common.schema import InputFile, Reads, contents
 from mvest.observation.learned import ErrorBeliefs
+from mvest.personalise.considered_geometry import ConsideredGeometry
 from mvest.personalise.settings import CaseMesh, PaperSettings
 
 __all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
@@ -57,6 +58,7 @@ class PersonalSettings:
     confirm: bool = False  # close the fitted valve anew from the open one
     correspondence: bool = True  # use corresponding vertices as such, where there are any
     errors: ErrorBeliefs | None = None  # learn the errors that the case states
+    considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

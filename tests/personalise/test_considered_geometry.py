@@ -1,0 +1,117 @@
+"""What is not known of the geometry: modes, columns of an observation, and wider intervals."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mvest.closure.rest_geometry import RestGeometry
+from mvest.errors import InputError
+from mvest.estimation.noise_family import ErrorColumns
+from mvest.observation.vertices import Observation
+from mvest.personalise import personalise_case
+from mvest.personalise.considered_geometry import (
+    ConsideredGeometry,
+    geometry_columns,
+    smooth_modes,
+)
+from mvest.problem.registration import RegisteredModel
+from tests.closure.test_model import AT, CLOSING, model_of
+from tests.made_up_closure import FIELDS, made_up_case, settings, use
+
+NONE = ConsideredGeometry(shape_mm=0, annulus_mm=0, tips_mm=0, thickness=0, fibre_degrees=0)
+MODULI = ("E_f.anterior", "E_f.posterior")
+
+
+def test_smooth_modes_have_the_share_of_the_variance_that_is_asked_for():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 30, (300, 3)) * [1, 1, 0]
+    few, many = (smooth_modes(points, 10.0, share) for share in (0.8, 0.99))
+    assert len(few) < len(many) < 300
+    for modes, share in ((few, 0.8), (many, 0.99)):
+        variance = np.sum(modes**2, axis=0)
+        assert share <= variance.mean() < share + 0.03
+        assert variance.max() < 1 + 1e-6
+    # Errors are alike over the length: 10 mm apart by (1 + sqrt 3) exp(-sqrt 3) = 0.48.
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    covariance = many.T @ many
+    assert np.mean(covariance[np.abs(apart - 10.0) < 0.5]) == pytest.approx(0.48, abs=0.03)
+
+
+def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_is_seen():
+    model = model_of(CLOSING, continuation=True)
+    names = (*model.names, "turn.z")
+    registered = RegisteredModel(model, names)
+    m = np.array([*AT, 90.0])
+    predicted = registered(m)
+    assert predicted.converged
+    n = len(model.valve.surface.vertices)
+    case = SimpleNamespace(
+        surface=model.valve.surface, valve=model.valve, error_samples=None, chordae_follow=False
+    )
+    seen = Observation(("closed",), np.zeros((1, n, 3)), np.array(1.0))
+
+    def columns_of(**changes):
+        given = replace(NONE, **changes)
+        return geometry_columns(case, given, registered, seen, m, predicted.y)
+
+    assert columns_of() == ()
+    (fibres,) = columns_of(fibre_degrees=10.0)
+    assert (fibres.name, fibres.factor) == ("fibres", 1.0)
+    change = RestGeometry(model).change(AT, RestGeometry(model).fibres(np.eye(2)))[1]
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    C = np.deg2rad(10.0) * np.einsum("ij,njq->niq", turn, change).reshape(3 * n, 2)
+    np.testing.assert_allclose(
+        fibres.columns @ fibres.columns.T, C @ C.T, atol=1e-3 * (C @ C.T).max()
+    )
+    both = columns_of(shape_mm=0.3, tips_mm=1.0)
+    assert [(own.name, own.factor) for own in both] == [
+        ("open shape", 2.0),
+        ("papillary tips", 1.0),
+    ]
+    twice = columns_of(shape_mm=0.6)[0].columns
+    assert np.linalg.norm(twice) == pytest.approx(2 * np.linalg.norm(both[0].columns), rel=1e-9)
+    # What samples of all frames tell of is not added a second time.
+    case.error_samples = ()
+    assert columns_of(shape_mm=0.3, tips_mm=1.0) == ()
+
+
+def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
+    use(monkeypatch)
+    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
+    where = []
+
+    def columns(case, considered, registered, observation, m, predicted):
+        # As if the anterior belly were not known by 0.2 mm.
+        where.append(m)
+        belly = FIELDS["E_f.anterior"].reshape(-1, 1)
+        return (ErrorColumns("open shape", 0.2 * belly),)
+
+    monkeypatch.setattr("mvest.personalise.chain.geometry_columns", columns)
+    for errors in (None, settings().errors):
+        known = personalise_case(case, settings(errors=errors))
+        doubtful = personalise_case(
+            case, settings(errors=errors, considered_geometry=ConsideredGeometry())
+        )
+        anterior = doubtful.names.index("E_f.anterior")
+        assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
+        exact = doubtful.narrower["geometry known exactly"]
+        assert doubtful.narrower["now"][0] > 1.3 * exact[0]
+        # A frame without error leaves the errors of the geometry as they are.
+        assert (
+            doubtful.narrower["a frame without error"][0]
+            > 5 * known.narrower["a frame without error"][0]
+        )
+    # At the start, and once more at the estimate.
+    np.testing.assert_allclose(where[0], doubtful.prior.mean)
+    np.testing.assert_allclose(where[1], doubtful.result.estimate, rtol=0.05, atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("shape_mm", -0.1), ("shape_length_mm", 0.0), ("factor", 0.5), ("share", 1.0)],
+)
+def test_what_is_no_standard_deviation_is_refused(setting, value):
+    with pytest.raises(InputError, match=f"considered geometry {setting} = "):
+        ConsideredGeometry(**{setting: value})
