@@ -54,8 +54,9 @@ def run(job):
 
 
 def main() -> int:
-    # Tests run in the background of a shell inherit that an interrupt is ignored.
+    # Tests run in the background of a shell, or by nohup, inherit that these are ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     from experiments import cli
     from experiments.runner import guard, sync, tracking
 

@@ -66,9 +66,13 @@ def answer(folder: Path) -> dict[str, object]:
     """What a sweep found, without times and commits."""
     found = json.loads((folder / "outputs" / "sweep_debug" / "sweep.json").read_text())
     runs = [(job["hash"], job["status"], job["runs"][0]["estimate"]) for job in found["jobs"]]
-    tables = {path.name: path.read_bytes() for path in folder.glob("results/*.csv")}
-    cost = tables.pop("sweep_debug_cost.csv", b"")
-    return {"runs": runs, "tables": tables, "cost": bool(cost)}
+    tables = {}
+    for path in folder.glob("results/*.csv"):
+        # Above the rows stands the commit, with a word if the checkout has been changed since.
+        rows = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        # What was spent is never the same.
+        tables[path.name] = len(rows) if "cost" in path.name else rows
+    return {"runs": runs, "tables": tables}
 
 
 def require_whole(folder: Path) -> None:
