@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts, free_orifice
+from mvest.estimation.evidence import LENGTH
 from mvest.estimation.information.consistency import moran
 from mvest.estimation.transform import to_filter
 from mvest.observation.surfaces import SurfaceObservation
@@ -39,7 +40,11 @@ def indications_of(fit: Personalised) -> Indications:
     prior, after = to_filter(filtered.transform, filtered.prior), filtered.transformed
     moved = dict(zip(filtered.names, ((after.mean - prior.mean) / prior.std).tolist(), strict=True))
     if filtered.learned is not None:
-        moved |= {f"{q.name} of the errors": q.stretch for q in filtered.learned.quantities}
+        # Errors smaller than believed contradict nothing.
+        moved |= {
+            f"{q.name} of the errors": q.stretch if q.name == LENGTH else max(q.stretch, 0.0)
+            for q in filtered.learned.quantities
+        }
     ratio = after.std / prior.std
     by_frame = {one.frame: one for one in fit.distances}
     fitted = by_frame.get(closed.name)
