@@ -13,7 +13,7 @@ from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
 from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
-from mvest.closure.robustness import REFERENCE, GateCase
+from mvest.closure.robustness import REFERENCE, GateCase, vary
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
 from mvest.estimation.filters.ensemble import EnsembleFilter
@@ -82,18 +82,10 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     MvestError
         If a setting is inadmissible; the message names it.
     """
-    template = template_of(config)
-    settings = mechanics_of(config)
-    protocol = replace(settings.protocol, dt=settings.protocol.dt * variation.dt)
-    distance = settings.contact.activation_distance * variation.activation
-    settings = replace(
-        settings,
-        protocol=protocol,
-        contact=replace(settings.contact, activation_distance=distance),
-    )
+    template, settings = template_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
     mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh)
-    return ClosureModel(
+    model = ClosureModel(
         template.valve(observed["columns"], observed["rows"]),
         template.valve(**_varied(points, variation.sampling)),
         build_mesh(template, mesh, config["mechanics"]["element"], _meshes(config)),
@@ -101,6 +93,12 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
         tuple(config["parameters"]),
         dict(config["fixed"]),
     )
+    if variation is REFERENCE:
+        return model
+    model = vary(model, replace(variation, mesh=1.0, sampling=1.0, guided=False))
+    if variation.guided:
+        model.guide = guide_of(model, template, mesh)
+    return model
 
 
 def _varied(grid: Values, factor: float) -> dict[str, int]:

@@ -120,6 +120,8 @@ class ClosureModel:
     anchors : Anchors, optional
         Where closed states of this and other models are kept. With ``continuation``, a closure that
         would start from the open valve is continued from the one that belongs to its parameters.
+    perturbation : (n, 3) mm, optional
+        By how much the nodes of the open valve are displaced before they are let go.
     closures : int
         How many closed states have been looked for, those between others included, anchors not.
     """
@@ -138,6 +140,7 @@ class ClosureModel:
     on_step: Callable[[float, int], None] | None = None
     ties: TiedPoints | None = None
     anchors: Anchors | None = None
+    perturbation: FloatArray | None = None
 
     closures: int = field(default=0, init=False)
     _closed: ClosedState | None = field(default=None, init=False, repr=False)
@@ -251,7 +254,7 @@ class ClosureModel:
         guide = "" if self.guide is None else self.guide._digest()
         return content_digest(
             self.valve, self.contact_valve, self.mesh, self.settings, self.names, self.fixed,
-            self.ties, self.repeat, guide,
+            self.ties, self.repeat, guide, self.perturbation,
         )  # fmt: skip
 
     def close(
@@ -341,7 +344,8 @@ class ClosureModel:
                         [*rests, replace(last, time=last.time + sum(REST))], start, end
                     )
         if simulation is None or (self.repeat and not simulation.converged):
-            simulation = run(steps)
+            moved = self.perturbation
+            simulation = run(steps, None if moved is None else self.mesh.nodes + moved)
         if simulation.converged:
             self._closed = ClosedState(
                 np.array(m, dtype=np.float64),

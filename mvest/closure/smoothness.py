@@ -1,0 +1,202 @@
+r"""Does the closed valve jump while a modulus changes? Curvature told from jumps.
+
+A closed state bends with the moduli, and the more the farther they are changed, so that differences
+over wide steps disagree with the derivative in any healthy valve. What a healthy valve does not do
+is jump. With the exact derivative d = dx / d log E at every state, the way from one state to the
+next is known but for what their derivatives do not explain,
+
+.. math:: r = x_b - x_a - \tfrac12 (d_a + d_b) \log (E_b / E_a) .
+
+The trapezoidal rule leaves of a smooth response a third-order term, -x''' h^3 / 12: half the step,
+an eighth. A jump stays whole, whatever the step. A kink (a slope that changes by k) leaves at most
+k h / 2, which falls in proportion. So a piece with too much unexplained is halved, until it is
+explained or narrower than `RESOLUTION`; what is then left is called a jump, with its size, place
+and the number of vertices. Too much is more than `JUMP_LIMIT` at any one vertex, not in the mean;
+or, over all vertices, more than `SLOPE_LIMIT` of the way that the derivatives say, which is what a
+derivative that is wrong everywhere does, and small steps too.
+
+What this cannot see: states that leave and come back between two neighbours; a jump smaller than
+the limit; and whether a change steeper than the resolution is continuous, which to an estimator of
+that modulus is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from mvest.typing import FloatArray
+
+__all__ = ["JUMP_LIMIT", "RESOLUTION", "SLOPE_LIMIT", "Path", "PathState", "Piece", "follow"]
+
+JUMP_LIMIT = 0.1
+"""mm, largest accepted unexplained move of any vertex: what other numerics may move in the mean."""
+SLOPE_LIMIT = 0.05
+"""Largest accepted unexplained part of the way, over all vertices."""
+RESOLUTION = 0.02
+"""Width in log E below which a piece is not halved any more."""
+ROUND_OFF = 1e-6
+"""mm, unexplained moves that are none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathState:
+    """A closed state and its derivative along a path.
+
+    Attributes
+    ----------
+    y : (n, 3) mm
+    slope : (n, 3) mm
+        Per unit of the logarithm of the factor.
+    """
+
+    y: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """From one state to the next.
+
+    Attributes
+    ----------
+    low, high : float
+        Factors on the moduli.
+    unexplained_mm : float
+        Of the vertex at which it is largest.
+    vertices : int
+        How many have more than the limit.
+    share : float
+        The unexplained over the explained way, both as norms over all vertices.
+    """
+
+    low: float
+    high: float
+    unexplained_mm: float
+    vertices: int
+    share: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the derivatives explain the way."""
+        small = self.share <= SLOPE_LIMIT or self.unexplained_mm <= ROUND_OFF
+        return self.unexplained_mm <= JUMP_LIMIT and small
+
+    @property
+    def width(self) -> float:
+        """In log E."""
+        return float(np.log(self.high / self.low))
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Closed states along changing moduli.
+
+    Attributes
+    ----------
+    name : str
+        What is changed.
+    pieces : tuple of Piece
+        In ascending order, after what was halved; up to the first that cannot be explained.
+    curvature : float
+        Largest difference of a central difference over the widest step from the exact derivative in
+        the middle, relative: how much the response bends. No limit is set to it.
+    closures : int
+        How many states were computed, without the middle one.
+    reason : str
+        Why it is not passed; empty if it is.
+    """
+
+    name: str
+    pieces: tuple[Piece, ...]
+    curvature: float
+    closures: int
+    reason: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether every piece is explained."""
+        return not self.reason
+
+
+def follow(
+    name: str,
+    close: Callable[[float], PathState | str],
+    centre: PathState,
+    factors: Sequence[float],
+) -> Path:
+    """Follow closed states along a factor on moduli and judge whether they jump.
+
+    Parameters
+    ----------
+    name : str
+    close : callable
+        Factor -> state, or the reason why there is none.
+    centre : PathState
+        At the factor 1.
+    factors : sequence of float
+        Where else the path is looked at first, below and above 1.
+    """
+    states: dict[float, PathState] = {1.0: centre}
+    tried = 0
+
+    def missing(factor: float) -> str:
+        nonlocal tried
+        tried += 1
+        found = close(factor)
+        if isinstance(found, str):
+            return f"no closed state at {_percent(factor)}: {found}"
+        states[factor] = found
+        return ""
+
+    for factor in factors:
+        if reason := missing(factor):
+            return Path(name, (), float("nan"), tried, reason)
+    curvature = _curvature(states)
+    pieces: list[Piece] = []
+    # The last one is looked at first, so that pieces come in ascending order.
+    waiting = [*pairwise(sorted(states))][::-1]
+    reason = ""
+    while waiting and not reason:
+        low, high = waiting.pop()
+        piece = _piece(low, high, states)
+        if piece.passed or piece.width < RESOLUTION:
+            pieces.append(piece)
+            reason = "" if piece.passed else _fault(piece)
+            continue
+        middle = float(np.sqrt(low * high))
+        reason = missing(middle)
+        waiting += [(middle, high), (low, middle)]
+    return Path(name, tuple(pieces), curvature, tried, reason)
+
+
+def _piece(low: float, high: float, states: dict[float, PathState]) -> Piece:
+    a, b, width = states[low], states[high], np.log(high / low)
+    unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)
+    at_vertex = np.linalg.norm(unexplained, axis=1)
+    way = 0.5 * width * float(np.linalg.norm(a.slope) + np.linalg.norm(b.slope))
+    size = float(np.linalg.norm(unexplained))
+    share = size / way if way > 0 else (0.0 if size == 0 else float("inf"))
+    return Piece(low, high, float(at_vertex.max()), int((at_vertex > JUMP_LIMIT).sum()), share)
+
+
+def _fault(piece: Piece) -> str:
+    where = f"between {_percent(piece.low)} and {_percent(piece.high)}"
+    if piece.unexplained_mm > JUMP_LIMIT:
+        return f"a jump of {piece.unexplained_mm:.2g} mm at {piece.vertices} vertices {where}"
+    return f"{100 * piece.share:.2g} % of the way {where} is not what the derivative says"
+
+
+def _percent(factor: float) -> str:
+    return f"{100 * (factor - 1):+.3g} %"
+
+
+def _curvature(states: dict[float, PathState]) -> float:
+    low, high = min(states), max(states)
+    exact = states[1.0].slope
+    central = (states[high].y - states[low].y) / np.log(high / low)
+    size = float(np.linalg.norm(exact))
+    return float(np.linalg.norm(central - exact)) / size if size > 0 else 0.0

@@ -1,0 +1,155 @@
+"""Made-up closed states along a modulus: curvature passes, jumps do not, kinks as is said of them.
+
+States are of 400 vertices, of which a few may jump: in a mean that would be lost.
+"""
+
+import numpy as np
+import pytest
+
+from mvest.closure.smoothness import (
+    JUMP_LIMIT,
+    RESOLUTION,
+    SLOPE_LIMIT,
+    PathState,
+    _piece,
+    follow,
+)
+
+FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.2)
+FEW = 4
+RNG = np.random.default_rng(1)
+PLACE = RNG.normal(size=(400, 3))
+WAY = RNG.normal(size=(400, 3))
+
+
+def response(shape, slope, jump_at=None, jump=0.0, wrong=1.0):
+    """PLACE + shape(s) WAY, s = log E; a few vertices move by ``jump`` mm above ``jump_at``."""
+
+    def close(factor):
+        s = np.log(factor)
+        y = PLACE + shape(s) * WAY
+        if jump_at is not None and s > jump_at:
+            y[:FEW, 2] += jump
+        return PathState(y, wrong * slope(s) * WAY)
+
+    return close
+
+
+def judged(close, factors=FACTORS):
+    return follow("E_f", close, close(1.0), factors)
+
+
+def waves(size, width):
+    return (lambda s: size * np.sin(s / width), lambda s: size / width * np.cos(s / width))
+
+
+@pytest.mark.parametrize(
+    ("shape", "slope", "curvature"),
+    [
+        # Over 20 % these differ by more from their derivative than any criterion that compares
+        # differences with it could let pass.
+        (lambda s: np.exp(5 * s), lambda s: 5 * np.exp(5 * s), 0.05),
+        (*waves(0.3, 0.08), 0.5),
+        (lambda s: 0.5 * np.tanh(s / 0.05), lambda s: 10 / np.cosh(s / 0.05) ** 2, 0.7),
+    ],
+)
+def test_smooth_responses_pass_however_curved(shape, slope, curvature):
+    path = judged(response(shape, slope))
+    assert path.passed, path.reason
+    assert path.curvature > curvature
+    # Ascending, and without a hole from one end to the other.
+    assert path.pieces[0].low == 0.8
+    assert path.pieces[-1].high == 1.2
+    assert [p.high for p in path.pieces[:-1]] == [p.low for p in path.pieces[1:]]
+
+
+@pytest.mark.parametrize("place", [-0.2, -0.07, -0.03, -0.005, 0.005, 0.03, 0.07, 0.15])
+@pytest.mark.parametrize("curve", [waves(0.1, 0.3), waves(0.3, 0.08)])
+def test_a_jump_of_few_vertices_is_seen_wherever_it_is(place, curve):
+    path = judged(response(*curve, place, 0.3))
+    assert not path.passed
+    last = path.pieces[-1]
+    # It is found with its size and number of vertices, and where it is.
+    assert last.unexplained_mm == pytest.approx(0.3, abs=0.05)
+    assert last.vertices == FEW
+    assert np.log(last.low) <= place <= np.log(last.high)
+    assert last.width < RESOLUTION
+    assert f"at {FEW} vertices" in path.reason
+    assert "a jump of 0.3" in path.reason or "a jump of 0.2" in path.reason
+
+
+def test_the_same_jump_is_invisible_in_the_mean():
+    # 0.3 mm at 4 of 400 vertices: 0.003 mm in the mean; and 1.5 % of the way from 0.8 to 1.2.
+    one, two = (response(*waves(1.0, 1.0), 0.1, jump) for jump in (0.0, 0.3))
+    moved = np.linalg.norm(two(1.2).y - one(1.2).y, axis=1)
+    assert moved.mean() == pytest.approx(0.003)
+    central = (two(1.2).y - two(0.8).y) / np.log(1.5)
+    exact = two(1.0).slope
+    assert np.linalg.norm(central - exact) / np.linalg.norm(exact) < SLOPE_LIMIT
+    assert not judged(two).passed
+
+
+def test_a_jump_within_the_limit_passes_and_one_beyond_does_not():
+    gentle = (lambda s: 0.0 * s, lambda s: 1e3 + 0.0 * s)
+    line = (lambda s: 2.0 * s, lambda s: 2.0 + 0.0 * s)
+    assert judged(response(*line, 0.1, 0.9 * JUMP_LIMIT)).passed
+    assert not judged(response(*line, 0.1, 1.1 * JUMP_LIMIT)).passed
+    assert not judged(response(*gentle)).passed
+
+
+def test_the_unexplained_falls_with_the_third_power_of_the_step_and_a_jump_not_at_all():
+    # Trapezoidal rule: -x''' h^3 / 12 (Abramowitz and Stegun 25.4.1); x''' = 27 e^(3 s).
+    def unexplained(close, h):
+        states = {f: close(f) for f in (1.0, np.exp(h))}
+        return _piece(1.0, np.exp(h), states).unexplained_mm
+
+    smooth = response(lambda s: np.exp(3 * s), lambda s: 3 * np.exp(3 * s))
+    jumping = response(lambda s: 0 * s, lambda s: 0 * s, 0.001, 0.3)
+    steps = np.array([0.2, 0.1, 0.05])
+    errors = np.array([unexplained(smooth, h) for h in steps])
+    assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(3.0, abs=0.25)
+    size = 27 * np.exp(0.075) * 0.05**3 / 12 * np.linalg.norm(WAY, axis=1).max()
+    assert errors[-1] == pytest.approx(size, rel=0.01)
+    assert [unexplained(jumping, h) for h in steps] == pytest.approx([0.3] * 3)
+
+
+@pytest.mark.parametrize(("change", "passes"), [(0.5, True), (40.0, False)])
+def test_a_kink_is_judged_by_what_it_moves_within_the_resolution(change, passes):
+    # A slope of 2 that changes by k at s = 0.003, off the middle of [0, log 1.01]: unexplained
+    # is k |h / 2 - 0.003| WAY, 0.002 k |WAY|, with |WAY| up to 3.5.
+    def shape(s):
+        return 2.0 * s + change * max(s - 0.003, 0.0)
+
+    path = judged(response(shape, lambda s: 2.0 + change * (s > 0.003)))
+    assert path.passed == passes, path.reason
+
+
+def test_a_derivative_that_is_wrong_everywhere_is_seen_by_its_share():
+    # 10 % too large: less than the limit in mm on small steps, but a tenth of the way.
+    right = waves(0.05, 1.0)
+    assert judged(response(*right)).passed
+    path = judged(response(*right, wrong=1.1))
+    assert not path.passed
+    assert "9.1 % of the way" in path.reason
+    assert path.pieces[-1].unexplained_mm < JUMP_LIMIT
+
+
+def test_closures_are_few_where_nothing_is_amiss_and_bounded_where_it_is():
+    calm = judged(response(*waves(0.1, 0.5)))
+    assert calm.closures == len(FACTORS)
+    jump = judged(response(*waves(0.1, 0.5), 0.1, 0.3))
+    # 0.13 wide: halved until narrower than the resolution, three times.
+    assert jump.closures == len(FACTORS) + 3
+
+
+def test_a_closure_that_fails_is_the_reason():
+    def close(factor):
+        return "it buckled" if factor > 1.1 else response(*waves(0.1, 0.5))(factor)
+
+    path = follow("E_f.anterior", close, response(*waves(0.1, 0.5))(1.0), FACTORS)
+    assert not path.passed
+    assert path.reason == "no closed state at +20 %: it buckled"
+
+
+def test_a_valve_that_does_not_move_is_smooth():
+    assert judged(response(lambda s: 0.0 * s, lambda s: 0.0 * s)).passed
