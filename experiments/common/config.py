@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -297,14 +298,24 @@ def _room(config_path: str) -> str:
     return name.removesuffix(".yaml") if group == GROUP else ""
 
 
+def _chosen(group: str, *, _root_: DictConfig) -> str:
+    """What was chosen of a group; its name where that is not known."""
+    # A job of a sweep is composed with Hydra's part, one by itself is not.
+    if OmegaConf.select(_root_, "hydra") is not None:
+        return str(_root_.hydra.runtime.choices[group])
+    known = HydraConfig.initialized()
+    return str(HydraConfig.get().runtime.choices[group]) if known else group
+
+
 def register() -> None:
     """Make the schemas and the resolvers known; may be called again.
 
     ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the
-    package's detectors.
+    package's detectors, ``${chosen:GROUP}`` what was chosen of a group.
     """
     Plugins.instance().register(StudySource)
     OmegaConf.register_new_resolver("package_model", _package_model, replace=True)
+    OmegaConf.register_new_resolver("chosen", _chosen, replace=True)
     OmegaConf.register_new_resolver(
         "config_hash", lambda *, _root_: hash_of(_root_)[:16], replace=True
     )

@@ -14,7 +14,11 @@ F = TypeVar("F")
 
 
 def outcome_of(
-    findings: F, mesh: SolidMesh, forward_solves: int, failures: Iterable[str] = ()
+    findings: F,
+    mesh: SolidMesh,
+    forward_solves: int,
+    failures: Iterable[str] = (),
+    gate: str | None = None,
 ) -> Outcome[F]:
     """The outcome of a study, which failed for the first of the reasons given, if any."""
     reason = next(iter(failures), None)
@@ -24,4 +28,5 @@ def outcome_of(
         reason="completed" if reason is None else reason,
         mesh=Mesh(mesh.sha256, len(mesh.nodes)),
         forward_solves=forward_solves,
+        gate=gate,
     )

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-__all__ = ["CONF", "EXPERIMENTS"]
+__all__ = ["CONF", "EXPERIMENTS", "GATE_RECORDS"]
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -14,3 +14,6 @@ CONF = next(
 
 EXPERIMENTS = CONF / "experiment"
 """One YAML file an experiment."""
+
+GATE_RECORDS = _PACKAGE.parent / "results" / "records" / "gate"
+"""Kept records of the gate in a checkout; an installation has none."""

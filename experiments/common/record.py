@@ -158,6 +158,8 @@ class Outcome(Generic[F]):
     parameters : tuple of str
     model : Model or None
         As in `Record`, where the data say them and not the configuration.
+    gate : str or None
+        As in `Record`.
     """
 
     findings: F
@@ -169,6 +171,7 @@ class Outcome(Generic[F]):
     row: str = ""
     parameters: tuple[str, ...] = ()
     model: Model | None = None
+    gate: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,6 +197,9 @@ class Record(Generic[F]):
     provenance : Provenance
     findings : F
         None where the job died before it had any.
+    gate : str or None
+        What the gate said of the anatomy (see `experiments.common.gate`); None where the study has
+        none of the configured anatomies.
     """
 
     schema: int
@@ -213,6 +219,7 @@ class Record(Generic[F]):
     mesh: Mesh | None
     provenance: Provenance
     findings: F
+    gate: str | None = None
 
     @property
     def converged(self) -> bool:
@@ -223,11 +230,12 @@ class Record(Generic[F]):
     def line(self) -> str:
         """Commit, configuration, mesh and seed in one line, for tables and figures."""
         source = self.provenance
+        gate = "" if self.gate is None else f"; gate of the anatomy: {self.gate}"
         sha = (source.git.sha or "unknown")[:HASH_DIGITS] + ("+changes" if source.git.dirty else "")
         return (
             f"{self.experiment}: mvest {source.versions['mvest']}, commit {sha}, "
             f"configuration {source.config_hash[:HASH_DIGITS]}, "
-            f"mesh {source.mesh_hash[:HASH_DIGITS]}, seed {source.seed}"
+            f"mesh {source.mesh_hash[:HASH_DIGITS]}, seed {source.seed}{gate}"
         )
 
 
@@ -277,6 +285,7 @@ def stamp(
             config_hash, "none" if outcome.mesh is None else outcome.mesh.sha256, values["seed"]
         ),
         findings=outcome.findings,
+        gate=outcome.gate,
     )
 
 

@@ -179,7 +179,7 @@ def _piece(low: float, high: float, states: dict[float, PathState]) -> Piece:
     at_vertex = np.linalg.norm(unexplained, axis=1)
     way = 0.5 * width * float(np.linalg.norm(a.slope) + np.linalg.norm(b.slope))
     size = float(np.linalg.norm(unexplained))
-    share = size / way if way > 0 else (0.0 if size == 0 else float("inf"))
+    share = float(size / way) if way > 0 else (0.0 if size == 0 else float("inf"))
     return Piece(low, high, float(at_vertex.max()), int((at_vertex > JUMP_LIMIT).sum()), share)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments.common.build import closure_model, template_of
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import SolveBar
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main
@@ -53,7 +54,7 @@ def run_closure(job: Job[Settings]) -> Outcome[Findings]:
     )
     _write_fields(job.folder / "fields.npz", model, result, normals)
     failed = () if simulation.converged else (simulation.reason.value,)
-    return outcome_of(findings, model.mesh, 1, failed)
+    return outcome_of(findings, model.mesh, 1, failed, gate_of(values))
 
 
 def _write_fields(

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from mvest.closure.robustness import GateRow
+from mvest.closure.smoothness import Path
 
-__all__ = ["Findings", "Limits", "Row"]
+__all__ = ["Findings", "Followed", "Limits", "Row"]
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """One variation: distance of the closed surface from the reference's.
 
-    Where moduli differ, less what the exact derivative predicts; None if the closure failed.
+    None if the closure failed; seconds are of the processor.
     """
 
     case: str
@@ -33,23 +33,70 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
+class Followed:
+    """The closed surface followed along a factor on moduli.
+
+    Unexplained is what the exact derivatives do not say of the way between two states, at its
+    largest anywhere, and as a share of the way; None where a closure failed. The curvature is by
+    how much a central difference over the widest step differs from the derivative, relative.
+    """
+
+    along: str
+    unexplained_mm: float | None
+    share: float | None
+    curvature: float | None
+    closures: int
+    passed: bool
+    reason: str
+
+    @classmethod
+    def of(cls, path: Path) -> Followed:
+        """What a path comes to."""
+        pieces = path.pieces
+        return cls(
+            path.name,
+            max((piece.unexplained_mm for piece in pieces), default=None),
+            max((p.share for p in pieces if math.isfinite(p.share)), default=None),
+            path.curvature if math.isfinite(path.curvature) else None,
+            path.closures,
+            path.passed,
+            path.reason,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Limits:
-    """Up to which distances and relative difference of slopes the gate is passed."""
+    """Up to which distances, jumps, and unexplained shares of a way the gate is passed."""
 
     mean_mm: float
     max_mm: float
-    slope: float
+    jump_mm: float
+    share: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """Whether the closed state is one: the reference, and every variation that was run.
+    """Whether the closed state of an anatomy is one: reference, variations, paths of the moduli.
 
-    Slopes are, by the relative step of the moduli, the relative difference between the exact
-    derivative and central differences.
+    ``anatomy`` is its digest, by which others look the verdict up. The gap is what stays open of
+    the reference, by the measure that predictions use, and beside it the largest ball that passes;
+    None where the reference did not close.
     """
 
+    anatomy: str
     passed: bool
+    gap_mm2: float | None
+    passing_ball_mm: float | None
     rows: tuple[Row, ...]
-    slopes: Mapping[str, float]
+    paths: tuple[Followed, ...]
     limits: Limits
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """What it fails by, one after another."""
+        rows = [
+            f"{row.case}: " + (row.reason if row.mean_mm is None else f"{row.max_mm:.2g} mm off")
+            for row in self.rows
+            if not row.passed
+        ]
+        return (*rows, *(f"{p.along}: {p.reason}" for p in self.paths if not p.passed))

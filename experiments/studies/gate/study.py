@@ -1,4 +1,4 @@
-"""Is the closed state one? The valve closed under every variation of the gate."""
+"""Is the closed state one? A valve closed under every variation of the gate."""
 
 from __future__ import annotations
 
@@ -8,39 +8,61 @@ import numpy as np
 
 from experiments.common.build import closure_model
 from experiments.common.forward import outcome_of
+from experiments.common.gate import anatomy_digest
 from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
-from experiments.studies.gate.findings import Findings, Limits, Row
-from experiments.studies.gate.report import gate_answer, gate_table, gate_words
+from experiments.studies.gate.findings import Findings, Followed, Limits, Row
+from experiments.studies.gate.report import gate_answer, gate_words, write_gate
 from experiments.studies.gate.settings import Settings
-from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, SLOPE_LIMIT, GateRow, run_gate
+from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, GateRow, run_gate
+from mvest.closure.smoothness import JUMP_LIMIT, SLOPE_LIMIT, Path
+from mvest.scenarios.measures import contact_reach
+from mvest.scenarios.scenario import plane_of
+from mvest.typing import FloatArray
+from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.passing_ball import largest_passing_ball
 
 __all__ = ["STUDY", "run_gate_study"]
 
 
 def run_gate_study(job: Job[Settings]) -> Outcome[Findings]:
-    """Close the valve under every variation of the gate."""
+    """Close the valve under every variation of the gate, and measure what stays open of it."""
     values = job.values
     report = run_gate(
         lambda case: closure_model(values, case),
         np.array(values["truth"]["values"], dtype=float),
         on_case=_say,
+        on_path=_say_path,
     )
-    rows = tuple(Row.of(row) for row in report.rows)
+    rows = tuple(map(Row.of, report.rows))
+    model = closure_model(values)
+    gap, ball = (None, None) if report.closed is None else _open(model, report.closed)
     findings = Findings(
+        anatomy=anatomy_digest(values),
         passed=report.passed,
+        gap_mm2=gap,
+        passing_ball_mm=ball,
         rows=rows,
-        slopes={str(step): difference for step, difference in report.slopes.items()},
-        limits=Limits(MEAN_LIMIT, MAX_LIMIT, SLOPE_LIMIT),
+        paths=tuple(map(Followed.of, report.paths)),
+        limits=Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SLOPE_LIMIT),
     )
     reference = rows[0]
     return outcome_of(
         findings,
-        closure_model(values).mesh,
-        len(rows),
+        model.mesh,
+        len(rows) + sum(path.closures for path in report.paths),
         () if reference.passed else (reference.reason,),
     )
+
+
+def _open(model: ClosureModel, vertices: FloatArray) -> tuple[float, float]:
+    """The gap (mm²) of a closed valve, and the diameter (mm) of the largest ball that passes."""
+    surface = model.valve.surface
+    annulus = vertices[model.valve.annulus]
+    seen = vertices, surface.triangles, annulus, plane_of(model.valve, annulus)
+    gap = find_gap(*seen, contact_reach(model))
+    return gap.area, largest_passing_ball(*seen, thickness=surface.thickness).diameter
 
 
 def _say(row: GateRow) -> None:
@@ -52,11 +74,17 @@ def _say(row: GateRow) -> None:
     )
 
 
+def _say_path(path: Path) -> None:
+    verdict = path.reason or "no jump"
+    print(f"along {path.name}: {path.closures} closures, {verdict}", file=sys.stderr, flush=True)
+
+
 STUDY = Study(
     settings=Settings,
     findings=Findings,
     run=run_gate_study,
-    words=lambda record: gate_words(record).replace("**", ""),
-    write=write_each(gate_table, gate_words),
-    sections=(Section("gate", validation=True, answer=answer_of_main(gate_answer)),),
+    words=lambda record: gate_words({record.row: record}).replace("**", ""),
+    write=write_gate,
+    keeps_failures=True,
+    sections=(Section("gate", validation=True, answer=gate_answer),),
 )

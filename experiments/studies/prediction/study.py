@@ -17,6 +17,7 @@ import numpy as np
 from experiments.common.build import Twin, build_mesh, build_twin, template_of
 from experiments.common.findings import Rows, rows, vector
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main
@@ -142,6 +143,7 @@ def run_prediction(job: Job[Settings]) -> Outcome[Findings]:
             for p in patients
         ),
         () if first.scenarios else (first.result.reason,),
+        gate_of(config),
     )
 
 

@@ -22,6 +22,7 @@ from experiments.common.estimate_record import (
 from experiments.common.estimates import Paper
 from experiments.common.expectation import TwinExpectation
 from experiments.common.findings import vector
+from experiments.common.gate import gate_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Mesh, Outcome
 from experiments.common.study import Job, Section, Study
@@ -92,6 +93,7 @@ def run_twin(job: Job[Settings]) -> Outcome[Findings]:
         detail=result.detail,
         mesh=Mesh(mesh.sha256, len(mesh.nodes), len(mesh.elements), twin.truth_model.mesh.sha256),
         forward_solves=(first.forward_solves or 0) + (confirmed is not None),
+        gate=gate_of(values),
     )
 
 
