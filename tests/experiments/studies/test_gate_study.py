@@ -113,7 +113,7 @@ def test_the_gate_study_records_every_case(run):
     assert [path["along"] for path in found["paths"]] == ["E_f", "E_f.anterior", "E_f.posterior"]
     # No contact and little load: nothing jumps, and no piece is halved.
     assert all(path["passed"] for path in found["paths"])
-    assert record["forward_solves"] == 1 + len(GATE_CASES) + 6 + 4 + 4
+    assert record["forward_solves"] == 1 + len(GATE_CASES) + 4 + 2 + 2
     assert [row["case"] for row in found["rows"]] == [
         "reference",
         *(c.name for c in GATE_CASES),
