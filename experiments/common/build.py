@@ -95,10 +95,8 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     )
     if variation is REFERENCE:
         return model
-    model = vary(model, replace(variation, mesh=1.0, sampling=1.0, guided=False))
-    if variation.guided:
-        model.guide = guide_of(model, template, mesh)
-    return model
+    model.guide = guide_of(model, template, mesh) if variation.guided else None
+    return vary(model, replace(variation, mesh=1.0, sampling=1.0))
 
 
 def _varied(grid: Values, factor: float) -> dict[str, int]:

@@ -70,7 +70,7 @@ class GateCase:
     sampling : float
         Factor on the density of the contact samples along both directions.
     guided : bool
-        Whether the closure is followed on coarser meshes.
+        Whether the closure is followed on the coarser meshes of the model's guide.
     perturbed : int
         Seed of a smooth displacement of the open leaflets before they close; 0 for none.
     start : float
@@ -92,7 +92,7 @@ class GateCase:
     @property
     def remeshed(self) -> bool:
         """Whether it needs another mesh or other contact samples than a model has."""
-        return self.mesh != 1 or self.sampling != 1 or self.guided
+        return self.mesh != 1 or self.sampling != 1
 
 
 REFERENCE = GateCase("reference")
@@ -167,12 +167,12 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
     """
     if case.remeshed:
         raise InputError(f"gate case {case.name!r} needs the anatomy to be meshed or sampled anew")
-    settings = model.settings
+    fresh, settings = model.fresh(), model.settings
     protocol, newton, contact = settings.protocol, settings.newton, settings.contact
     dt, ramp = protocol.dt * case.dt, protocol.ramp * case.ramp
     tolerance = newton.tolerance if case.converged_path else newton.path_tolerance
     return replace(
-        model.fresh(),
+        fresh,
         settings=replace(
             settings,
             protocol=replace(protocol, dt=dt, ramp=ramp),
@@ -181,7 +181,7 @@ def vary(model: ClosureModel, case: GateCase) -> ClosureModel:
                 contact, activation_distance=contact.activation_distance * case.activation
             ),
         ),
-        guide=None,
+        guide=fresh.guide if case.guided else None,
         anchors=None,
         continuation=case.start != 1,
         reach=np.inf,
@@ -280,6 +280,10 @@ def _directions(
     names: Sequence[str], is_modulus: FloatArray
 ) -> list[tuple[str, FloatArray, tuple[float, ...]]]:
     """What is changed together: its name, 1 for its parameters, and the first factors."""
-    each = [(names[k], np.eye(len(names))[k], SINGLE) for k in np.flatnonzero(is_modulus).tolist()]
-    common = [("E_f", is_modulus.astype(float), COMMON)] if each else []
-    return common + (each if len(each) > 1 else [])
+    moduli = np.flatnonzero(is_modulus).tolist()
+    found: list[tuple[str, FloatArray, tuple[float, ...]]] = []
+    if moduli:
+        found.append(("E_f", is_modulus.astype(np.float64), COMMON))
+    if len(moduli) > 1:
+        found += [(names[k], np.eye(len(names))[k], SINGLE) for k in moduli]
+    return found

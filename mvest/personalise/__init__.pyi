@@ -1,5 +1,6 @@
 from .chain import expect_case as expect_case
 from .chain import personalise_case as personalise_case
+from .gate import gate_case as gate_case
 from .model import build_model as build_model
 from .result import FrameDistance as FrameDistance
 from .result import Personalised as Personalised

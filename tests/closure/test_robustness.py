@@ -253,7 +253,10 @@ def test_a_model_is_varied_as_its_case_says_and_begins_anew():
     assert again.perturbation is None
     assert not again.continuation
     assert vary(model, GateCase("x", start=1.2)).continuation
-    for case in (GateCase("x", mesh=1.5), GateCase("x", sampling=2.0), GateCase("x", guided=True)):
+    guided = vary(model_of(GENTLE, **SMALL, guide=model), GateCase("x", guided=True))
+    assert guided.guide is not None
+    assert vary(guided, GateCase("x")).guide is None
+    for case in (GateCase("x", mesh=1.5), GateCase("x", sampling=2.0)):
         with pytest.raises(InputError, match="meshed or sampled anew"):
             vary(model, case)
 

@@ -15,4 +15,5 @@ class Settings:
 
     case: CaseInput = None  # folder of a case
     strict: bool = False  # refuse a case that is not plausible, instead of saying so
+    gate: bool = False  # with check=true: ask whether the closed state is one, some minutes
     personal: PersonalSettings

@@ -17,6 +17,7 @@ from experiments.common.study import Job, Study
 from experiments.studies.case.settings import Settings
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.plausibility import doubts, require_plausible
+from mvest.personalise.gate import gate_case, gate_lines
 from mvest.personalise.model import build_model
 from mvest.reporting.case.fields import turn_of
 
@@ -57,6 +58,8 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
         f"{model.mesh.element_type}",
         f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
     ]
+    if values["gate"]:
+        lines += gate_lines(gate_case(case, settings, meshes_of(values)))
     strange = doubts(case)
     lines += [f"  {'MISTAKE?' if one.mistake else 'doubtful'}: {one}" for one in strange]
     drawn = f"drawn in {files[0]}"

@@ -7,6 +7,7 @@ import numpy as np
 from experiments.common.expectation import expect_cycle
 from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main, write_each
@@ -93,6 +94,7 @@ def run_chord(job: Job[Settings]) -> Outcome[Findings]:
         true.mesh,
         sum(entry.runs for entry in results),
         (entry.reason for entry in results if entry.status != "converged"),
+        gate_of(values),
     )
 
 

@@ -14,6 +14,7 @@ from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import expect_cycle
 from experiments.common.findings import finite, rows, vector
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main, write_each
@@ -101,7 +102,7 @@ def run_cycle(job: Job[Settings]) -> Outcome[Findings]:
         },
     )
     failed = (drift,) if isinstance(drift, str) else ()
-    return outcome_of(findings, true.mesh, 1 + steps.runs + runs, failed)
+    return outcome_of(findings, true.mesh, 1 + steps.runs + runs, failed, gate_of(values))
 
 
 def _frame(

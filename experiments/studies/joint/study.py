@@ -10,6 +10,7 @@ import numpy as np
 from experiments.common.expectation import expect_cycle
 from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main, write_each
@@ -145,6 +146,7 @@ def run_joint(job: Job[Settings]) -> Outcome[Findings]:
         true.mesh,
         sum(e.forward_solves for e in runs),
         (e.reason.value for e in runs if not e.converged),
+        gate_of(values),
     )
 
 

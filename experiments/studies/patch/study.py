@@ -18,6 +18,7 @@ from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import expect_cycle
 from experiments.common.findings import vector
 from experiments.common.forward import outcome_of
+from experiments.common.gate import gate_of
 from experiments.common.progress import say
 from experiments.common.record import Outcome
 from experiments.common.report import answer_of_main, write_each
@@ -113,6 +114,7 @@ def run_patch(job: Job[Settings]) -> Outcome[Findings]:
         model.closure.mesh,
         sum(fit.runs for fit in results.values()),
         (fit.reason for fit in results.values() if fit.status != "converged"),
+        gate_of(values),
     )
 
 

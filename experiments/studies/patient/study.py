@@ -15,6 +15,7 @@ from experiments.common.cases.findings import Findings, Revealed
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.cases.report import case_text, write_case_run
 from experiments.common.expectation import expect_own
+from experiments.common.gate import NOT_GATED, gate_of
 from experiments.common.record import Outcome
 from experiments.common.schema import build
 from experiments.common.store import Store
@@ -66,7 +67,9 @@ def run_patient(job: Job[Settings]) -> Outcome[Findings]:
     patient = job.settings.patient
     place = make_patient(job.values, patient)
     estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden)
-    return reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
+    outcome = reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
+    # One that is drawn has another anatomy than the one configured.
+    return replace(outcome, gate=NOT_GATED if patient.variation else gate_of(job.values))
 
 
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
