@@ -107,7 +107,6 @@ GATE_CASES = (
     GateCase("mesh x 1.5", mesh=1.5),
     GateCase("followed on coarser meshes", guided=True),
     GateCase("perturbed start", perturbed=1),
-    GateCase("perturbed start, another", perturbed=2),
     GateCase("continued from E_f + 20 %", start=1.2),
     GateCase("continued from E_f - 20 %", start=0.8),
 )

@@ -78,7 +78,6 @@ def test_the_cases_are_the_variations_that_must_not_matter():
         {"mesh"},
         {"guided"},
         {"perturbed"},
-        {"perturbed"},
         {"start"},
         {"start"},
     ]

@@ -198,6 +198,8 @@ def fields_of(fit: Personalised) -> dict[str, Any]:
         "region": surface.region.astype(np.int8),
         "frames": np.array(frames),
         "seen": np.array([d.seen for d in fit.distances]),
+        "reach_mm": fit.settings.mechanics.contact.activation_distance
+        * surface.thickness[case.free_edge].mean(),
     }
     if all(frame.corresponds for frame in seen):
         reals["observed"] = np.stack([frame.vertices for frame in seen])

@@ -27,6 +27,7 @@ __all__ = [
 KEPT_ARRAYS = (
     "triangles", "region", "rest", "annulus", "free_edge", "frames", "seen", "tips", "chord_tip",
     "chord_insertion", "generic", "fitted", "distance_generic", "distance_fitted",
+    "reach_mm",
 )  # fmt: skip
 """Arrays that Figure 3 needs."""
 

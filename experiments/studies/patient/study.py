@@ -239,8 +239,9 @@ STUDY = Study(
                 "figure3": "Figure 3: closed valves coloured by their distance from what was "
                 "observed, "
                 "with generic and with personalised stiffness, on one scale. Drawn are "
-                "midsurfaces: leaflets that touch lie a thickness apart, so that a white slit"
-                " is not yet a leak. Simulated."
+                "midsurfaces: leaflets that touch lie a thickness apart, and what"
+                " opens between them is white or, where it is known to be no leak, grey; a "
+                "gap is red. Simulated."
             },
             "Table 3: distances of their closed valves (simulated)",
             table=PATIENTS,

@@ -21,7 +21,7 @@ from experiments.common.cases.report import interval_words
 from experiments.common.record import Record
 from experiments.common.tables import write_table
 from mvest.errors import InputError
-from mvest.reporting.case.drawing import ATRIUM, draw_valve, same_scale
+from mvest.reporting.case.drawing import ATRIUM, draw_valve, paint_leak, same_scale
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.figures import corner_colours, distance_top
 from mvest.reporting.case.findings import ModuliAlone, UnknownRow
@@ -309,6 +309,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
             axes = grid[row, column]
             colours = corner_colours(scale, distance[k], valve.triangles)
             draw_valve(axes, valve, positions[k], colours, ATRIUM, k + 1, strength=0.3)
+            paint_leak(axes, valve, positions[k], k + 1)
             title = f"{_words(name)}\n" if row == 0 else ""
             axes.set_title(f"{title}{Spread.of(distance[k])} mm", fontsize=9)
             if column == 0:

@@ -32,6 +32,7 @@ __all__ = [
     "leaflet_colours",
     "name_leaflets",
     "paint_gap",
+    "paint_leak",
     "quartered",
     "same_scale",
 ]
@@ -222,6 +223,15 @@ def paint_gap(
         interpolation="nearest",
         zorder=3,
     )
+
+
+def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) -> None:
+    """Draw the gap of a closed valve, and the slit where leaflets touch, if it knows their reach.
+
+    Nothing is drawn where some of the ``points (n, 3)`` were not seen; see `paint_gap`.
+    """
+    if fields.reach_mm is not None and np.isfinite(points).all():
+        paint_gap(axes, fields, points, frame, fields.reach_mm)
 
 
 def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str], view: View = ATRIUM) -> None:

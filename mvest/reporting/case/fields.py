@@ -57,6 +57,8 @@ class CaseFields:
         ``(n, 3, p)`` mm per unit of each parameter, of the closed frame at the estimate.
     innovation : ndarray or None
         ``(n, 3)`` standardised innovation of the closed frame.
+    reach_mm : float or None
+        Distance of midsurfaces within which leaflets touch.
     """
 
     triangles: IntArray
@@ -79,6 +81,7 @@ class CaseFields:
     distance_fitted: FloatArray | None = None
     sensitivity: FloatArray | None = None
     innovation: FloatArray | None = None
+    reach_mm: float | None = None
 
     def __post_init__(self) -> None:
         f, n = len(self.frames), len(self.rest)
@@ -171,6 +174,7 @@ def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> Case
         distance_fitted=reals("distance_fitted"),
         sensitivity=reals("sensitivity"),
         innovation=reals("innovation"),
+        reach_mm=float(arrays["reach_mm"]) if "reach_mm" in arrays else None,
     )
 
 

@@ -20,6 +20,7 @@ from mvest.reporting.case.drawing import (
     draw_valve,
     leaflet_colours,
     name_leaflets,
+    paint_leak,
     same_scale,
 )
 from mvest.reporting.case.fields import CaseFields, read_case_fields
@@ -66,6 +67,8 @@ def views_figure(
         for axes, (title, fields, points, frame) in zip(grid[row], shapes, strict=True):
             colours = leaflet_colours(fields.region)
             draw_valve(axes, fields, points, colours, view, frame, chords=True)
+            if row == 0 and frame:
+                paint_leak(axes, fields, points, frame)
             reach += [points, fields.tips[frame]] if view is SIDE else [points]
             if row == 0:
                 axes.set_title(title, fontsize=10, pad=10)
@@ -111,6 +114,7 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
             colours = corner_colours(scale, distance, fields.triangles)
             draw_valve(axes, fields, points, colours, view, k + 1, strength=0.3)
             if row == 0:
+                paint_leak(axes, fields, points, k + 1)
                 axes.set_title(f"{title}\n{Spread.of(distance)} mm", fontsize=11, pad=10)
                 name_leaflets(axes, fields, names)
         same_scale(grid[row], [points for _, points, _ in panels], view)
@@ -124,8 +128,8 @@ def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
 
 
 MIDSURFACES = (
-    "Drawn are midsurfaces: leaflets that touch lie a thickness apart, so that a white slit is not "
-    "yet a leak."
+    "Drawn are midsurfaces: leaflets that touch lie a thickness apart. What opens between them "
+    "without a leak is grey or, where their reach is not known, white; a gap is red."
 )
 
 

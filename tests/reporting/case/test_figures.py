@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from mvest.errors import InputError
-from mvest.reporting.case.drawing import ATRIUM, LINE_PIECES, SIDE, quartered
+from mvest.reporting.case.drawing import ATRIUM, BLOOD, LINE_PIECES, SIDE, TISSUE, quartered
 from mvest.reporting.case.fields import read_case_fields
 from mvest.reporting.case.figures import (
     case_figure,
@@ -360,3 +360,25 @@ def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> N
     assert '"f4"' in own
     assert '"f8"' not in own
     assert len(own) < 400_000
+
+
+# --- leaks --------------------------------------------------------------------------------------
+def test_a_slit_of_touching_leaflets_is_told_from_a_leak_where_their_reach_is_known(fields):
+    def colours(reach):
+        axes = case_figure(replace(fields, reach_mm=reach)).axes[0]
+        drawn = [image.get_array()[image.get_array()[..., 3] > 0] for image in axes.images]
+        return [{tuple(np.round(colour[:3], 2)) for colour in one} for one in drawn]
+
+    assert colours(None) == []
+    # Nothing touches within no distance, and everything does within the size of the valve.
+    assert colours(0.0) == [{BLOOD}]
+    assert colours(200.0) == [{TISSUE}]
+
+
+def test_of_an_open_or_half_seen_valve_no_leak_is_drawn(fields):
+    whole = replace(fields, reach_mm=2.0, observed=fields.fitted)
+    seen = fields.fitted.copy()
+    seen[fields.closed, 0] = np.nan
+    for valve, images in ((whole, [0, 1, 1]), (replace(whole, observed=seen), [0, 0, 1])):
+        axes = shapes_figure(valve, NAMES).axes[:3]
+        assert [len(panel.images) for panel in axes] == images
