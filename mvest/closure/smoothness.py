@@ -187,10 +187,10 @@ def _fault(piece: Piece) -> str:
     where = f"between {_percent(piece.low)} and {_percent(piece.high)}"
     if piece.unexplained_mm > JUMP_LIMIT:
         return f"a jump of {piece.unexplained_mm:.2g} mm at {piece.vertices} vertices {where}"
-    return (
-        f"{100 * piece.share:.2g} % of the way {where}, up to {piece.unexplained_mm:.2g} mm, is not "
-        "what the derivatives say"
+    unexplained = (
+        f"{100 * piece.share:.2g} % of the way {where}, up to {piece.unexplained_mm:.2g} mm"
     )
+    return f"{unexplained}, is not what the derivatives say"
 
 
 def _percent(factor: float) -> str:

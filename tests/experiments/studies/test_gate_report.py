@@ -81,6 +81,8 @@ def test_all_anatomies_are_one_table_and_what_was_not_run_says_so(calm, jumping,
     assert list(table.passed) == [True, True, True, False, False, True, False]
     files = write_gate(tmp_path, {"a": calm, "b": jumping}, {})
     assert {path.name for path in files} == {"gate.csv", "gate.md"}
+    others = sorted(set(ANATOMIES) - {"template", "prolapse"})
+    assert f"Not asked yet: {', '.join(others)}." in (tmp_path / "gate.md").read_text()
 
 
 def test_a_record_comes_back_as_it_was_written(jumping, tmp_path):
