@@ -88,7 +88,8 @@ class LearnedNoise:
         Of the logarithms of the family's quantities.
     quantities : tuple of LearnedQuantity
         In a reader's terms: standard deviation and length of the smooth part (the length at which
-        its correlation is that of a Matérn one at its own), and all others.
+        its correlation is that of a Matérn one at its own), and all others; the resolution is part
+        of what is rough.
     noise : ObservationNoise
         At the mean, added columns included.
     log_likelihood : float
@@ -401,13 +402,22 @@ def _in_words(
                 for of in (prior, posterior)
             )
             quantities.append(LearnedQuantity(name, believed, learned))
+    rough = {block.rough for block in family.blocks}
     for k, name in enumerate(family.names[first:], first):
+        least = family.resolution**2 if name in rough else 0.0
         believed, learned = (
-            LogNormal(float(np.exp(of.mean[k])), float(np.exp(of.std[k])))
+            _with_resolution(float(of.mean[k]), float(of.std[k]), least)
             for of in (prior, posterior)
         )
         quantities.append(LearnedQuantity(name, believed, learned, name in factors))
     return tuple(quantities)
+
+
+def _with_resolution(log: float, std: float, least: float) -> LogNormal:
+    """A standard deviation of given logarithm together with a variance of ``least``."""
+    variance = np.exp(2.0 * log)
+    total = variance + least
+    return LogNormal(float(np.sqrt(total)), float(np.exp(std * variance / total)))
 
 
 def _log_normal(amount: Callable[[FloatArray], float], of: Gaussian) -> LogNormal:

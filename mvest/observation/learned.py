@@ -71,7 +71,7 @@ class ErrorBeliefs:
     other_share: float = 0.2
     other_factor: float = 3.0
     frame_factor: float = 1.5
-    resolution_mm: float = 0.03
+    resolution_mm: float = 0.02
 
     def __post_init__(self) -> None:
         for name in ("std_factor", "length_factor", "deviation", "other_factor", "frame_factor"):

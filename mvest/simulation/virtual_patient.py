@@ -17,7 +17,7 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation
+from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
 from mvest.problem.registration import REGISTRATION, displace
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
@@ -108,6 +108,8 @@ class PatientSimulation:
     std_mm, correlation_length_mm : float
         Error of each coordinate of each vertex in each frame but the first, and over which distance
         it is alike. Frames are independent.
+    rough_std_mm : float
+        Of further errors in these frames that are independent, and that the case does not state.
     rest_std_mm : float
         Error of the open shape from which an estimator takes its model; 0: it is seen exactly.
     held_pressure_mmHg : tuple of float
@@ -128,6 +130,7 @@ class PatientSimulation:
     seen_rows: int = 21
     std_mm: float = 0.6
     correlation_length_mm: float = 10.0
+    rough_std_mm: float = 0.0
     rest_std_mm: float = 0.0
     held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
@@ -308,6 +311,8 @@ def _case(
     error = CorrelatedNoise(simulation.std_mm, correlation)
     moved = np.stack(list(true.values()))
     seen_later = error(moved, moved, rng)
+    if simulation.rough_std_mm:
+        seen_later = WhiteNoise(simulation.rough_std_mm)(seen_later, moved, rng)
     if simulation.rest_std_mm:
         rest_error = CorrelatedNoise(simulation.rest_std_mm, correlation)
         exact = surface.vertices[None]

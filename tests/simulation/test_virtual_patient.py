@@ -175,6 +175,22 @@ def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):
     assert abs(alike[1]) < 0.2
 
 
+def test_rough_errors_come_on_top_and_are_not_stated(patient):
+    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    rough = replace(SMALL, rough_std_mm=0.3)
+    seen = TEMPLATE.valve(32, 9)
+    case = virtual_patient._case(
+        "small", "d", seen, hidden, rough, MECHANICS, np.random.default_rng(3)
+    )
+    assert case.uncertainty.std_mm == SMALL.std_mm
+    np.testing.assert_array_equal(case.frames[0].vertices, patient.case.frames[0].vertices)
+    more = [a.vertices - b.vertices for a, b in zip(case.frames[1:], patient.case.frames[1:],
+                                                    strict=True)]  # fmt: skip
+    # 1728 numbers: an SD of 1.7 %.
+    assert np.std(more) == pytest.approx(0.3, rel=0.07)
+    assert abs(np.mean(np.array(more)[:, 1:] * np.array(more)[:, :-1])) < 0.01
+
+
 def test_a_patient_is_the_same_again(patient):
     hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
     again = virtual_patient._case(

@@ -13,6 +13,7 @@ import numpy as np
 from mvest.reporting.case.findings import (
     About,
     CaseFindings,
+    ErrorRow,
     FrameDistances,
     ModuliAlone,
     ModulusRow,
@@ -179,6 +180,19 @@ def _case(fields: dict[str, np.ndarray]) -> CaseFindings:
         iterate_std=((2.0, 1.5, 0.02), (1.0, 0.4, 0.01), (0.8, 0.3, 0.008), (0.8, 0.3, 0.008)),
         objective=(920.0, 340.0, 301.0, 300.2),
         innovation=Innovation(1428, 1.02, 3.1, 1485.0, (1325.0, 1535.0)),
+        errors=(
+            ErrorRow(
+                name="rough part",
+                unit="mm",
+                believed=0.12,
+                believed_low=0.014,
+                believed_high=1.03,
+                learned=0.205,
+                low=0.198,
+                high=0.212,
+                stretch=0.5,
+            ),
+        ),
         whiteness=(
             WhitenessTest("Kolmogorov–Smirnov", 0.03, 0.21, "ok"),
             WhitenessTest("runs", -0.4, 0.69, "ok"),

@@ -99,6 +99,17 @@ def test_the_answer_stands_at_the_top(html) -> None:
     assert told.index("E_f anterior 5.8 MPa") < told.index("Contents")
 
 
+def test_what_was_learned_of_the_errors_stands_beside_what_was_believed(case) -> None:
+    (row,) = words.error_rows(case[0].errors)
+    assert row == {
+        "errors of the closed frame": "rough part [mm]",
+        "believed": "0.12",
+        "95 %": "0.014 to 1.03",
+        "learned": "0.205",
+        "its 95 % interval": "0.198 to 0.212",
+    }
+
+
 def test_what_the_data_hardly_tell_apart_is_named(html) -> None:
     assert (
         "The data hardly tell apart E_f anterior and slack of the chordae (correlations of at "
@@ -208,6 +219,7 @@ def test_what_is_missing_is_said(bare_page) -> None:
         "The record lists no parameters.",
         "The record has no analysis of identifiability.",
         "The record has no tests of the innovation.",
+        "The errors of the frame were taken as they are stated.",
         "No frame was held out",
         "The record has no distances.",
         "The record has no measurements.",
