@@ -18,6 +18,7 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
 from mvest.estimation.filters.ensemble import EnsembleFilter
 from mvest.estimation.filters.extended import ExtendedFilter
+from mvest.estimation.filters.importance import ImportanceFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.monte_carlo import MonteCarloFilter
 from mvest.estimation.filters.paper import PaperFilter
@@ -65,7 +66,7 @@ ENVELOPE_SHARE = 0.05
 COARSEST = (24, 3)
 """Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
 
-MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo")
+MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo", "importance")
 """Filters that a configuration can name."""
 
 UNSTRUCTURED_SURFACE = (112, 29)
@@ -389,6 +390,8 @@ def filter_of(settings: Values, mean: FloatArray) -> Filter:
             return build(EnsembleFilter, settings["ensemble"])
         case "monte_carlo":
             return build(MonteCarloFilter, settings["monte_carlo"])
+        case "importance":
+            return ImportanceFilter()
     raise ConfigurationError(
         f"filter.mode = {settings['mode']!r}, expected one of {', '.join(MODES)}"
     )

@@ -84,7 +84,7 @@ class ContactPointsConfig:
 class FilterConfig:
     """The filter and what it is told."""
 
-    mode: str = MISSING  # paper, extended, iterated, unscented, ensemble or monte_carlo
+    mode: str = MISSING  # paper, extended, iterated, unscented, ensemble, monte_carlo or importance
     initial: list[float] = MISSING  # prior mean of the parameters
     P0: Any = MISSING  # variance, variances or matrix
     Q: Any = 0.01  # the same, added each round of the paper's mode

@@ -9,6 +9,7 @@ from .filters.drift import DriftSmoother as DriftSmoother
 from .filters.drift import FrameModel as FrameModel
 from .filters.ensemble import EnsembleFilter as EnsembleFilter
 from .filters.extended import ExtendedFilter as ExtendedFilter
+from .filters.importance import ImportanceFilter as ImportanceFilter
 from .filters.iterated import IteratedFilter as IteratedFilter
 from .filters.monte_carlo import MonteCarloFilter as MonteCarloFilter
 from .filters.paper import PaperFilter as PaperFilter

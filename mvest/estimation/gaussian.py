@@ -77,6 +77,15 @@ class Gaussian:
         return std[:, None] * root
 
 
+def standard(prior: Gaussian, other: Gaussian) -> Gaussian:
+    """Another Gaussian of the same parameters, in coordinates in which the prior is N(0, I)."""
+    inverse = np.linalg.pinv(prior.factor)
+    P = inverse @ other.covariance @ inverse.T
+    # What the prior holds fixed keeps the unit variance that these coordinates give it.
+    fixed = np.eye(len(P)) - inverse @ prior.factor
+    return Gaussian(inverse @ (other.mean - prior.mean), P + fixed @ fixed.T)
+
+
 def as_covariance(variance: float | FloatArray, size: int, what: str) -> FloatArray:
     """Checked (p, p) covariance from one variance, p variances or a full matrix.
 

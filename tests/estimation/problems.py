@@ -50,7 +50,7 @@ def wings(m):
 
 
 def gridded(model, prior, y, R, reach=5.0, points=201):
-    """Mean and standard deviation (p,) of a posterior of one or two parameters, on a grid."""
+    """Mean, standard deviation and kurtosis (p,) of a posterior of one or two parameters."""
     axis = np.linspace(-reach, reach, points)
     u = np.stack(np.meshgrid(*[axis] * prior.size, indexing="ij"), axis=-1).reshape(-1, prior.size)
     at = prior.mean + u @ prior.factor.T
@@ -58,4 +58,5 @@ def gridded(model, prior, y, R, reach=5.0, points=201):
     weights = np.exp(misfit.min() - misfit - 0.5 * np.sum(u**2, axis=1))
     weights /= weights.sum()
     mean = weights @ at
-    return mean, np.sqrt(weights @ (at - mean) ** 2)
+    variance = weights @ (at - mean) ** 2
+    return mean, np.sqrt(variance), weights @ (at - mean) ** 4 / variance**2

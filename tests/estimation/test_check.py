@@ -50,7 +50,7 @@ def test_a_filter_that_sits_in_one_of_two_wings_says_so() -> None:
     # h = x² + x/10 of a normal x: wings about ± 1.1, in one of which the filter ends.
     prior = Gaussian(np.array([0.05]), np.eye(1))
     y, R = np.array([1.3]), 0.05
-    mean, std = gridded(wings, prior, y, R)
+    mean, std, _ = gridded(wings, prior, y, R)
     found = UnscentedFilter()(wings, prior, y, R)
     assert found.reason is Reason.CONVERGED
     assert abs(found.mean[0] - mean[0]) > 5 * found.std[0]

@@ -20,7 +20,7 @@ from mvest.estimation.filters.surrogate import (
     fit_surrogate,
 )
 from mvest.estimation.filters.unscented import UnscentedFilter
-from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.gaussian import Gaussian, standard
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.estimation.run import FilterRun, by_filter
@@ -135,7 +135,7 @@ class MonteCarloFilter:
         run.record(z, P, float(first.objective[-1]), float(first.log_likelihood[-1]))
 
         rng = np.random.default_rng(self.seed)
-        explored = self._explore(_Runs(run, kept), _standard(run, first.transformed), rng)
+        explored = self._explore(_Runs(run, kept), standard(run.prior, first.transformed), rng)
         if isinstance(explored, Prediction):
             return run.fail(z, P, explored)
         surrogate, at, error, rounds = explored
@@ -262,15 +262,6 @@ class _Runs:
             if prediction.converged:
                 errors.append(float(misfit(x[None])[0]) - self.run.misfit(prediction))
         return float(np.std(errors, ddof=1)) if len(errors) > 1 else np.inf
-
-
-def _standard(run: FilterRun, posterior: Gaussian) -> Gaussian:
-    """N(z, P) in coordinates in which the prior is N(0, I)."""
-    inverse = np.linalg.pinv(run.prior.factor)
-    P = inverse @ posterior.covariance @ inverse.T
-    # What the prior holds fixed keeps the unit variance that these coordinates give it.
-    fixed = np.eye(len(P)) - inverse @ run.prior.factor
-    return Gaussian(inverse @ (posterior.mean - run.prior.mean), P + fixed @ fixed.T)
 
 
 def _around(points: FloatArray) -> Region:

@@ -1,0 +1,299 @@
+"""Draws from the posterior itself, weighted by runs of the model: no surrogate, nothing assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import logsumexp
+
+from mvest.errors import InputError
+from mvest.estimation.check import ApproximationCheck
+from mvest.estimation.estimate import Estimate, OnIterate, Reason
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.gaussian import Gaussian, standard
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction
+from mvest.estimation.run import FilterRun, by_filter
+from mvest.estimation.transform import Transform
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["ImportanceFilter"]
+
+K_HAT_LIMIT = 0.7
+"""Shape of the weights' tail above which their mean is not to be trusted (Vehtari et al. 2024)."""
+
+PRIOR_SHARE = 0.1
+"""Of each round's draws, from the prior: no place that the prior allows is left out."""
+
+EXPLORING = 3
+"""Rounds before kernels are chosen by weight."""
+
+KERNELS = 24
+"""Runs of the model at most about which the next are drawn."""
+
+WIDTHS = (1.0, 0.5, 0.25, 0.1)
+"""Widths of these kernels to choose from, in parts of the posterior linearised at the run."""
+
+FEWEST = 25
+"""Weights to which the tail can be fitted."""
+
+NOTHING = 50.0
+"""Logarithm by which a weight below the largest is none; the fit of the tail takes no zeros."""
+
+DRAWS = 4000
+"""Equally weighted draws that an estimate carries."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportanceFilter:
+    """Weighted draws from the posterior, from proposals that learn from the model's derivatives.
+
+    In coordinates x in which the prior is N(0, I), with π(x) = exp(−J(x)):
+
+    1. The posterior's mode and its Gaussian N(x₀, P₀) come from `IteratedFilter`.
+    2. A round draws points from a mixture q and runs the model there. The first mixture is of
+       N(x₀, P₀), wider, and the prior. Then it is also of kernels N(xᵢ, s² Pᵢ) about runs, chosen
+       by their weights, where Pᵢ = (I + Hᵢᵀ R⁻¹ Hᵢ)⁻¹ is the posterior linearised at xᵢ itself, so
+       that they follow a curved ridge (gradient adaptive population importance sampling, Elvira,
+       Martino, Luengo and Corander 2015, IEEE ICASSP 4075). s is what gives the weighted draws so
+       far the largest probability, each left out of its own kernel.
+    3. All draws of all rounds are weighted by π over the mixture of all proposals (Cornuet, Marin,
+       Mira and Robert 2012, Scand. J. Stat. 39:798), which the prior's share bounds.
+
+    until there are enough effective draws, or runs. The weights are smoothed by a generalised
+    Pareto tail (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Mach. Learn. Res. 25:72), whose
+    shape k̂ says whether they can be trusted at all: not above 0.7.
+
+    A model without derivatives is drawn from with P₀ in the place of every Pᵢ.
+
+    Attributes
+    ----------
+    runs : int
+        Largest number of runs of the model, those of `start` not counted.
+    batch : int
+        Runs of each round.
+    effective : float
+        Effective draws that are enough.
+    start : IteratedFilter
+    seed : int
+        Of all random numbers.
+
+    Raises
+    ------
+    InputError
+        If a setting, a shape or a covariance is not admissible; never for a failing model.
+    """
+
+    runs: int = 320
+    batch: int = 32
+    effective: float = 60.0
+    start: IteratedFilter = field(default_factory=lambda: IteratedFilter(tolerance=0.01))
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if not (self.runs >= self.batch >= 10 and self.effective > 1.0):
+            raise InputError(
+                f"importance sampling needs batches of at least 10, no fewer runs, and more than "
+                f"one effective draw; got {self.batch}, {self.runs} and {self.effective:g}"
+            )
+
+    def __call__(
+        self,
+        model: ObservationModel,
+        prior: Gaussian,
+        y: FloatArray,
+        R: NoiseCovariance,
+        *,
+        names: Sequence[str] | None = None,
+        transform: Transform | None = None,
+        on_iterate: OnIterate | None = None,
+    ) -> Estimate:
+        """Draw from the posterior; see `Filter` for the arguments."""
+        run = FilterRun(model, prior, y, R, names, transform, on_iterate)
+        first = self.start(model, prior, y, R, names=names, transform=transform)
+        run.forward_solves += first.forward_solves
+        if first.prediction is None:
+            z = first.transformed
+            return run.fail(z.mean, z.covariance, Prediction.failed(first.detail))
+        run.record(
+            first.transformed.mean,
+            first.transformed.covariance,
+            float(first.objective[-1]),
+            float(first.log_likelihood[-1]),
+        )
+        rng, L = np.random.default_rng(self.seed), run.prior.factor
+        draws = _Draws(run, standard(run.prior, first.transformed))
+        while True:
+            draws.more(min(self.batch, self.runs - len(draws.points)), rng)
+            weights, k_hat, effective = draws.weights()
+            good = effective >= self.effective and k_hat <= K_HAT_LIMIT
+            good = good and draws.rounds > EXPLORING
+            if good or len(draws.points) >= self.runs:
+                break
+        x = weights @ draws.points
+        spread = draws.points - x
+        chosen = draws.points[rng.choice(len(weights), DRAWS, p=weights)]
+        checks = [
+            ApproximationCheck(
+                "effective draws, how many times too few",
+                self.effective / effective,
+                1.0,
+                len(weights),
+            ),
+            ApproximationCheck(
+                "tail of the weights, Pareto k", max(k_hat, 0.0), K_HAT_LIMIT, len(weights)
+            ),
+        ]
+        return run.finish_with_slope(
+            run.prior.mean + L @ x,
+            L @ (spread.T * weights) @ spread @ L.T,
+            by_filter(draws.slope, L),
+            Reason.COMPLETED if good else Reason.NOT_SAMPLED,
+            f"{len(weights)} weighted draws, {effective:.0f} effective, Pareto k {k_hat:.2f}",
+            run.prior.mean + chosen @ L.T,
+            checks,
+        )
+
+
+class _Draws:
+    """Draws of all rounds, and the mixture that they come from.
+
+    Attributes
+    ----------
+    points : (s, p)
+    slope : (n, p)
+        dh/dx at the last run with derivatives; 0 without any.
+    """
+
+    def __init__(self, run: FilterRun, laplace: Gaussian) -> None:
+        self._run, self._laplace = run, laplace
+        p = laplace.mean.size
+        self.points = np.empty((0, p))
+        self.slope = np.zeros((run.y.size, p))
+        self._log_target = np.empty(0)
+        self._moved: list[tuple[FloatArray, FloatArray]] = []
+        self._covariances: list[FloatArray] = []
+        self._rounds: list[tuple[int, list[tuple[float, FloatArray, FloatArray]]]] = []
+
+    def more(self, count: int, rng: np.random.Generator) -> None:
+        """Draw from the next mixture, and run the model there."""
+        mixture = self._mixture(rng)
+        shares = np.array([share for share, _, _ in mixture])
+        # Stratified: each part as often as its share says, but for the rounding.
+        edges = (np.arange(count) + rng.random()) / count
+        which = np.searchsorted(np.cumsum(shares / shares.sum()), edges)
+        drawn = np.array(
+            [
+                mixture[k][1] + np.linalg.cholesky(mixture[k][2]) @ rng.standard_normal(len(self))
+                for k in np.minimum(which, len(mixture) - 1)
+            ]
+        )
+        self._rounds.append((count, mixture))
+        values = [self._evaluate(x) for x in drawn]
+        self.points = np.vstack([self.points, drawn])
+        self._log_target = np.append(self._log_target, values)
+
+    @property
+    def rounds(self) -> int:
+        """How many there were."""
+        return len(self._rounds)
+
+    def __len__(self) -> int:
+        """Number p of unknowns."""
+        return self._laplace.mean.size
+
+    def weights(self) -> tuple[FloatArray, float, float]:
+        """Smoothed weights (s,) that sum to 1, their k̂, and how many draws are effective."""
+        from arviz_stats.base import array_stats  # takes a second, for this function alone
+
+        count = len(self.points)
+        parts = [
+            np.log(drawn / count) + self._log_mixture(mixture) for drawn, mixture in self._rounds
+        ]
+        raw = self._log_target - logsumexp(parts, axis=0)
+        possible = raw > max(float(np.max(raw)), -1e300) - NOTHING
+        weights = np.zeros(count)
+        k_hat = np.inf
+        smoothed: FloatArray = raw[possible]
+        if len(smoothed) >= FEWEST:
+            smoothed, k_hat = array_stats.psislw(-smoothed)  # it takes log-likelihoods
+        if not np.any(possible):
+            return np.full(count, 1.0 / count), np.inf, 1.0
+        weights[possible] = np.exp(smoothed - logsumexp(smoothed))
+        return weights, float(k_hat), float(1.0 / np.sum(weights**2))
+
+    def _evaluate(self, x: FloatArray) -> float:
+        """Logarithm of π(x); −∞ where the model gives no prediction."""
+        z = self._run.prior.mean + self._run.prior.factor @ x
+        prediction = self._run.predict(z, derivatives=False)
+        covariance = self._laplace.covariance
+        value = -np.inf
+        if prediction.converged:
+            value = -self._run.misfit(prediction) - 0.5 * float(x @ x)
+            if prediction.differentiated:
+                self.slope = self._run.jacobian(z, prediction) @ self._run.prior.factor
+                A = self._run.noise.whiten(self.slope)
+                covariance = np.asarray(np.linalg.inv(np.eye(len(x)) + A.T @ A), np.float64)
+                e = self._run.noise.whiten(self._run.y - prediction.y)
+                self._moved.append((covariance @ (A.T @ (e + A @ x)), covariance))
+        self._covariances.append(0.5 * (covariance + covariance.T))
+        return value
+
+    def _mixture(self, rng: np.random.Generator) -> list[tuple[float, FloatArray, FloatArray]]:
+        """Shares, means and covariances of the next proposal."""
+        p = len(self)
+        wide = self._laplace.covariance * 1.3**2
+        prior = (PRIOR_SHARE, np.zeros(p), np.eye(p))
+        if not self._rounds:
+            return [(0.5, self._laplace.mean, wide), (0.5, *prior[1:])]
+        if len(self._rounds) < EXPLORING and self._moved:
+            share = (0.9 - PRIOR_SHARE) / len(self._moved)
+            moved = [(share, mean, 0.25 * P) for mean, P in self._moved]
+            self._moved = []
+            return [*moved, (0.1, self._laplace.mean, wide), prior]
+        weights, _, _ = self.weights()
+        order = np.argsort(-weights)[:KERNELS]
+        tempered = np.sqrt(weights[order])
+        tempered /= tempered.sum()
+        width = self._width(order, tempered, weights)
+        kernels = [
+            ((0.9 - PRIOR_SHARE) * share, self.points[i], width**2 * self._covariances[i])
+            for i, share in zip(order, tempered, strict=True)
+            if share > 0.0
+        ]
+        return [*kernels, (0.1, self._laplace.mean, wide), prior]
+
+    def _width(self, order: IntArray, shares: FloatArray, weights: FloatArray) -> float:
+        """Of the kernels, that under which the weighted draws so far are most probable."""
+        scores = []
+        for width in WIDTHS:
+            parts = np.array(
+                [
+                    np.log(max(share, 1e-300))
+                    + _log_normal(self.points, self.points[i], width**2 * self._covariances[i])
+                    for i, share in zip(order, shares, strict=True)
+                ]
+            )
+            parts[np.arange(len(order)), order] = -np.inf
+            at = logsumexp(parts, axis=0)
+            # The prior's share bounds the score of a draw that no other kernel reaches.
+            prior = np.log(PRIOR_SHARE) - 0.5 * np.sum(self.points**2, axis=1)
+            scores.append(float(weights @ np.maximum(at, prior)))
+        return WIDTHS[int(np.argmax(scores))]
+
+    def _log_mixture(self, mixture: list[tuple[float, FloatArray, FloatArray]]) -> FloatArray:
+        total = sum(share for share, _, _ in mixture)
+        parts = [
+            np.log(share / total) + _log_normal(self.points, mean, covariance)
+            for share, mean, covariance in mixture
+        ]
+        return np.asarray(logsumexp(parts, axis=0))
+
+
+def _log_normal(points: FloatArray, mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Logarithm of N(points; mean, covariance) (s,), without the constant of its size."""
+    L = np.linalg.cholesky(covariance)
+    u = np.linalg.solve(L, (points - mean).T)
+    return np.asarray(-0.5 * np.sum(u**2, axis=0) - np.log(np.diagonal(L)).sum())

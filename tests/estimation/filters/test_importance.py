@@ -1,0 +1,76 @@
+"""Weighted draws against posteriors that are known, in a few hundred runs of the model."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.estimation import Gaussian, ImportanceFilter, Prediction, Reason
+from tests.estimation.problems import Linear, banana, gridded, wings
+
+
+@pytest.mark.parametrize(("y", "R"), [(0.0, 0.01), (1.0, 0.05), (2.0, 0.01)])
+def test_a_banana_is_drawn_as_one(y, R) -> None:
+    prior = Gaussian(np.array([0.3, 0.0]), np.eye(2))
+    mean, std, kurtosis = gridded(banana, prior, np.array([y]), R)
+    found = ImportanceFilter(effective=100.0)(banana, prior, np.array([y]), R)
+    assert found.trusted, found.why
+    # Four standard errors of a mean of 100 effective draws, and of a standard deviation of theirs.
+    assert np.all(np.abs(found.mean - mean) < 4.0 * std / 10.0)
+    # The latter has the relative variance (kurtosis - 1)/(4 n).
+    assert np.all(np.abs(np.log(found.std / std)) < 2.0 * np.sqrt((kurtosis - 1.0) / 100.0))
+    assert found.forward_solves < 340
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_both_wings_are_seen(seed) -> None:
+    prior = Gaussian(np.array([0.05]), np.eye(1))
+    mean, std, _ = gridded(wings, prior, np.array([1.3]), 0.05)
+    found = ImportanceFilter(seed=seed)(wings, prior, np.array([1.3]), 0.05)
+    assert found.trusted, found.why
+    assert abs(found.mean[0] - mean[0]) < 4.0 * std[0] / np.sqrt(60.0)
+    assert found.std[0] == pytest.approx(std[0], rel=0.2)
+    low, high = found.interval()
+    assert low[0] < -1.0
+    assert high[0] > 1.0
+
+
+@pytest.mark.parametrize("p", [2, 5, 11])
+def test_on_a_linear_model_it_is_the_kalman_filter_within_its_error(p) -> None:
+    problem = Linear(n=30, p=p, seed=1)
+    found = ImportanceFilter()(problem.differentiated, problem.prior, problem.y, problem.R)
+    assert found.reason is Reason.COMPLETED
+    std = np.sqrt(np.diagonal(problem.covariance))
+    assert np.all(np.abs(found.mean - problem.mean) < 4.0 * std / np.sqrt(60.0))
+    assert np.all(np.abs(np.log(found.std / std)) < 4.0 / np.sqrt(120.0))
+
+
+def test_too_few_runs_are_said_to_be_too_few() -> None:
+    problem = Linear(n=30, p=8, seed=1)
+    found = ImportanceFilter(runs=40, batch=20)(
+        problem.differentiated, problem.prior, problem.y, problem.R
+    )
+    assert found.reason is Reason.NOT_SAMPLED
+    assert not found.trusted
+    assert "effective" in found.why + found.detail
+
+
+def test_where_the_model_fails_there_is_no_posterior() -> None:
+    def positive_only(m):
+        if m[0] <= 0.0:
+            return Prediction.failed("not positive")
+        return Prediction(m.copy(), np.eye(1))
+
+    prior = Gaussian(np.array([0.5]), np.eye(1))
+    found = ImportanceFilter()(positive_only, prior, np.array([0.2]), 0.25)
+    assert found.transformed_samples is not None
+    assert np.all(found.transformed_samples > 0.0)
+    # N(0.26, 0.2) cut at zero.
+    grid = np.linspace(0.0, 4.0, 4001)
+    density = np.exp(-0.5 * (grid - 0.26) ** 2 / 0.2)
+    expected = np.sum(grid * density) / np.sum(density)
+    assert found.mean[0] == pytest.approx(expected, abs=4.0 * 0.3 / np.sqrt(60.0))
+
+
+def test_settings_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(InputError, match="batches of at least 10"):
+        ImportanceFilter(batch=5)
