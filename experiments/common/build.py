@@ -376,16 +376,17 @@ def build_filter(
 def filter_of(settings: Values, mean: FloatArray) -> Filter:
     """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
     tolerance, most = settings["tolerance"], settings["max_iterations"]
+    check = settings.get("check_runs", 0)
     match settings["mode"]:
         case "paper":
             Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
-            return PaperFilter(Q, tolerance, most)
+            return PaperFilter(Q, tolerance, most, check_runs=check)
         case "extended":
-            return ExtendedFilter()
+            return ExtendedFilter(check_runs=check)
         case "iterated":
-            return IteratedFilter(tolerance, max_iterations=most)
+            return IteratedFilter(tolerance, max_iterations=most, check_runs=check)
         case "unscented":
-            return UnscentedFilter(tolerance, most, settings["spread"])
+            return UnscentedFilter(tolerance, most, settings["spread"], check_runs=check)
         case "ensemble":
             return build(EnsembleFilter, settings["ensemble"])
         case "monte_carlo":

@@ -29,6 +29,10 @@ from mvest.valve.anatomy.template import TemplateParameters
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
+AS_BEFORE = {"check_runs": 0}
+"""Settings that came after results which are as with these values; so they leave no trace in the
+hash, wherever they stand in a configuration."""
+
 GROUP = "study"
 """The configuration group of the rooms."""
 
@@ -94,6 +98,7 @@ class FilterConfig:
     tolerance: float = 1e-4
     max_iterations: int = 30
     spread: float = 1.0  # of sigma points, in parts of the simplex whose covariance is P
+    check_runs: int = 0  # made at the end to check the posterior; an ensemble has its own
     ensemble: EnsembleFilterConfig = field(default_factory=EnsembleFilterConfig)  # type: ignore[valid-type]
     monte_carlo: MonteCarloFilterConfig = field(default_factory=MonteCarloFilterConfig)  # type: ignore[valid-type]
 
@@ -236,7 +241,15 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
         part, _, inner = name.partition(".")
         if inner and kept.get(part) is not None:
             kept[part] = {key: value for key, value in kept[part].items() if key != inner}
-    return config_hash(with_contents(_settings(kept.get("study")), kept))
+    return config_hash(with_contents(_settings(kept.get("study")), _without_as_before(kept)))
+
+
+def _without_as_before(part: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_as_before(value) if isinstance(value, Mapping) else value
+        for key, value in part.items()
+        if not (key in AS_BEFORE and value == AS_BEFORE[key])
+    }
 
 
 @cache

@@ -82,6 +82,17 @@ def test_a_hash_depends_on_what_changes_the_result_only() -> None:
     assert len(others) == 8
 
 
+def test_a_check_that_is_not_asked_for_leaves_no_trace_in_the_hash() -> None:
+    values = plain(composed("experiment=table1"))
+    assert values["filter"].pop("check_runs") == 0
+    assert values["filter"]["ensemble"].pop("check_runs") == 0
+    assert values["filter"]["monte_carlo"]["start"].pop("check_runs") == 0
+    base = hash_of(composed("experiment=table1"))
+    assert hash_of(values) == base
+    assert hash_of(composed("experiment=table1", "filter.check_runs=2")) != base
+    assert hash_of(composed("experiment=table1", "filter.ensemble.check_runs=2")) != base
+
+
 def test_what_within_a_part_changes_no_number_is_no_part_of_the_hash() -> None:
     base = hash_of(composed("experiment=imaging"))
     same = ["imaging.processes=7", "imaging.publish_model=true"]
