@@ -146,3 +146,14 @@ def test_a_signal_leaves_nothing_behind(stage, signals, undisturbed, tmp_path, r
         store = open_store(None, tmp_path / "outputs", "sweep_debug")
         runs = store.list_runs()
         assert [run.info.status for run in runs] == ["FINISHED"] * 5, "four jobs and the sweep"
+
+
+def test_the_time_limit_of_a_job_ends_the_programs_that_it_started(tmp_path):
+    (tmp_path / "hold").write_text("simulating")
+    one = ("filter.initial=[5,3]", "sweep.small.seed=1")
+    sweep = start(tmp_path, UNTRACKED, *one, "time_limit_s=10")
+    out, _ = sweep.communicate(timeout=120)
+    assert (tmp_path / "at").exists(), "the program had not begun"
+    assert sweep.returncode == 1, out
+    assert "time limit of 10 s" in out
+    assert gone(tmp_path), alive(tmp_path)
