@@ -15,7 +15,7 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics.reference import RestVariation, vary_equilibrium
-from mvest.mechanics.valve_system import boundary_loading
+from mvest.mechanics.valve_system import boundary_loading, patch_members
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import leaflet_normals
 from mvest.valve.anatomy.valve import lumped_areas
@@ -135,6 +135,15 @@ class RestGeometry:
         follows from the tips.
         """
         return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
+
+    def insertions(self, moves: FloatArray) -> RestVariation:
+        """Of where the chordae end, by displacements ``(q, c, 3)`` mm at rest."""
+        model = self.model
+        members, _, slope = patch_members(
+            model.contact_valve, model.settings.patch_radius, model.valve.chordae.insertion
+        )
+        patches = np.einsum("csi,qci->qcs", slope, moves)
+        return RestVariation(self._still(len(moves)), patches=patches, members=members)
 
     def change(self, m: FloatArray, variation: RestVariation) -> FloatArray | str:
         """Derivatives ``(2, n, 3, q)`` of the observed open and closed valve, or why none.

@@ -27,7 +27,7 @@ from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import LinearSolver
 from mvest.mechanics.system import Loads, System
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 
 __all__ = ["RestVariation", "vary_equilibrium"]
 
@@ -53,6 +53,10 @@ class RestVariation:
     tips : (q, t, 3) mm or None
     rest_length : (q, cables) or None
         Relative change of the cables' rest lengths.
+    patches : (q, cables, s) or None
+        Change of the weights of the contact points that a cable's end is an average of.
+    members : (cables, s) or None
+        These points, the same for all quantities.
     """
 
     nodes: FloatArray
@@ -62,6 +66,8 @@ class RestVariation:
     supports: FloatArray | None = None
     tips: FloatArray | None = None
     rest_length: FloatArray | None = None
+    patches: FloatArray | None = None
+    members: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -84,10 +90,11 @@ class RestVariation:
             )
 
         nodes = np.concatenate([part.nodes for part in parts])
-        return cls(nodes, **{name: of(name) for name in _OPTIONAL})
+        members = next((part.members for part in parts if part.members is not None), None)
+        return cls(nodes, **{name: of(name) for name in _OPTIONAL}, members=members)
 
 
-_OPTIONAL = tuple(f.name for f in fields(RestVariation) if f.name != "nodes")
+_OPTIONAL = tuple(f.name for f in fields(RestVariation) if f.name not in ("nodes", "members"))
 
 
 def vary_equilibrium(
@@ -220,7 +227,7 @@ def _outside_change(
         add_forces(out, points.nodes, points.weights[:, :, None] * force[:, None, :])
     if system.cables is not None:
         cables, factors = system.cables, system.factors
-        _, stiffness, _, by_length = cables.forces(
+        pull, stiffness, _, by_length = cables.forces(
             x, loads.tips, factors.chord_stiffness, factors.chord_rest_length
         )
         force = np.zeros((len(stiffness), 3))
@@ -229,6 +236,14 @@ def _outside_change(
         if variation.rest_length is not None:
             factor = factors.chord_rest_length * variation.rest_length[k]
             force += factor[:, None] * by_length
+        if variation.patches is not None and variation.members is not None:
+            assert system.contact is not None
+            points, weights = system.contact.points, variation.patches[k]
+            moved = np.einsum("cs,csi->ci", weights, points(x)[variation.members])
+            force += np.einsum("cij,cj->ci", stiffness, moved)
+            pulled = np.zeros((len(points), 3))
+            add_forces(pulled, variation.members, weights[:, :, None] * pull[:, None, :])
+            add_forces(out, points.nodes, points.weights[:, :, None] * pulled[:, None, :])
         patches = cables.patches
         add_forces(out, patches.nodes, patches.weights[:, :, None] * force[:, None, :])
     return out

@@ -26,7 +26,7 @@ from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.system import Factors, Loads, System
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 from mvest.units import mmhg_to_mpa
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.embedding import Embedding, embed
@@ -42,6 +42,7 @@ __all__ = [
     "factors_of",
     "held_loading",
     "material_law",
+    "patch_members",
     "retune",
     "variation_of",
 ]
@@ -130,8 +131,9 @@ def build_system(
     solid = Solid(mesh, law, density=settings.density)
     surface = contact_valve.surface
     midpoints = embed(mesh, surface.vertices)
+    members, weights, _ = patch_members(contact_valve, settings.patch_radius, chordae.insertion)
     cables = Cables(
-        _patches(midpoints, contact_valve, settings.patch_radius, chordae.insertion),
+        midpoints.average(weights, members),
         chordae.tip,
         chordae.rest_length,
         chordae.axial_stiffness,
@@ -277,27 +279,43 @@ def factors_of(cables: Cables, values: Mapping[str, float]) -> Factors:
     )
 
 
-def _patches(points: Embedding, valve: Valve, radius: float, insertion: FloatArray) -> Embedding:
+def patch_members(
+    valve: Valve, radius: float, insertion: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Leaflet ends of the chordae: averages over material points within ``radius`` mm.
 
     Weights ``area (1 - (d / radius)^2)^2``, of fixed physical size whatever the mesh.
+
+    Returns
+    -------
+    members : (c, s)
+        Vertices; padding has the weight zero.
+    weights : (c, s)
+        Rows sum to one.
+    by_insertion : (c, s, 3) 1/mm
+        Derivatives of the weights by the place of the insertion.
     """
     vertices, areas = valve.surface.vertices, valve.surface.areas
-    members, factors = [], []
+    rows = []
     for centre in insertion:
-        d = np.linalg.norm(vertices - centre, axis=1)
+        away = vertices - centre
+        d = np.linalg.norm(away, axis=1)
         reach = max(radius, 1.05 * float(d.min()))
         inside = np.flatnonzero(d < reach)
-        weight = areas[inside] * (1 - (d[inside] / reach) ** 2) ** 2
-        members.append(inside)
-        factors.append(weight / weight.sum())
-    width = max((len(m) for m in members), default=1)
-    groups = np.zeros((len(members), width), dtype=np.int64)
-    coefficients = np.zeros((len(members), width))
-    for k, (m, f) in enumerate(zip(members, factors, strict=True)):
-        groups[k, : len(m)] = m
-        coefficients[k, : len(m)] = f
-    return points.average(coefficients, groups)
+        level = 1 - (d[inside] / reach) ** 2
+        weight = areas[inside] * level**2
+        slope = (areas[inside] * level * 4 / reach**2)[:, None] * away[inside]
+        total = weight.sum()
+        weight /= total
+        rows.append((inside, weight, (slope - weight[:, None] * slope.sum(axis=0)) / total))
+    width = max((len(row[0]) for row in rows), default=1)
+    members = np.zeros((len(rows), width), dtype=np.int64)
+    weights, by_insertion = np.zeros((len(rows), width)), np.zeros((len(rows), width, 3))
+    for k, (inside, weight, slope) in enumerate(rows):
+        members[k, : len(inside)] = inside
+        weights[k, : len(inside)] = weight
+        by_insertion[k, : len(inside)] = slope
+    return members, weights, by_insertion
 
 
 def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hinge:

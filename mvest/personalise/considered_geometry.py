@@ -32,6 +32,8 @@ __all__ = ["ConsideredGeometry", "geometry_columns"]
 KEPT = 0.999
 """Share of the variance of a kind's columns that is kept: what the rest adds is nothing."""
 
+_SCALES = ("shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "thickness", "fibre_degrees")
+
 TIP_STEP = 0.01
 """mm, by which tips are moved to differentiate rest lengths that follow from them."""
 
@@ -42,8 +44,8 @@ class ConsideredGeometry:
 
     The defaults are choices: a third of the spread between observers of a leaflet in 3D
     echocardiography for the open shape, which a case takes from the sharpest frame; a voxel for the
-    annulus; two for the tips, of which images show the muscle rather than a point; thickness and
-    fibres as they vary between hearts.
+    annulus; two for the tips, of which images show the muscle rather than a point; the size of a
+    patch of chordal branches for the insertions; thickness and fibres as they vary between hearts.
 
     Attributes
     ----------
@@ -53,6 +55,8 @@ class ConsideredGeometry:
         Of the closed annulus.
     tips_mm : float
         Of each coordinate of a papillary tip.
+    insertions_mm : float
+        Of each coordinate of where a chord ends, along the leaflet.
     thickness : float
         Relative, of each leaflet.
     fibre_degrees : float
@@ -69,13 +73,14 @@ class ConsideredGeometry:
     annulus_mm: float = 0.5
     annulus_length_mm: float = 20.0
     tips_mm: float = 1.0
+    insertions_mm: float = 0.5
     thickness: float = 0.1
     fibre_degrees: float = 10.0
     factor: float = 2.0
     share: float = 0.95
 
     def __post_init__(self) -> None:
-        for name in ("shape_mm", "annulus_mm", "tips_mm", "thickness", "fibre_degrees"):
+        for name in _SCALES:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"considered geometry {name} = {value}, expected >= 0")
@@ -154,6 +159,9 @@ def _variations(
         if considered.tips_mm:
             moves = considered.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
             kinds.append(("papillary tips", geometry.tips(moves, _lengths(case, moves)), 1.0))
+    if considered.insertions_mm:
+        moves = considered.insertions_mm * _each_way(np.eye(len(case.valve.chordae)))
+        kinds.append(("insertions", geometry.insertions(moves), 1.0))
     if considered.thickness:
         factors = considered.thickness * _leaflets(surface)
         kinds.append(("thickness", geometry.thickness(factors), 1.0))

@@ -507,8 +507,13 @@ def test_a_chord_is_spread_over_its_patch():
     mesh = structured_mesh(TEMPLATE, "hex18", 24, 3)
     points = embed(mesh, contact_valve.surface.vertices)
     insertion = valve.chordae.insertion
+
+    def patches_of(points, valve, radius):
+        members, weights, _ = valve_system.patch_members(valve, radius, insertion)
+        return points.average(weights, members)
+
     for radius in (1.0, 2.0):
-        patches = valve_system._patches(points, contact_valve, radius, insertion)
+        patches = patches_of(points, contact_valve, radius)
         np.testing.assert_allclose(patches.weights.sum(axis=1), 1, atol=1e-12)
         # The centre of a patch lies within it; at the free edge it is cut on one side.
         distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
@@ -518,12 +523,11 @@ def test_a_chord_is_spread_over_its_patch():
     dense = TEMPLATE.valve(240, 61)
     exact = embed(mesh, dense.surface.vertices)
     centres = [
-        valve_system._patches(p, v, 2.0, insertion)(mesh.nodes)
-        for p, v in ((points, contact_valve), (exact, dense))
+        patches_of(p, v, 2.0)(mesh.nodes) for p, v in ((points, contact_valve), (exact, dense))
     ]
     assert np.linalg.norm(centres[0] - centres[1], axis=1).max() < 0.03
     # A patch smaller than the samples' spacing takes the nearest sample.
-    patches = valve_system._patches(points, contact_valve, 1e-6, insertion)
+    patches = patches_of(points, contact_valve, 1e-6)
     gap = np.linalg.norm(contact_valve.surface.vertices - insertion[:, None], axis=2).min(axis=1)
     distance = np.linalg.norm(patches(mesh.nodes) - insertion, axis=1)
     assert np.all(distance <= 1.05 * gap + 1e-6)

@@ -17,10 +17,11 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
-from mvest.mechanics.valve_system import boundary_loading, build_system
+from mvest.mechanics.valve_system import boundary_loading, build_system, patch_members
+from mvest.valve.mesh.embedding import embed
 from tests.closure.test_model import AT, CLOSING, OPEN, model_of
 
-KINDS = ("shape", "thickness", "fibres", "annulus", "tips", "rest length")
+KINDS = ("shape", "thickness", "fibres", "annulus", "tips", "rest length", "insertions")
 
 
 def variation_of(geometry, kind):
@@ -37,6 +38,8 @@ def variation_of(geometry, kind):
     annulus = model.contact_valve.motion.annulus[-1]
     if kind == "annulus":
         return geometry.annulus((0.1 * annulus[:, [1, 2, 0]])[None])
+    if kind == "insertions":
+        return geometry.insertions(0.5 * np.roll(model.valve.chordae.insertion / 20, 1, 1)[None])
     tips = np.array([[[0.5, 0.7, -0.3], [-0.2, 0.4, 0.9]]])
     lengths = np.linspace(-1, 1, len(model.valve.chordae))[None]
     return geometry.tips(tips if kind == "tips" else 0 * tips, None if kind == "tips" else lengths)
@@ -65,6 +68,14 @@ def displaced(model, variation, h, start):
         surface.triangles,
         model.settings.contact,
     )
+    if variation.patches is not None:
+        members, weights, _ = patch_members(
+            model.contact_valve, model.settings.patch_radius, model.valve.chordae.insertion
+        )
+        surface = model.contact_valve.surface
+        embedded = embed(model.mesh, surface.vertices)
+        system.cables.patches = embedded.average(weights + part("patches"), members)
+        system._build_pattern(np.zeros((0, 2), dtype=np.int64))
     system.cables.rest_length = system.cables.rest_length * (1 + part("rest_length"))
     loads = replace(loads, hinge=loads.hinge + part("supports"), tips=loads.tips + part("tips"))
     result = simulate(
@@ -138,3 +149,23 @@ def test_a_leaflet_is_thicker_on_both_faces_and_moves_as_a_whole(closed):
 def test_a_valve_that_still_moves_has_no_derivative_by_its_geometry():
     with pytest.raises(InputError, match="ends in equilibrium"):
         RestGeometry(model_of(OPEN))
+
+
+def test_weights_of_a_chords_end_follow_its_insertion():
+    valve, move = model_of(CLOSING).contact_valve, np.array([0.3, -0.5, 0.2])
+    members, weights, slope = patch_members(valve, 2.0, valve.chordae.insertion)
+
+    def all_weights(h):
+        there, own, _ = patch_members(valve, 2.0, valve.chordae.insertion + h * move)
+        out = np.zeros((len(own), len(valve.surface.vertices)))
+        np.add.at(out, (np.arange(len(own))[:, None], there), own)
+        return out
+
+    exact = np.zeros((len(weights), len(valve.surface.vertices)))
+    np.add.at(exact, (np.arange(len(weights))[:, None], members), slope @ move)
+    difference = (all_weights(1e-5) - all_weights(-1e-5)) / 2e-5
+    # Of chords whose patch has a radius of its own, by their nearest vertex, that changes as well.
+    d = np.linalg.norm(valve.surface.vertices[:, None] - valve.chordae.insertion, axis=2).min(0)
+    fixed = 1.05 * d < 2.0 - 1e-3
+    assert fixed.sum() > 10
+    np.testing.assert_allclose(exact[fixed], difference[fixed], atol=1e-6)

@@ -20,7 +20,9 @@ from mvest.problem.registration import RegisteredModel
 from tests.closure.test_model import AT, CLOSING, model_of
 from tests.made_up_closure import FIELDS, made_up_case, settings, use
 
-NONE = ConsideredGeometry(shape_mm=0, annulus_mm=0, tips_mm=0, thickness=0, fibre_degrees=0)
+NONE = ConsideredGeometry(
+    shape_mm=0, annulus_mm=0, tips_mm=0, insertions_mm=0, thickness=0, fibre_degrees=0
+)
 MODULI = ("E_f.anterior", "E_f.posterior")
 
 
