@@ -16,7 +16,8 @@ SOON, LATE = 60.0, 300.0
 def test_an_extreme_closes_or_says_why_not(name):
     ended = close(EXTREMES[name])
     assert ended.sound, ended
-    assert ended.converged == EXTREMES[name].closes, ended
+    if EXTREMES[name].closes is not None:
+        assert ended.converged == EXTREMES[name].closes, ended
     assert ended.seconds < SOON
 
 

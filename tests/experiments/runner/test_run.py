@@ -136,7 +136,7 @@ ERRORS = [
     ("seed=-1", "seed = -1, expected 0 to 4294967295"),
     ("time_limit_s=1e12", "time_limit_s = 1e+12, expected 0.01 to 2592000 s"),
     ("mesh.columns=100000", "mesh.columns = 100000, expected 1 to 400"),
-    ("mechanics.protocol.pressure_mmHg=1e6", "pressure_mmHg = 1000000, expected 0 to 500 mmHg"),
+    ("mechanics.protocol.pressure_mmHg=1e6", "pressure_mmHg = 1000000, expected -100 to 500 mmHg"),
     ("truth.values=[1e9,2]", "truth.values of E_f.anterior = 1000000000, expected"),
     ("mechanics.density=nan", "mechanics.density is nan"),
     ("study=magic", "Could not find 'study/magic'; known: case, chord"),

@@ -197,7 +197,7 @@ def test_a_valve_that_cannot_be_simulated_is_recorded_as_a_failure(run, monkeypa
     [
         ("prediction.samples=24", "prediction.samples = 24, expected a power of two"),
         ("prediction.spread=[0.1]", "prediction.spread has 1 values"),
-        ("prediction.scenarios.both.clip.width_mm=-1", "clip width_mm = -1"),
+        ("prediction.scenarios.both.clip.width_mm=-1", "clip.width_mm = -1, expected 0 to"),
         ("prediction.scenarios.both.annuloplasty.mm=2", "one of them > 0"),
     ],
 )
