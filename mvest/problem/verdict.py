@@ -236,12 +236,12 @@ def _innovation(e: Indications) -> Seen:
         yield None
         return
     low, high = e.nis_band
-    if low <= e.nis <= high:
+    # Errors smaller than assumed leave intervals wider than they need to be.
+    if e.nis <= high:
         return
-    far = e.nis > NIS_FACTOR * high or e.nis < low / NIS_FACTOR
     yield Ground(
         "size of what is left over",
-        NONE if far else DOUBTFUL,
+        NONE if e.nis > NIS_FACTOR * high else DOUBTFUL,
         f"what the fit leaves over is {np.sqrt(e.nis):.2f} times what its errors explain, "
         f"expected {np.sqrt(low):.2f} to {np.sqrt(high):.2f}",
         "state larger errors, or look where the model cannot follow (map of the innovation)",
