@@ -108,16 +108,16 @@ def check_against_runs(
 ) -> list[ApproximationCheck]:
     """Compare N(z, P) with the objective J at runs of the model, and with one more update.
 
-    Were the posterior N(z, P), a point at the distance δ = |C⁻¹ (zₖ − z)|, P = C Cᵀ, would have
-    τ = √(2 (J(zₖ) − J(z))) = δ, the profile of Bates and Watts (Nonlinear Regression Analysis and
-    Its Applications, 1988, section 6.1). Two comparisons are made at every run:
+    Were the posterior N(z, P) with P = C Cᵀ, a point at the distance ``δ = |C⁻¹ (zₖ − z)|`` would
+    have ``τ = √(2 (J(zₖ) − J(z))) = δ``, the profile of Bates and Watts (Nonlinear Regression
+    Analysis and Its Applications, 1988, section 6.1). Two comparisons are made at every run:
 
     * τ with δ, wherever either says that the point is probable, and roughly where either says that
       it is not out of the question. A place that is as likely as the estimate, but lies far beyond
       its intervals, is seen so.
     * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², brought
       to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)) and
-      a = W H (zₖ − z)/δ it changes J at a distance of ± 1 by −(q/δ²)·(e ∓ a) + ½ |q/δ²|².
+      a = W H (zₖ − z)/δ it changes J at a distance of ± 1 by ``−(q/δ²)·(e ∓ a) + ½ |q/δ²|²``.
       A run with derivatives tells ½ W (Hₖ − H) C u/δ of other directions u as well.
 
     Further, with H and e an update of the prior should lead to N(z, P) itself.
