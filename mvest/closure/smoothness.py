@@ -9,15 +9,21 @@ next is known but for what their derivatives do not explain,
 
 The trapezoidal rule leaves of a smooth response a third-order term, -x''' h^3 / 12: half the step,
 an eighth. A jump stays whole, whatever the step. A kink (a slope that changes by k) leaves at most
-k h / 2, which falls in proportion. So a piece with too much unexplained is halved, until it is
-explained or narrower than `RESOLUTION`; what is then left is called a jump, with its size, place
-and the number of vertices. Too much is more than `JUMP_LIMIT` at any one vertex, not in the mean;
-or, over all vertices, more than `SLOPE_LIMIT` of the way that the derivatives say, which is what a
-derivative that is wrong everywhere does, and small steps too.
+k h / 2, which falls in proportion. So a piece with more than `JUMP_LIMIT` unexplained at any one
+vertex, or more than `SLOPE_LIMIT` of its way over all vertices, is halved until it is explained or
+narrower than `RESOLUTION`. A path is not passed if then
+
+* a vertex moves by more than `JUMP_LIMIT` unexplained: a jump, which no mean may hide;
+* or more than `SLOPE_LIMIT` of a piece's way is unexplained and it can be seen: a vertex moves by
+  more than `SEEN`. A share of a way that is itself too short to be seen says nothing;
+* or what is unexplained adds up to more than `SLOPE_LIMIT` of the whole way: derivatives that are
+  wrong everywhere, or many small jumps, which no piece shows;
+* or a state's derivative explains neither of its two sides to `SIDE_LIMIT`. At a kink it is right
+  on one of them.
 
 What this cannot see: states that leave and come back between two neighbours; a jump smaller than
-the limit; and whether a change steeper than the resolution is continuous, which to an estimator of
-that modulus is the same.
+the limit; a derivative that is wrong at an end of the path alone; and whether a change steeper than
+the resolution is continuous, which to an estimator of that modulus is the same.
 """
 
 from __future__ import annotations
@@ -30,12 +36,28 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["JUMP_LIMIT", "RESOLUTION", "SLOPE_LIMIT", "Path", "PathState", "Piece", "follow"]
+__all__ = [
+    "JUMP_LIMIT",
+    "RESOLUTION",
+    "SEEN",
+    "SIDE_LIMIT",
+    "SLOPE_LIMIT",
+    "Path",
+    "PathState",
+    "Piece",
+    "follow",
+]
 
 JUMP_LIMIT = 0.1
 """mm, largest accepted unexplained move of any vertex: what other numerics may move in the mean."""
 SLOPE_LIMIT = 0.05
-"""Largest accepted unexplained part of the way, over all vertices."""
+"""Largest accepted unexplained part of a way, over all vertices, piece by piece and in all."""
+SEEN = 0.02
+"""mm, what no estimator sees of a single point: as `resolution_mm` of the errors that are learned
+(:class:`mvest.observation.learned.ErrorBeliefs`)."""
+SIDE_LIMIT = 0.2
+"""Unexplained part of the way on both sides of a state from which its derivative is called wrong,
+by half (of one half too large: h d / 4 in 5 h d / 4), and with it the width of an interval."""
 RESOLUTION = 0.02
 """Width in log E below which a piece is not halved any more."""
 ROUND_OFF = 1e-6
@@ -69,21 +91,34 @@ class Piece:
         Of the vertex at which it is largest.
     vertices : int
         How many have more than the limit.
-    share : float
-        The unexplained over the explained way, both as norms over all vertices.
+    unexplained, way : float
+        mm, of all vertices (the root of the sum of squares): what the derivatives do not say of the
+        way, and how long it is by what they say.
     """
 
     low: float
     high: float
     unexplained_mm: float
     vertices: int
-    share: float
+    unexplained: float
+    way: float
+
+    @property
+    def share(self) -> float:
+        """The unexplained over the way; 0 where there is no more than round-off."""
+        if self.unexplained_mm <= ROUND_OFF:
+            return 0.0
+        return self.unexplained / self.way if self.way > 0 else float("inf")
+
+    @property
+    def explained(self) -> bool:
+        """Whether it need not be looked at more closely."""
+        return self.unexplained_mm <= JUMP_LIMIT and self.share <= SLOPE_LIMIT
 
     @property
     def passed(self) -> bool:
-        """Whether the derivatives explain the way."""
-        small = self.share <= SLOPE_LIMIT or self.unexplained_mm <= ROUND_OFF
-        return self.unexplained_mm <= JUMP_LIMIT and small
+        """Whether it may stay as it is where it cannot be looked at more closely."""
+        return self.explained or self.unexplained_mm <= SEEN
 
     @property
     def width(self) -> float:
@@ -101,6 +136,8 @@ class Path:
         What is changed.
     pieces : tuple of Piece
         In ascending order, after what was halved; up to the first that cannot be explained.
+    share : float
+        Of the whole way, what the derivatives do not explain: over all pieces, nothing cancels.
     curvature : float
         Largest difference of a central difference over the widest step from the exact derivative in
         the middle, relative: how much the response bends. No limit is set to it.
@@ -112,6 +149,7 @@ class Path:
 
     name: str
     pieces: tuple[Piece, ...]
+    share: float
     curvature: float
     closures: int
     reason: str
@@ -154,7 +192,7 @@ def follow(
 
     for factor in factors:
         if reason := missing(factor):
-            return Path(name, (), float("nan"), tried, reason)
+            return Path(name, (), float("nan"), float("nan"), tried, reason)
     curvature = _curvature(states)
     pieces: list[Piece] = []
     # The last one is looked at first, so that pieces come in ascending order.
@@ -163,14 +201,15 @@ def follow(
     while waiting and not reason:
         low, high = waiting.pop()
         piece = _piece(low, high, states)
-        if piece.passed or piece.width < RESOLUTION:
+        if piece.explained or piece.width < RESOLUTION:
             pieces.append(piece)
             reason = "" if piece.passed else _fault(piece)
             continue
         middle = float(np.sqrt(low * high))
         reason = missing(middle)
         waiting += [(middle, high), (low, middle)]
-    return Path(name, tuple(pieces), curvature, tried, reason)
+    share = _share(pieces)
+    return Path(name, tuple(pieces), share, curvature, tried, reason or _overall(pieces, share))
 
 
 def _piece(low: float, high: float, states: dict[float, PathState]) -> Piece:
@@ -178,9 +217,36 @@ def _piece(low: float, high: float, states: dict[float, PathState]) -> Piece:
     unexplained = b.y - a.y - 0.5 * width * (a.slope + b.slope)
     at_vertex = np.linalg.norm(unexplained, axis=1)
     way = 0.5 * width * float(np.linalg.norm(a.slope) + np.linalg.norm(b.slope))
-    size = float(np.linalg.norm(unexplained))
-    share = float(size / way) if way > 0 else (0.0 if size == 0 else float("inf"))
-    return Piece(low, high, float(at_vertex.max()), int((at_vertex > JUMP_LIMIT).sum()), share)
+    return Piece(
+        low,
+        high,
+        float(at_vertex.max()),
+        int((at_vertex > JUMP_LIMIT).sum()),
+        float(np.linalg.norm(unexplained)),
+        way,
+    )
+
+
+def _share(pieces: Sequence[Piece]) -> float:
+    """Of the whole way."""
+    unexplained = sum(piece.unexplained for piece in pieces if piece.share > 0)
+    way = sum(piece.way for piece in pieces)
+    if unexplained == 0:
+        return 0.0
+    return unexplained / way if way > 0 else float("inf")
+
+
+def _overall(pieces: Sequence[Piece], share: float) -> str:
+    """Why pieces that pass one by one do not do so together; empty if they do."""
+    for left, right in pairwise(pieces):
+        if min(left.share, right.share) > SIDE_LIMIT:
+            return (
+                f"the derivative at {_percent(left.high)} explains neither side of it: "
+                f"{100 * left.share:.2g} and {100 * right.share:.2g} % of the way are left"
+            )
+    if share > SLOPE_LIMIT:
+        return f"{100 * share:.2g} % of the whole way is not what the derivatives say"
+    return ""
 
 
 def _fault(piece: Piece) -> str:

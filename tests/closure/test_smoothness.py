@@ -9,11 +9,13 @@ import pytest
 from mvest.closure.smoothness import (
     JUMP_LIMIT,
     RESOLUTION,
+    SEEN,
     SLOPE_LIMIT,
     PathState,
     _piece,
     follow,
 )
+from mvest.observation.learned import ErrorBeliefs
 
 FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.2)
 FEW = 4
@@ -130,8 +132,52 @@ def test_a_derivative_that_is_wrong_everywhere_is_seen_by_its_share():
     assert judged(response(*right)).passed
     path = judged(response(*right, wrong=1.1))
     assert not path.passed
-    assert "9.1 % of the way" in path.reason
-    assert path.pieces[-1].unexplained_mm < JUMP_LIMIT
+    assert path.reason.startswith("9.1 % of the whole way")
+    assert path.pieces[-1].unexplained_mm < SEEN
+
+
+@pytest.mark.parametrize(("slope", "passes"), [(1.0, True), (6.0, False)])
+def test_a_slope_that_doubles_passes_where_it_moves_less_than_is_seen(slope, passes):
+    # Off the middle of [0, log 1.01] by 0.002: 0.002 slope |WAY| is left, 8 and 46 micrometres, in
+    # either case of a way of 1.5 slope log 1.01 |WAY|: 13 %.
+    def shape(s):
+        return slope * (s + max(s - 0.003, 0.0))
+
+    path = judged(response(shape, lambda s: slope * (1.0 + (s > 0.003))))
+    assert max(piece.share for piece in path.pieces) == pytest.approx(0.132, abs=0.01)
+    assert path.passed == passes, path.reason
+    assert passes or "13 % of the way between +0 % and +1 %, up to 0.046 mm" in path.reason
+
+
+@pytest.mark.parametrize(("jump", "passes"), [(0.004, True), (0.01, False)])
+def test_a_jump_of_all_vertices_passes_where_it_is_less_than_is_seen(jump, passes):
+    # 14 and 35 micrometres at the vertex that jumps farthest: both below the limit of one vertex.
+    path = judged(response(lambda s: s + jump * (s > 0.1), lambda s: 1.0 + 0.0 * s))
+    assert path.passed == passes, path.reason
+
+
+def test_many_small_jumps_are_seen_by_what_they_add_up_to():
+    # 14 micrometres every 2 %: each less than is seen, together 7 % of the way.
+    path = judged(response(lambda s: 3.0 * s + 0.004 * np.round(s / 0.02), lambda s: 3.0 + 0.0 * s))
+    assert max(piece.unexplained_mm for piece in path.pieces) < SEEN
+    assert "% of the whole way" in path.reason
+    assert path.share == pytest.approx(0.004 / (3.0 * 0.02), rel=0.1)
+
+
+@pytest.mark.parametrize(("wrong", "passes"), [(1.3, True), (1.6, False), (0.5, False)])
+def test_a_derivative_that_is_wrong_at_one_state_explains_neither_side(wrong, passes):
+    # Of a way so short that nothing of it is seen, and of all of it too little to count.
+    close = response(*waves(0.05, 1.0))
+    centre = PathState(close(1.0).y, wrong * close(1.0).slope)
+    path = follow("E_f", close, centre, FACTORS)
+    assert max(piece.unexplained_mm for piece in path.pieces) < SEEN
+    assert path.share < SLOPE_LIMIT
+    assert path.passed == passes, path.reason
+    assert passes or path.reason.startswith("the derivative at +0 % explains neither side")
+
+
+def test_what_is_seen_is_what_an_estimator_believes_of_a_point():
+    assert ErrorBeliefs().resolution_mm == SEEN
 
 
 def test_closures_are_few_where_nothing_is_amiss_and_bounded_where_it_is():

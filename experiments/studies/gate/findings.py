@@ -37,8 +37,9 @@ class Followed:
     """The closed surface followed along a factor on moduli.
 
     Unexplained is what the exact derivatives do not say of the way between two states, at its
-    largest anywhere, and as a share of the way; None where a closure failed. The curvature is by
-    how much a central difference over the widest step differs from the derivative, relative.
+    largest anywhere, and in all as a share of the whole way; None where a closure failed. The
+    curvature is by how much a central difference over the widest step differs from the derivative,
+    relative.
     """
 
     along: str
@@ -56,7 +57,7 @@ class Followed:
         return cls(
             path.name,
             max((piece.unexplained_mm for piece in pieces), default=None),
-            max((p.share for p in pieces if math.isfinite(p.share)), default=None),
+            path.share if math.isfinite(path.share) else None,
             path.curvature if math.isfinite(path.curvature) else None,
             path.closures,
             path.passed,
@@ -66,12 +67,17 @@ class Followed:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Up to which distances, jumps, and unexplained shares of a way the gate is passed."""
+    """Up to which distances, jumps, and unexplained shares of a way the gate is passed.
+
+    Shares below ``seen_mm`` are not judged, ``side`` is that on both sides of one state.
+    """
 
     mean_mm: float
     max_mm: float
     jump_mm: float
+    seen_mm: float
     share: float
+    side: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

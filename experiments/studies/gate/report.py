@@ -139,29 +139,31 @@ def _variations(records: Records) -> list[str]:
 
 
 def _paths(records: Records) -> list[str]:
-    """The largest unexplained move and the curvature, a column for each anatomy."""
+    """The largest unexplained move, its share of the whole way, and the curvature."""
     cells = {
         record.row: {
-            path.along: f"{_number(path.unexplained_mm)} ({percent(path.curvature, '.2g', '-')})"
-            + ("" if path.passed else " **no**")
+            path.along: f"{_number(path.unexplained_mm)} mm, {percent(path.share, '.2g', '-')} "
+            f"({percent(path.curvature, '.2g', '-')})" + ("" if path.passed else " **no**")
             for path in record.findings.paths
         }
         for record in records.values()
     }
     names = dict.fromkeys(name for column in cells.values() for name in column)
     rows = [(name, *(column.get(name, "not run") for column in cells.values())) for name in names]
-    return _markdown(("unexplained along ± 20 % (mm; curvature)", *cells), rows)
+    return _markdown(("unexplained along ± 20 % (curvature)", *cells), rows)
 
 
 def _limits(limits: Limits) -> str:
     return (
         f"Limits: under variations that must not matter, mean {limits.mean_mm} mm and maximum "
         f"{limits.max_mm} mm from the reference. Along the moduli, a move of any one vertex that "
-        f"the exact derivatives do not explain, {limits.jump_mm} mm, and over all vertices "
-        f"{100 * limits.share:g} % of the way; a response that bends is followed in smaller steps "
-        "until it is explained, a jump stays. The curvature is the difference between the exact "
-        "derivative and a central one over ± 20 %; it has no limit. The gap is what stays open of "
-        "the reference where leaflets that touch are taken off."
+        f"the exact derivatives do not explain, {limits.jump_mm} mm; over all vertices, "
+        f"{100 * limits.share:g} % of a piece of the way, where a vertex moves by more than "
+        f"{limits.seen_mm} mm unexplained, and {100 * limits.share:g} % of the whole way; and "
+        f"{100 * limits.side:g} % on both sides of one state. A response that bends is followed in "
+        "smaller steps until it is explained, a jump stays. The curvature is the difference "
+        "between the exact derivative and a central one over ± 20 %; it has no limit. The gap is "
+        "what stays open of the reference where leaflets that touch are taken off."
     )
 
 

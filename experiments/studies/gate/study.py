@@ -16,7 +16,7 @@ from experiments.studies.gate.report import gate_answer, gate_words, write_gate
 from experiments.studies.gate.settings import Settings
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT, GateRow, run_gate
-from mvest.closure.smoothness import JUMP_LIMIT, SLOPE_LIMIT, Path
+from mvest.closure.smoothness import JUMP_LIMIT, SEEN, SIDE_LIMIT, SLOPE_LIMIT, Path
 from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
@@ -45,7 +45,7 @@ def run_gate_study(job: Job[Settings]) -> Outcome[Findings]:
         passing_ball_mm=ball,
         rows=rows,
         paths=tuple(map(Followed.of, report.paths)),
-        limits=Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SLOPE_LIMIT),
+        limits=Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SEEN, SLOPE_LIMIT, SIDE_LIMIT),
     )
     reference = rows[0]
     return outcome_of(

@@ -11,11 +11,11 @@ from experiments.common.record import Mesh, Outcome, read_record, stamp, write_r
 from experiments.studies.gate.findings import Findings, Followed, Limits, Row
 from experiments.studies.gate.report import gate_answer, gate_table, gate_words, write_gate
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT
-from mvest.closure.smoothness import JUMP_LIMIT, SLOPE_LIMIT
+from mvest.closure.smoothness import JUMP_LIMIT, SEEN, SIDE_LIMIT, SLOPE_LIMIT
 from tests.experiments.studies.test_gate_study import composed
 from tests.places import CONF
 
-LIMITS = Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SLOPE_LIMIT)
+LIMITS = Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SEEN, SLOPE_LIMIT, SIDE_LIMIT)
 ANATOMIES = sorted(path.stem for path in (CONF / "valve").glob("*.yaml"))
 
 
@@ -72,7 +72,7 @@ def test_all_anatomies_are_one_table_and_what_was_not_run_says_so(calm, jumping,
     words = gate_words({"a": calm, "b": jumping})
     assert "| mesh x 1.5 | 0.01 / 0.07 | - **no** |" in words
     assert "| ramp / 3 | not run | 0.05 / 0.61 **no** |" in words
-    assert "| E_f | 0.004 (3 %) | 0.7 (6 %) **no** |" in words
+    assert "| E_f | 0.004 mm, 1 % (3 %) | 0.7 mm, 20 % (6 %) **no** |" in words
     assert "| template | passed | 0 | 0 |" in words
     assert "| prolapse | **NOT passed**: mesh x 1.5: it buckled" in words
     assert "| 1.9 | 0 |" in words

@@ -118,7 +118,9 @@ def test_the_gate_study_records_every_case(run):
         "reference",
         *(c.name for c in GATE_CASES),
     ]
-    assert found["limits"] == {"mean_mm": 0.1, "max_mm": 0.5, "jump_mm": 0.1, "share": 0.05}
+    assert found["limits"] == {
+        "mean_mm": 0.1, "max_mm": 0.5, "jump_mm": 0.1, "seen_mm": 0.02, "share": 0.05, "side": 0.2,
+    }  # fmt: skip
     assert isinstance(found["passed"], bool)
     assert 0 < found["paths"][0]["unexplained_mm"] < 0.1
     # The valve has hardly begun to close.
