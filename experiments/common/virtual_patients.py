@@ -33,6 +33,7 @@ class PatientSettings:
 
     name: str
     description: str
+    world: str = ""  # what else is otherwise than its case says, in words
     moduli: dict[str, float] = field(default_factory=dict)  # MPa
     moduli_spread: float = 0.0  # SD of the logarithm by which they are drawn about these
     variation: float = 0.0  # size of the random variation of the anatomy; 0: as configured

@@ -8,7 +8,7 @@ belongs in another place than it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.observation.errors import CorrelatedNoise, SpatialCorrelation, WhiteNoise
+from mvest.observation.errors import WhiteNoise
 from mvest.problem.registration import REGISTRATION, displace
+from mvest.simulation.world import World
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
@@ -118,6 +119,8 @@ class PatientSimulation:
         Share of its way back to the open shape that the annulus has gone in each.
     held_tips : (float, float, float)
         mm, displacement of the papillary tips per unit of relaxation.
+    world : World
+        In what else the valve and how it is seen differ from what the case says.
     """
 
     element: str = "hex18"
@@ -135,6 +138,7 @@ class PatientSimulation:
     held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
     held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
+    world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:
         if len(self.held_pressure_mmHg) != len(self.held_relaxation):
@@ -197,9 +201,14 @@ def simulate_patient(
     GeometryError
         If the valve does not close, or has no equilibrium in a frame that is held out.
     """
+    world, other = simulation.world, rng.spawn(1)[0]
+    values = world.values(values, other)
     seen = template.valve(simulation.seen_columns, simulation.seen_rows)
-    contact = template.valve(simulation.contact_columns, simulation.contact_rows)
-    model = patient_model(template, seen, contact, values, simulation, mechanics)
+    real = Template(world.anatomy(template.parameters, other))
+    contact = real.valve(simulation.contact_columns, simulation.contact_rows)
+    own = world.mechanics(mechanics, values)
+    there = real.valve(simulation.seen_columns, simulation.seen_rows)
+    model = patient_model(real, there, contact, values, simulation, own)
     centre = seen.motion.annulus[-1].mean(axis=0)
     registration = np.array([values[parameter] for parameter in REGISTRATION])
     true = {
@@ -230,12 +239,22 @@ def patient_model(
     simulation : PatientSimulation
     mechanics : MechanicsSettings
     """
-    names = tuple(name for name in values if name not in REGISTRATION)
+    # An exponential tissue has its coefficients, which follow from a modulus, and no modulus.
+    exponential = simulation.world.exponential
+    names = tuple(
+        name
+        for name in values
+        if name not in REGISTRATION and not (exponential and name.startswith("E_f."))
+    )
     protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
     # Closures are followed on coarser meshes only.
-    guides = [cells for cells in GUIDES if cells[1] * cells[2] < own[1] * own[2]]
+    guides = [
+        cells
+        for cells in GUIDES
+        if cells[1] * cells[2] < own[1] * own[2] and simulation.world.guided
+    ]
     for element, columns, rows in (*guides, own):
         guide = ClosureModel(
             seen,
@@ -306,21 +325,24 @@ def _case(
     mechanics: MechanicsSettings,
     rng: np.random.Generator,
 ) -> ValveCase:
-    surface = seen.surface
-    correlation = SpatialCorrelation(surface.vertices, simulation.correlation_length_mm)
-    error = CorrelatedNoise(simulation.std_mm, correlation)
+    other = rng.spawn(1)[0]
+    surface, world, length = seen.surface, simulation.world, simulation.correlation_length_mm
     moved = np.stack(list(true.values()))
-    seen_later = error(moved, moved, rng)
+    seen_later = world.noise(simulation.std_mm, surface.vertices, length)(moved, moved, rng)
     if simulation.rough_std_mm:
         seen_later = WhiteNoise(simulation.rough_std_mm)(seen_later, moved, rng)
     if simulation.rest_std_mm:
-        rest_error = CorrelatedNoise(simulation.rest_std_mm, correlation)
+        rest_error = world.noise(simulation.rest_std_mm, surface.vertices, length)
         exact = surface.vertices[None]
         surface = replace(surface, vertices=rest_error(exact, exact, rng)[0])
     motion = seen.motion
+    at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)
     closed = HeldState(
-        mechanics.protocol.pressure_mmHg, motion.annulus[-1], motion.papillary_tips[-1]
+        mechanics.protocol.pressure_mmHg,
+        motion.annulus[-1] + at_annulus,
+        motion.papillary_tips[-1] + at_tips,
     )
+    seen_later[0] = world.seen(seen_later[0], seen.surface, other)
     states = {CLOSED: closed, **held_states(simulation, seen)}
 
     def frame(name: str, time: float, role: Role, state: HeldState, vertices: FloatArray) -> Frame:
@@ -338,7 +360,7 @@ def _case(
             True,
         )
 
-    rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips)
+    rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips + at_tips)
     end = mechanics.protocol.ramp
     later = [
         frame(

@@ -12,6 +12,7 @@ from scipy import sparse
 
 from experiments.common.estimate_record import identified_of, innovation_of, seed_run
 from experiments.common.estimates import Data, SeedRun
+from experiments.common.findings import vector
 from experiments.common.record import Mesh, Model, Outcome
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
@@ -57,12 +58,14 @@ class Revealed:
     """What is said of a virtual patient after its estimation.
 
     Anatomies were drawn until one closed. Of the paper's patient there are moduli ``(2,)`` MPa and
-    the distances ``(2,)`` mm, generic and personalised; empty if it has none.
+    the distances ``(2,)`` mm, generic and personalised; empty if it has none. In its world more is
+    otherwise than its case says (see `mvest.simulation.world`); empty if nothing is said of it.
     """
 
     anatomies_drawn: int
     paper_moduli: Vector
     paper_distance_mm: Vector
+    world: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,6 +143,7 @@ def _case_findings(
         converged=run.converged,
         reason=run.reason,
         unknowns=unknowns,
+        correlation=_correlation(result),
         moduli=_moduli(result, unknowns),
         without_nuisances=_alone(fit, fit.moduli_only),
         as_in_the_paper=_alone(fit, fit.paper),
@@ -262,6 +266,14 @@ def _unknowns(
             rows, *(value.tolist() for value in values), strict=True
         )
     )
+
+
+def _correlation(result: StudyResult) -> tuple[Vector, ...]:
+    """How the errors of the estimates are alike, in the coordinates of the filter."""
+    if result.filtered is None or result.estimate is None:
+        return ()
+    after = result.filtered.transformed
+    return tuple(map(vector, after.covariance / np.outer(after.std, after.std)))
 
 
 def _moduli(result: StudyResult, unknowns: tuple[UnknownRow, ...]) -> tuple[ModulusRow, ...]:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import beta
 
 from experiments.common.cases.findings import Findings
+from experiments.common.cases.skill import share_bounds
 from experiments.common.record import Record
 from experiments.common.tables import write_table
 from experiments.studies.patient.tables import distance_words, provenance_of, table3
@@ -52,7 +52,7 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
     for (estimation, name), group in table.groupby(["estimation", "name"], sort=False):
         known = group[group["inside"].notna()]
         inside, n = int(known["inside"].sum()), len(known)
-        low, high = _clopper_pearson(inside, n)
+        low, high = share_bounds(inside, n)
         error = (known["estimate"] - known["truth"]).astype(float)
         relative = str(name).startswith("E_f.") or "_" in str(name)
         scale = known["truth"].astype(float) if relative else 1.0
@@ -137,14 +137,6 @@ def population_figure(table: pd.DataFrame) -> Figure:
             axes.legend(fontsize=8, loc="upper left", frameon=False)
             axes.spines[["top", "right"]].set_visible(False)
     return figure
-
-
-def _clopper_pearson(inside: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a share (Clopper and Pearson 1934, Biometrika 26:404)."""
-    tail = 0.5 * (1 - level)
-    low = 0.0 if inside == 0 else float(beta.ppf(tail, inside, n - inside + 1))
-    high = 1.0 if inside == n else float(beta.ppf(1 - tail, inside + 1, n - inside))
-    return low, high
 
 
 def _amount(value: float, relative: bool) -> str:

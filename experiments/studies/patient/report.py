@@ -13,7 +13,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
 from mvest.reading.npz import read_npz
-from mvest.reporting.case.findings import UnknownRow
+from mvest.reporting.case.findings import CaseFindings, UnknownRow
 
 __all__ = [
     "arrays_of_patient",
@@ -35,12 +35,16 @@ KEPT_ARRAYS = (
 def write_patients(
     folder: Path, records: Mapping[str, Record[Findings]], arrays: Mapping[str, Path]
 ) -> list[Path]:
-    """Tables 2 and 3 and Figure 3, or the table of the population."""
+    """Tables 2 and 3 and Figure 3, or the table of the population or of the worlds."""
+    from experiments.studies.patient.calibration import CALIBRATION, write_calibration_tables
     from experiments.studies.patient.population import write_population_tables
     from experiments.studies.patient.tables import POPULATION, in_order, write_patient_tables
 
     kept = in_order(records)
-    if next(iter(records.values())).table == POPULATION:
+    table = next(iter(records.values())).table
+    if table == CALIBRATION:
+        return write_calibration_tables(folder, list(kept.values()))
+    if table == POPULATION:
         return write_population_tables(folder, list(kept.values()))
     return write_patient_tables(folder, kept, arrays)
 
@@ -84,11 +88,23 @@ def distances_answer(records: Mapping[str, Record[Findings]]) -> str:
 
 def kept_of_patient(record: Record[Findings]) -> Record[Findings]:
     """What tables need of a record; the settings are in ``conf``."""
+    from experiments.studies.patient.calibration import CALIBRATION
     from experiments.studies.patient.tables import POPULATION
 
-    if record.table != POPULATION:
-        return record
-    case = replace(record.findings.case, settings={}, measurements={})
+    case = record.findings.case
+    if record.table == POPULATION:
+        case = replace(case, settings={}, measurements={})
+    elif record.table == CALIBRATION:
+        case = CaseFindings(
+            about=case.about,
+            converged=case.converged,
+            reason=case.reason,
+            unknowns=case.unknowns,
+            correlation=case.correlation,
+            innovation=case.innovation,
+            errors=case.errors,
+            verdict=case.verdict,
+        )
     return replace(record, findings=replace(record.findings, case=case))
 
 

@@ -26,6 +26,7 @@ from experiments.common.virtual_patients import (
     first_that_closes,
     require_patient,
 )
+from experiments.studies.patient.calibration import calibration_answer
 from experiments.studies.patient.report import (
     arrays_of_patient,
     distances_answer,
@@ -165,7 +166,9 @@ def reveal(
         as_in_the_paper=_alone(case.as_in_the_paper, truth),
         distances=_to_truth(case.distances, positions, fields),
     )
-    drawn = Revealed(hidden["anatomies_drawn"], patient.paper_moduli, patient.paper_distance_mm)
+    drawn = Revealed(
+        hidden["anatomies_drawn"], patient.paper_moduli, patient.paper_distance_mm, patient.world
+    )
     (run,) = estimated.findings.repeats
     true = (truth[name] for name in estimated.parameters)
     errors = run.estimate and tuple((a - b) / b for a, b in zip(run.estimate, true, strict=True))
@@ -259,6 +262,18 @@ STUDY = Study(
             answer=patients_answer,
             headline=True,
             opens="population",
+        ),
+        Section(
+            "calibration",
+            {
+                "calibration": "Where the truth lies in the posterior: difference of its "
+                "distribution from the uniform one, and where that of right intervals stays in 95 "
+                "of 100 samples (grey). Simulated."
+            },
+            "Estimates in worlds that are not as they assume (simulated)",
+            answer=calibration_answer,
+            headline=True,
+            opens="calibration",
         ),
     ),
 )

@@ -224,6 +224,8 @@ class CaseFindings:
 
     Attributes
     ----------
+    correlation : (p, p)
+        Of the errors of the unknowns, in the coordinates of the filter; empty without an estimate.
     moduli : tuple of ModulusRow
         All that follow from the estimated ones through fixed ratios.
     iterates, iterate_std : (i, p)
@@ -245,6 +247,7 @@ class CaseFindings:
     converged: bool
     reason: str
     unknowns: tuple[UnknownRow, ...] = ()
+    correlation: tuple[Vector, ...] = ()
     moduli: tuple[ModulusRow, ...] = ()
     without_nuisances: ModuliAlone | None = None
     as_in_the_paper: ModuliAlone | None = None

@@ -1,11 +1,23 @@
-from experiments.common.cases.skill import skill_words
+import numpy as np
+import pytest
+
+from experiments.common.cases.skill import (
+    generic_guess,
+    log_width,
+    prior_alone,
+    score,
+    share_bounds,
+    skill_words,
+)
 from mvest.reporting.case.findings import UnknownRow
 
 
 def answered(truth, estimate, low, high, generic) -> UnknownRow:
+    # Believed within a factor of 1.48.
     return UnknownRow(
         name="E_f.anterior", label="", unit="MPa", kind="modulus", treatment="estimated",
-        prior_mean=generic, prior_std=1.0, estimate=estimate, low=low, high=high, truth=truth,
+        prior_mean=generic, prior_std=0.2 * generic, estimate=estimate, low=low, high=high,
+        truth=truth,
     )  # fmt: skip
 
 
@@ -18,11 +30,54 @@ def test_errors_stand_beside_the_generic_guess_and_runs_lost_count_as_misses():
         answered(1.0, None, None, None, 2.0),
     ]
     assert skill_words(asked) == (
-        "2 of 4 moduli lie inside their 95 % intervals; the median error is 20.0 %, that of the "
-        "generic guess 50.0 %; 1 without an estimate."
+        "2 of 4 moduli lie inside their 95 % intervals (1 inside those of the prior alone); the "
+        "median error is 20.0 %, that of the generic guess 50.0 %; 1 without an estimate."
     )
 
 
 def test_without_an_estimate_there_is_no_error_to_compare():
     words = skill_words([answered(1.0, None, None, None, 2.0)])
-    assert words == "0 of 1 moduli lie inside their 95 % intervals; 1 without an estimate."
+    assert words == (
+        "0 of 1 moduli lie inside their 95 % intervals (0 inside those of the prior alone); 1 "
+        "without an estimate."
+    )
+
+
+def test_what_anyone_could_say():
+    row = answered(10.0, 11.0, 9.0, 13.0, 5.0)
+    guess, before = generic_guess(row), prior_alone(row)
+    assert (guess.estimate, guess.low, guess.inside) == (5.0, None, None)
+    # A relative SD of 0.2 becomes one of the logarithm.
+    assert before.low == pytest.approx(5.0 * np.exp(-1.95996 * 0.2), rel=1e-5)
+    assert log_width(before) == pytest.approx(2 * 1.95996 * 0.2, rel=1e-5)
+    assert before.inside is False
+    shift = UnknownRow(
+        name="shift.x", label="", unit="mm", kind="nuisance", treatment="estimated",
+        prior_mean=0.0, prior_std=1.0, truth=-1.0,
+    )  # fmt: skip
+    assert (prior_alone(shift).low, prior_alone(shift).high) == pytest.approx((-1.959964, 1.959964))
+    assert score(prior_alone(shift)) == pytest.approx(-1.0)
+    assert score(shift) is None
+
+
+def test_scores_are_of_the_logarithm():
+    middle, sd = 4.0, 0.1
+    row = answered(float(4.0 * np.exp(0.2)), middle, middle * np.exp(-1.959964 * sd),
+                   middle * np.exp(1.959964 * sd), 5.0)  # fmt: skip
+    assert score(row) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("inside", "n", "low", "high"),
+    [
+        # Clopper and Pearson's intervals as R's binom.test prints them: 7 of 20, 18 of 20.
+        (7, 20, 0.1539092, 0.5921885),
+        (18, 20, 0.6830173, 0.9876515),
+        # None and all of n: the root of 0.025, 0.025^(1/20) = 0.8315665.
+        (0, 20, 0.0, 0.1684335),
+        (20, 20, 0.8315665, 1.0),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_bounds_of_a_share(inside, n, low, high):
+    assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)

@@ -15,7 +15,6 @@ from experiments.common.cases.report import case_text, write_case_run
 from experiments.results.keep import publish
 from experiments.studies.patient import tables as patient_tables
 from experiments.studies.patient.population import (
-    _clopper_pearson,
     population_figure,
     population_frame,
     write_population_tables,
@@ -229,22 +228,6 @@ def population(n=20, misses=2):
         rows = (anterior, *patient().findings.case.unknowns[1:])
         found.append(patient(f"drawn_{k}", "population", unknowns=rows, as_in_the_paper=None))
     return found
-
-
-@pytest.mark.parametrize(
-    ("inside", "n", "low", "high"),
-    [
-        # Clopper and Pearson's intervals as R's binom.test prints them: 7 of 20, 18 of 20.
-        (7, 20, 0.1539092, 0.5921885),
-        (18, 20, 0.6830173, 0.9876515),
-        # None and all of n: the root of 0.025, 0.025^(1/20) = 0.8315665.
-        (0, 20, 0.0, 0.1684335),
-        (20, 20, 0.8315665, 1.0),
-        (0, 0, 0.0, 1.0),
-    ],
-)
-def test_bounds_of_a_share(inside, n, low, high):
-    assert _clopper_pearson(inside, n) == pytest.approx((low, high), abs=1e-7)
 
 
 def test_the_population_counts_how_often_intervals_hold(tmp_path):
