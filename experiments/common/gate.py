@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.places import GATE_RECORDS
+from experiments.common.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import build
 from mvest.closure.anchors import content_digest
 from mvest.errors import InputError
 from mvest.reading.json_file import read_mapping
 from mvest.valve.anatomy.template import TemplateParameters
 
-__all__ = ["NOT_GATED", "anatomy_digest", "gate_of"]
-
-NOT_GATED = "not gated"
+__all__ = ["anatomy_digest", "gate_of"]
 
 
 def anatomy_digest(values: Mapping[str, Any]) -> str:
@@ -45,7 +44,7 @@ def _verdicts(records: Path) -> dict[str, str]:
         try:
             record = read_mapping(path)
             cells, element = record["model"]["cells"], record["model"]["element"]
-            passed = "passed" if record["findings"]["passed"] is True else "NOT passed"
+            passed = PASSED_GATE if record["findings"]["passed"] is True else FAILED_GATE
             found[str(record["findings"]["anatomy"])] = (
                 f"{passed} on {cells[0]} x {cells[1]} {element}"
             )

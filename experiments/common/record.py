@@ -21,7 +21,10 @@ from mvest.provenance import provenance, require_sealed, sealed, write_json
 from mvest.reading.json_file import read_mapping
 
 __all__ = [
+    "FAILED_GATE",
     "FIELDS",
+    "NOT_GATED",
+    "PASSED_GATE",
     "SCHEMA",
     "GitState",
     "Mesh",
@@ -30,6 +33,7 @@ __all__ = [
     "Provenance",
     "Record",
     "Status",
+    "has_passed",
     "here_and_now",
     "model_of_values",
     "read_record",
@@ -47,6 +51,9 @@ FIELDS = "fields.npz"
 
 HASH_DIGITS = 12
 """Digits of a hash that a line of text shows."""
+
+NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
+"""What the gate has said of an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
 F = TypeVar("F")
@@ -227,6 +234,21 @@ class Record(Generic[F]):
         return self.status == "converged"
 
     @property
+    def caution(self) -> str:
+        """What stands before a result whose anatomy has not passed the gate; else empty."""
+        if self.gate == NOT_GATED:
+            return (
+                "The gate was not asked of this anatomy: whether its closed state is the only one "
+                "is not known (experiment=gate; of one's own valve, check=true gate=true)."
+            )
+        if self.gate is not None and not has_passed(self.gate):
+            return (
+                f"The anatomy did NOT pass the gate ({self.gate}): its closed state is not the "
+                "only one, or jumps while moduli change."
+            )
+        return ""
+
+    @property
     def line(self) -> str:
         """Commit, configuration, mesh and seed in one line, for tables and figures."""
         source = self.provenance
@@ -237,6 +259,11 @@ class Record(Generic[F]):
             f"configuration {source.config_hash[:HASH_DIGITS]}, "
             f"mesh {source.mesh_hash[:HASH_DIGITS]}, seed {source.seed}{gate}"
         )
+
+
+def has_passed(gate: str) -> bool | None:
+    """Whether the gate was passed; None if it was not asked."""
+    return None if gate == NOT_GATED else gate.startswith(PASSED_GATE)
 
 
 def model_of_values(values: Mapping[str, Any]) -> Model:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +16,8 @@ from mvest.reporting.figures import save_figure_with
 __all__ = [
     "answer_of_main",
     "axis_label",
+    "cautions",
+    "heading",
     "page",
     "parameter_label",
     "percent",
@@ -64,7 +66,24 @@ def answer_of_main(answer: Callable[[Record[F]], str]) -> Callable[[Mapping[str,
 
 def page(record: Record[Any], words: str) -> str:
     """Markdown of a record: its title, words, and in small print where it came from."""
-    return f"# {record.title}\n\n{words}\n\n<sub>{record.line}</sub>\n"
+    return f"{heading(record)}{words}\n\n<sub>{record.line}</sub>\n"
+
+
+def heading(*records: Record[Any]) -> str:
+    """Markdown of the first record's title, and of what has to be said before any of them."""
+    return f"# {records[0].title}\n\n" + "".join(f"**{text}**\n\n" for text in cautions(records))
+
+
+def cautions(records: Sequence[Record[Any]]) -> list[str]:
+    """What stands before results whose anatomies have not passed the gate, naming them."""
+    rows: dict[str, list[str]] = {}
+    for record in records:
+        if record.caution:
+            rows.setdefault(record.caution, []).append(record.row)
+    return [
+        text if len(named) == len(records) else f"{', '.join(named)}: {text}"
+        for text, named in rows.items()
+    ]
 
 
 def write_report(
@@ -82,7 +101,7 @@ def write_report(
         If a file cannot be written.
     """
     base = folder / record.experiment
-    text = f"# {record.title}\n\n{words}\n\n{record.line}\n"
+    text = f"{heading(record)}{words}\n\n{record.line}\n"
     return [
         write_atomically(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
         write_atomically(base.with_suffix(".md"), text),

@@ -60,7 +60,7 @@ def run_job(request: Request) -> None:
         # Only another process can be stopped at any moment.
         data = run_apart(request, aloud=True)
         _raise_failure(data["status"], data["reason"], data["detail"], folder)
-        print(study.words(record_from(data, study.findings, str(folder / RESULT))))
+        _say(study, record_from(data, study.findings, str(folder / RESULT)))
         print(f"Written to {folder}")
         return
     with lock(folder):
@@ -70,7 +70,7 @@ def run_job(request: Request) -> None:
             _compute_here(request)
             return
     record = record_from(done, study.findings, str(folder / RESULT))
-    print(study.words(record))
+    _say(study, record)
     source = record.provenance
     print(
         f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}, in "
@@ -145,6 +145,13 @@ def _computed(study: Study[Any, Any], request: Request) -> Record[Any] | None:
         return None
 
 
+def _say(study: Study[Any, Any], record: Record[Any]) -> None:
+    """What a finished run says on the terminal."""
+    if record.caution:
+        print(record.caution)
+    print(study.words(record))
+
+
 def _write_out(study: Study[Any, Any], request: Request, record: Record[Any]) -> None:
     """All that follows from a record on disk, and the marker that says so."""
     folder = request.folder
@@ -153,7 +160,7 @@ def _write_out(study: Study[Any, Any], request: Request, record: Record[Any]) ->
             study.write_run(folder, record)
         else:
             study.write(folder, {record.table: record}, arrays_of(folder, record.table))
-    print(study.words(record))
+    _say(study, record)
     print(f"Written to {folder}")
     _publish(study, request, record)
     if record.converged:

@@ -27,8 +27,15 @@ SAME_MM = 0.5
 """Largest distance at which a valve that was closed anew is the same, as of the gate."""
 
 
-def indications_of(fit: Personalised) -> Indications:
-    """What speaks for and against the estimate of a case; nothing of it needs the truth."""
+def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
+    """What speaks for and against the estimate of a case; nothing of it needs the truth.
+
+    Parameters
+    ----------
+    fit : Personalised
+    gate : bool, optional
+        Whether its valve has passed the gate, if it was asked.
+    """
     result, closed = fit.result, fit.case.frame(Role.CLOSED)
     found = doubts(fit.case)
     mistakes = tuple(str(doubt) for doubt in found if doubt.mistake)
@@ -87,7 +94,8 @@ def indications_of(fit: Personalised) -> Indications:
         if closed.name in fit.fitted
         else None,
         observed_orifice_mm2=free_orifice(fit.case, closed),
-        gate=None if fit.confirmed_mm is None else fit.confirmed_mm <= SAME_MM,
+        again=None if fit.confirmed_mm is None else fit.confirmed_mm <= SAME_MM,
+        gate=gate,
         mistakes=mistakes,
         doubts=doubtful,
     )

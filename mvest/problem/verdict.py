@@ -19,6 +19,7 @@ import numpy as np
 __all__ = [
     "DOUBTFUL",
     "NONE",
+    "ONE_STATE",
     "TRUSTWORTHY",
     "Ground",
     "Held",
@@ -126,8 +127,10 @@ class Indications:
     held_out : tuple of Held
     orifice_mm2, observed_orifice_mm2 : float or None
         Free in the line of sight, of the fitted valve and of the observed one.
+    again : bool or None
+        Whether the fitted closed state was also reached from the open valve.
     gate : bool or None
-        Whether the closed state is known to be the only one.
+        Whether the valve has passed the gate (:mod:`mvest.closure.robustness`); None: not asked.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
     """
@@ -146,6 +149,7 @@ class Indications:
     held_out: tuple[Held, ...] = ()
     orifice_mm2: float | None = None
     observed_orifice_mm2: float | None = None
+    again: bool | None = None
     gate: bool | None = None
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
@@ -167,6 +171,11 @@ LEAK = (10.0, 30.0)
 area from a jagged edge, and what no closed valve has."""
 WORSE = 1.05
 """Distance of a held-out frame, fitted over generic, that counts as farther."""
+
+
+ONE_STATE = "one closed state"
+"""The check of the gate. It is not asked of a valve that is met for the first time, since it costs
+minutes; that it was not is no ground against an estimate, and is said."""
 
 
 def judge(seen: Indications) -> Verdict:
@@ -336,15 +345,29 @@ def _closes(e: Indications) -> Seen:
         )
 
 
+def _repeated(e: Indications) -> Seen:
+    if e.again is None:
+        yield None
+    elif not e.again:
+        yield Ground(
+            "closed anew",
+            DOUBTFUL,
+            "the fitted valve, closed anew from the open one, ends in another closed state",
+            "ask the gate of this valve (check=true gate=true)",
+        )
+
+
 def _unique(e: Indications) -> Seen:
     if e.gate is None:
         yield None
     elif not e.gate:
         yield Ground(
-            "one closed state",
+            ONE_STATE,
             DOUBTFUL,
-            "the closed state is not known to be the only one: it was not reached again",
-            "run the gate for this valve",
+            "the valve did not pass the gate: its closed state is not the only one, or jumps while "
+            "moduli change",
+            "the gate says by what (experiment=gate, check=true gate=true); a finer mesh or denser "
+            "contact samples may mend it",
         )
 
 
@@ -359,7 +382,8 @@ CHECKS = {
     "distance": _fits,
     "frames held out": _predicts,
     "closure": _closes,
-    "one closed state": _unique,
+    "closed anew": _repeated,
+    ONE_STATE: _unique,
 }
 """Check -> what it looks at."""
 

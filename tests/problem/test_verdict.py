@@ -12,6 +12,7 @@ from mvest.problem.verdict import (
     NEEDED,
     NIS_FACTOR,
     NONE,
+    ONE_STATE,
     STRETCH,
     TRUSTWORTHY,
     Held,
@@ -32,6 +33,7 @@ GOOD = Indications(
     held_out=(Held("late", 1.5, 1.1),),
     orifice_mm2=3.0,
     observed_orifice_mm2=2.0,
+    again=True,
     gate=True,
 )
 
@@ -40,9 +42,9 @@ def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
     assert verdict.grounds == ()
-    assert len(verdict.passed) == 11
+    assert len(verdict.passed) == 12
     assert verdict.missing == ()
-    assert str(verdict) == "trustworthy: 11 checks passed"
+    assert str(verdict) == "trustworthy: 12 checks passed"
 
 
 CASES = {
@@ -62,7 +64,8 @@ CASES = {
     "held out": ({"held_out": (Held("late", 1.0, 1.06),)}, DOUBTFUL, "frame late"),
     "ajar": ({"orifice_mm2": 2.1 + LEAK[0]}, DOUBTFUL, "leaves 12 mm"),
     "open": ({"orifice_mm2": 121.0}, NONE, "leaves 121 mm² free, the observed one 2 mm²"),
-    "another closed state": ({"gate": False}, DOUBTFUL, "not known to be the only one"),
+    "another closed state": ({"again": False}, DOUBTFUL, "ends in another closed state"),
+    "an anatomy that failed": ({"gate": False}, DOUBTFUL, "did not pass the gate"),
 }
 
 
@@ -103,10 +106,11 @@ def test_the_worst_ground_decides_and_stands_first():
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(Indications(estimated=True))
-    assert len(verdict.missing) == 9
+    assert len(verdict.missing) == 10
     # Of these, four are needed.
     assert verdict.trust == DOUBTFUL
     assert [ground.check for ground in verdict.grounds] == list(NEEDED)
     assert judge(replace(GOOD, alike=None, gate=None, held_out=())).trust == TRUSTWORTHY
+    assert judge(replace(GOOD, gate=None)).missing == (ONE_STATE,)
     assert set(verdict.missing).isdisjoint(verdict.passed)
     assert "what the data add" in verdict.missing

@@ -26,7 +26,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.cases.volume import run_volume
-from experiments.common.record import Outcome
+from experiments.common.record import NOT_GATED, Outcome
 from experiments.common.schema import build
 from mvest.errors import InputError, MvestError
 from mvest.processes import run
@@ -66,7 +66,7 @@ def seal(folder: Path) -> None:
 
 
 def estimate_blindly(
-    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
+    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, gate: str = NOT_GATED
 ) -> Outcome[Findings]:
     """Personalise a case, or the valve in a volume, in a process apart.
 
@@ -80,6 +80,8 @@ def estimate_blindly(
         Folder of the case, or the file of a volume over time.
     sealed : Path
         Folder that the process cannot open.
+    gate : str
+        What the gate said of the anatomy.
 
     Raises
     ------
@@ -91,6 +93,7 @@ def estimate_blindly(
         "values": {k: v for k, v in values.items() if k not in SECRET} | given,
         "folder": str(folder),
         "sealed": str(sealed),
+        "gate": gate,
     }
     path = folder / ESTIMATE
     path.unlink(missing_ok=True)
@@ -137,7 +140,8 @@ def main() -> int:
     try:
         if values.get("volume") is None:
             case = read_configured(values["case"])
-            outcome = run_case(values, build(PersonalSettings, values["personal"]), case, folder)
+            personal = build(PersonalSettings, values["personal"])
+            outcome = run_case(values, personal, case, folder, gate=request["gate"])
         else:
             personal = build(PersonalSettings, values["personal"])
             imaged = build(ImagedSettings, values["imaged"])

@@ -13,7 +13,7 @@ from scipy import sparse
 from experiments.common.estimate_record import identified_of, innovation_of, seed_run
 from experiments.common.estimates import Data, SeedRun
 from experiments.common.findings import vector
-from experiments.common.record import Mesh, Model, Outcome
+from experiments.common.record import NOT_GATED, Mesh, Model, Outcome, has_passed
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
 from mvest.estimation.information.consistency import moran, zero_mean
@@ -85,15 +85,21 @@ class Findings:
 
 
 def outcome_of_case(
-    fit: Personalised, settings: Mapping[str, Any], image_step: ImageStep | None = None
+    fit: Personalised,
+    settings: Mapping[str, Any],
+    image_step: ImageStep | None = None,
+    gate: str = NOT_GATED,
 ) -> Outcome[Findings]:
-    """What follows from a personalised case; the settings are shown in its report."""
+    """What follows from a personalised case; the settings are shown in its report.
+
+    ``gate`` is what the gate said of its anatomy.
+    """
     case, result, grid = fit.case, fit.result, fit.settings.mesh
     run = seed_run(None, result)
     moduli = [k for k, name in enumerate(fit.names) if name.startswith("E_f.")]
     return Outcome(
         findings=Findings(
-            case=_case_findings(fit, run, settings, image_step),
+            case=_case_findings(fit, run, settings, image_step, has_passed(gate)),
             repeats=(_of_moduli(run, moduli),),
             data=Data(case.source, case.sha256),
             memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
@@ -113,6 +119,7 @@ def outcome_of_case(
         ),
         mesh=Mesh(fit.mesh.sha256, len(fit.mesh.nodes), len(fit.mesh.elements)),
         forward_solves=run.forward_solves or 0,
+        gate=gate,
     )
 
 
@@ -133,7 +140,11 @@ def _of_moduli(run: SeedRun, kept: list[int]) -> SeedRun:
 
 
 def _case_findings(
-    fit: Personalised, run: SeedRun, settings: Mapping[str, Any], image_step: ImageStep | None
+    fit: Personalised,
+    run: SeedRun,
+    settings: Mapping[str, Any],
+    image_step: ImageStep | None,
+    gate: bool | None,
 ) -> CaseFindings:
     result = fit.result
     unknowns = _unknowns(fit, result, fit.names)
@@ -171,7 +182,7 @@ def _case_findings(
         confirmed_mm=fit.confirmed_mm,
         settings=settings,
         image_step=image_step,
-        verdict=judge(indications_of(fit)),
+        verdict=judge(indications_of(fit, gate)),
     )
 
 

@@ -13,7 +13,7 @@ from experiments.common.build import mechanics_of
 from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar
-from experiments.common.record import Outcome
+from experiments.common.record import NOT_GATED, Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
@@ -88,8 +88,9 @@ def run_case(
     case: ValveCase,
     folder: Path,
     image_step: ImageStep | None = None,
+    gate: str = NOT_GATED,
 ) -> Outcome[Findings]:
-    """Personalise a case; its arrays are written to ``folder``."""
+    """Personalise a case, of whose anatomy the gate said so; its arrays go to ``folder``."""
     fields = folder / FIELDS
     # Of an earlier run: there are none where no estimate is reached now.
     fields.unlink(missing_ok=True)
@@ -109,4 +110,4 @@ def run_case(
     if fit.distances:
         np.savez_compressed(fields, **fields_of(fit))
     shown = {key: dict(values[key]) for key in ("personal", "mechanics")}
-    return outcome_of_case(fit, shown, image_step)
+    return outcome_of_case(fit, shown, image_step, gate)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.skill import share_bounds
 from experiments.common.record import Record
+from experiments.common.report import cautions
 from experiments.common.tables import write_table
 from experiments.studies.patient.tables import distance_words, provenance_of, table3
 from mvest.reporting.figures import save_figure_with
@@ -71,6 +72,7 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
         )
     distances = table3(records)
     notes = [
+        *cautions(records),
         "Simulated valves with anatomies and moduli drawn at random; the truth was revealed after "
         "the estimation.",
         *_both_moduli(table),

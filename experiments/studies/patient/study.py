@@ -15,8 +15,8 @@ from experiments.common.cases.findings import Findings, Revealed
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.cases.report import case_text, write_case_run
 from experiments.common.expectation import expect_own
-from experiments.common.gate import NOT_GATED, gate_of
-from experiments.common.record import Outcome
+from experiments.common.gate import gate_of
+from experiments.common.record import NOT_GATED, Outcome
 from experiments.common.schema import build
 from experiments.common.store import Store
 from experiments.common.study import Job, Section, Study
@@ -67,10 +67,10 @@ def run_patient(job: Job[Settings]) -> Outcome[Findings]:
     """Simulate, estimate apart, reveal."""
     patient = job.settings.patient
     place = make_patient(job.values, patient)
-    estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden)
-    outcome = reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
     # One that is drawn has another anatomy than the one configured.
-    return replace(outcome, gate=NOT_GATED if patient.variation else gate_of(job.values))
+    gate = NOT_GATED if patient.variation else gate_of(job.values)
+    estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden, gate)
+    return reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
 
 
 def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import interval_words
 from experiments.common.record import Record
+from experiments.common.report import cautions
 from experiments.common.tables import write_table
 from mvest.errors import InputError
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, paint_leak, same_scale
@@ -139,14 +140,14 @@ def write_patient_tables(
         If a file cannot be written.
     """
     records = list(kept.values())
-    line = provenance_of(records)
+    line, notes = provenance_of(records), [*cautions(records), NOTE]
     second, third = table2(records), table3(records)
     written = write_table(
-        results / "table2", second, _readable2(records), line, [NOTE, *_words2(second, records)]
+        results / "table2", second, _readable2(records), line, [*notes, *_words2(second, records)]
     )
     if not third.empty:
         written += write_table(
-            results / "table3", third, _readable3(third), line, [NOTE, *distance_words(third)]
+            results / "table3", third, _readable3(third), line, [*notes, *distance_words(third)]
         )
     fields = {
         _patient(record): read_case_fields(arrays[name])

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.common.estimates import Paper
 from experiments.common.record import Record
+from experiments.common.report import heading
 from experiments.studies.twin.findings import Findings
 from mvest.files import write_atomically
 from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std
@@ -154,7 +155,7 @@ def write_tables(folder: Path, name: str, records: Sequence[Twin]) -> list[Path]
     table = markdown_rows(
         [dict(zip(reading.columns, row, strict=True)) for row in reading.to_numpy().tolist()]
     )
-    markdown = f"# {records[0].title}\n\n{table}\n\n{_truth(records[0])}\n\n{notes}\n"
+    markdown = f"{heading(*records)}{table}\n\n{_truth(records[0])}\n\n{notes}\n"
     tex = "".join(f"% {line}\n" for line in lines) + _latex(reading)
     return [
         write_atomically(folder / f"{name}.csv", csv),

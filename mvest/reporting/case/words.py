@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
+from mvest.problem.verdict import DOUBTFUL, NONE, ONE_STATE, TRUSTWORTHY
 from mvest.reporting.case.findings import (
     CaseFindings,
     ErrorRow,
@@ -33,6 +33,8 @@ __all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words"
 Rows = list[dict[str, str]]
 
 VERDICT_BADGES = {TRUSTWORTHY: "TRUSTWORTHY", DOUBTFUL: "DOUBTFUL", NONE: "NOT TO BE BELIEVED"}
+
+UNASKED = "the gate was not asked; check=true gate=true asks it"
 
 MODULUS_NAMES = {
     "E_f": "stiffness along the fibres, E_f",
@@ -93,7 +95,8 @@ def verdict_words(case: CaseFindings) -> tuple[str, list[str], list[str]]:
         + (f". Next: {ground.advice}." if ground.advice else ".")
         for ground in verdict.grounds
     ]
-    return heads[verdict.trust], against, list(verdict.missing)
+    unseen = [f"{name} ({UNASKED})" if name == ONE_STATE else name for name in verdict.missing]
+    return heads[verdict.trust], against, unseen
 
 
 def _interval(modulus: ModulusRow) -> str:

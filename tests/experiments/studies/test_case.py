@@ -12,7 +12,7 @@ from experiments.common.cases.own_case import read_configured, settings_of
 from experiments.common.cases.report import write_case_run
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.config import hash_of
-from experiments.common.record import read_record, stamp, write_record
+from experiments.common.record import NOT_GATED, read_record, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.run import main
@@ -21,6 +21,7 @@ from experiments.studies.case.study import STUDY, run_own_case
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.personalise import Treatment, personalise_case
+from mvest.problem.verdict import ONE_STATE
 from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.common.test_config import composed, plain
 from tests.made_up_closure import made_up_case, use
@@ -113,6 +114,19 @@ def test_settings_are_those_of_the_configuration(config):
     assert settings.paper.R == 0.25
 
 
+def test_an_anatomy_that_did_not_pass_the_gate_speaks_against_an_estimate(made, config):
+    outcome, fit = made
+    shown = {"personal": config["personal"]}
+    failed, passed = (
+        outcome_of_case(fit, shown, gate=gate) for gate in ("NOT passed on a", "passed on a")
+    )
+    assert failed.gate == "NOT passed on a"
+    (ground,) = [g for g in failed.findings.case.verdict.grounds if g.check == ONE_STATE]
+    assert "did not pass the gate" in ground.text
+    assert ONE_STATE in passed.findings.case.verdict.passed
+    assert passed.findings.case.verdict.grounds == outcome.findings.case.verdict.grounds
+
+
 def test_a_record_is_plain_and_knows_no_truth(made, config, tmp_path):
     outcome, fit = made
     path = tmp_path / "record.json"
@@ -124,6 +138,8 @@ def test_a_record_is_plain_and_knows_no_truth(made, config, tmp_path):
     # What the case is and not what the configuration of other studies says.
     assert (back.model.filter, back.model.noise_mm) == ("iterated", 0.3)
     case, (run,) = back.findings.case, back.findings.repeats
+    assert back.gate == NOT_GATED
+    assert ONE_STATE in case.verdict.missing
     assert case.about.simulated is True
     assert len(case.about.sha256) == 64
     assert run.relative_error is None

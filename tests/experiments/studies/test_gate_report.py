@@ -5,9 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.common.gate import NOT_GATED, anatomy_digest, gate_of
+from experiments.common.gate import anatomy_digest, gate_of
 from experiments.common.places import GATE_RECORDS
-from experiments.common.record import Mesh, Outcome, read_record, stamp, write_record
+from experiments.common.record import (
+    NOT_GATED,
+    Mesh,
+    Outcome,
+    has_passed,
+    read_record,
+    stamp,
+    write_record,
+)
+from experiments.common.report import cautions, page
 from experiments.studies.gate.findings import Findings, Followed, Limits, Row
 from experiments.studies.gate.report import gate_answer, gate_table, gate_words, write_gate
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT
@@ -128,3 +137,24 @@ def test_kept_verdicts_are_of_the_anatomies_as_they_ship(path):
     assert record.findings.limits == LIMITS
     # Dilated and tethered leaflets alone leak; all others close, seen as predictions see them.
     assert (record.findings.gap_mm2 == 0.0) == (record.row != "functional_mr")
+
+
+def test_what_has_not_passed_says_so_before_its_results(calm):
+    values = settings("template")
+
+    def stamped(gate):
+        return stamp(values, "b" * 64, Outcome(findings=None, row=f"on {gate}", gate=gate), 0.0)
+
+    passed, failed = stamped("passed on 54 x 6 hex18"), stamped("NOT passed on 54 x 6 hex18")
+    never, none = stamped(NOT_GATED), stamped(None)
+    assert [has_passed(r.gate) for r in (passed, failed, never)] == [True, False, None]
+    assert passed.caution == none.caution == ""
+    assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
+    assert "experiment=gate" in never.caution
+    title = "# One closed state\n\n"
+    assert page(passed, "words").startswith(f"{title}words")
+    assert page(failed, "words").startswith(f"{title}**The anatomy did NOT pass the gate")
+    # Of several, those that it is said of are named.
+    assert cautions([failed]) == [failed.caution]
+    assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
+    assert cautions([passed, none]) == []

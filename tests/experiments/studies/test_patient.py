@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from experiments.common.cases.blind import SECRET, read_estimate
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.record import stamp, write_record
+from experiments.common.record import NOT_GATED, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.common.virtual_patients import PatientSettings
@@ -20,6 +20,7 @@ from experiments.studies.patient.settings import Settings
 from experiments.studies.patient.study import STUDY, expect_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
+from mvest.problem.verdict import ONE_STATE
 from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
@@ -85,10 +86,10 @@ def in_process(monkeypatch):
     )
     seen = []
 
-    def blindly(values, folder, case, sealed):
+    def blindly(values, folder, case, sealed, gate):
         given = {k: v for k, v in values.items() if k not in SECRET}
         personal = build(PersonalSettings, given["personal"])
-        outcome = run_case(given, personal, read_configured(str(case)), folder)
+        outcome = run_case(given, personal, read_configured(str(case)), folder, gate=gate)
         write_json(folder / "estimate.json", asdict(outcome))
         seen.append((folder, sealed))
         return read_estimate(folder)
@@ -216,11 +217,14 @@ def leaves(value):
     return {value}
 
 
-def test_what_is_revealed_is_right(tmp_path, simulated, in_process):
+def test_what_is_revealed_is_right(tmp_path, simulated, in_process, monkeypatch):
     out = tmp_path / "job"
     out.mkdir()
     values = config_of(tmp_path)
+    monkeypatch.setattr(patient, "gate_of", lambda values: "NOT passed on 54 x 6 hex18")
     outcome = run(values, out)
+    assert outcome.gate == "NOT passed on 54 x 6 hex18"
+    assert ONE_STATE in [ground.check for ground in outcome.findings.case.verdict.grounds]
     write_record(tmp_path / "record.json", stamp(values, "hash", outcome, 0.0))
     assert outcome.status == "converged"
     case, (estimate,) = outcome.findings.case, outcome.findings.repeats
@@ -262,7 +266,7 @@ def test_revealing_leaves_what_it_was_given(tmp_path, simulated, in_process):
     place = make_patient(values)
     out = tmp_path / "job"
     out.mkdir()
-    estimated = patient.estimate_blindly(values, out, place.case, place.hidden)
+    estimated = patient.estimate_blindly(values, out, place.case, place.hidden, NOT_GATED)
     before = json.dumps(asdict(estimated))
     revealed = reveal(estimated, place, out / "fields.npz", settings_in(values), 1)
     assert json.dumps(asdict(estimated)) == before
