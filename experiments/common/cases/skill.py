@@ -7,7 +7,7 @@ the interval that is believed before anything was seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -16,10 +16,14 @@ from scipy.stats import beta, norm
 from mvest.mechanics.parameters import is_positive
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import UnknownRow
+from mvest.reporting.markup import number
 
 __all__ = [
     "GENERIC",
     "PRIOR",
+    "PRIOR_STD",
+    "Baseline",
+    "baselines",
     "generic_guess",
     "log_width",
     "median_errors",
@@ -31,6 +35,9 @@ __all__ = [
 
 GENERIC, PRIOR = "generic guess", "prior alone"
 """What tables call the two."""
+
+PRIOR_STD = 0.5
+"""Standard deviation of a modulus relative to its mean in the prior of ``conf/personal``."""
 
 HALF = float(norm.ppf(0.975))
 """Standard deviations from the middle of a 95 % interval to its end."""
@@ -48,6 +55,56 @@ def prior_alone(row: UnknownRow) -> UnknownRow:
         factor = float(np.exp(HALF * std / mean))
         return replace(row, estimate=mean, std=std, low=mean / factor, high=mean * factor)
     return replace(row, estimate=mean, std=std, low=mean - HALF * std, high=mean + HALF * std)
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """What the generic guess or the prior alone is worth for the modulus of a leaflet.
+
+    Attributes
+    ----------
+    what : str
+        ``GENERIC`` or ``PRIOR``.
+    row : UnknownRow
+        Its value, and its interval where it has one.
+    inside, n : int
+        Of so many truths so many lie in the interval; n is 0 where there is none.
+    error : float
+        Median error, relative.
+    """
+
+    what: str
+    row: UnknownRow
+    inside: int
+    n: int
+    error: float
+
+    @property
+    def words(self) -> str:
+        """Value, interval and what they are worth, for a cell of a table."""
+        row, error = self.row, f"median error {100 * self.error:.1f} %"
+        if row.low is None:
+            return f"{number(row.estimate)}; {error}"
+        interval = f"{number(row.low)} to {number(row.high)}"
+        return f"{number(row.estimate)} ({interval}); {error}, {self.inside} of {self.n} inside"
+
+
+def baselines(moduli: Sequence[UnknownRow]) -> list[Baseline]:
+    """What stands below every table of estimates; truths are known.
+
+    Parameters
+    ----------
+    moduli : sequence of UnknownRow
+        The estimates, of several leaflets and valves; priors are the same for all valves.
+    """
+    rows = []
+    for what, guess in ((GENERIC, generic_guess), (PRIOR, prior_alone)):
+        for name in dict.fromkeys(row.name for row in moduli):
+            own = [guess(row) for row in moduli if row.name == name and row.truth is not None]
+            known = [row.inside for row in own if row.inside is not None]
+            if own:
+                rows.append(Baseline(what, own[0], sum(known), len(known), median(_errors(own))))
+    return rows
 
 
 def score(row: UnknownRow) -> float | None:

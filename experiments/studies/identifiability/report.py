@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from experiments.common.cases.skill import GENERIC, PRIOR, PRIOR_STD
 from experiments.common.record import Record
 from experiments.common.report import page
 from experiments.studies.identifiability.figures import identifiability_figures
@@ -66,6 +67,13 @@ def _design_rows(findings: Findings) -> Rows:
             needed = min(_or_any(one.needed_noise_mm) for one in moduli)
             row[knowledge] = f"{stds} ({_noise(needed)})"
         shown.append(row)
+    if shown:
+        # Nothing is seen: what is believed of a modulus, and so how far a guess for all is off.
+        names = {one.parameter for one in findings.designs[0].moduli}
+        guess = " / ".join([_percent(PRIOR_STD)] * len(names))
+        known = dict.fromkeys(findings.settings.knowledge, guess)
+        row = dict.fromkeys(shown[0], MISSING) | {"vertices": f"none: {GENERIC}, {PRIOR}"}
+        shown.append(row | known)
     return shown
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.cases.report import interval_words
+from experiments.common.cases.skill import baselines, skill_words
 from experiments.common.tables import write_table
 from experiments.studies.imaged_patient.findings import Row
 from mvest.errors import InputError
@@ -107,6 +108,15 @@ def write_volume_tables(results: Path, rows: Sequence[Row], line: str) -> list[P
         }
         for row, (_, errors) in zip(rows, table[table.columns[-3:]].iterrows(), strict=True)
     ]
-    return write_table(
-        results / "volume", table, readable, line, [TRUTH_OF_MODULI, *volume_words(table)]
-    )
+    moduli = [row.modulus for row in rows]
+    readable += [
+        dict.fromkeys(readable[0], MISSING)
+        | {
+            "patient (simulated)": one.what,
+            "modulus": one.row.leaflet,
+            "estimate, 95 % [MPa]": one.words,
+        }
+        for one in baselines(moduli)
+    ]
+    notes = [TRUTH_OF_MODULI, skill_words(moduli), *volume_words(table)]
+    return write_table(results / "volume", table, readable, line, notes)

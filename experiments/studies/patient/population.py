@@ -10,7 +10,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.common.cases.findings import Findings
-from experiments.common.cases.skill import share_bounds
+from experiments.common.cases.skill import (
+    GENERIC,
+    PRIOR,
+    generic_guess,
+    prior_alone,
+    share_bounds,
+    skill_words,
+)
 from experiments.common.record import Record
 from experiments.common.report import cautions
 from experiments.common.tables import write_table
@@ -25,14 +32,17 @@ COLUMNS = ("name", "unit", "truth", "estimate", "std", "low", "high", "inside")
 
 
 def population_frame(records: Sequence[Record[Findings]]) -> pd.DataFrame:
-    """One row for each patient and unknown: truth, estimate and interval."""
+    """One row for each patient and unknown: truth, estimate and interval, and of the guesses."""
     rows = []
     for record in records:
         case = record.findings.case
         alone = case.without_nuisances
+        moduli = [row for row in case.unknowns if row.is_modulus]
         for estimation, unknowns in (
             ("with nuisances", case.unknowns),
             ("without nuisances", alone.parameters if alone else ()),
+            (GENERIC, list(map(generic_guess, moduli))),
+            (PRIOR, list(map(prior_alone, moduli))),
         ):
             rows += [
                 {
@@ -51,8 +61,9 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
     table = population_frame(records)
     readable = []
     for (estimation, name), group in table.groupby(["estimation", "name"], sort=False):
-        known = group[group["inside"].notna()]
-        inside, n = int(known["inside"].sum()), len(known)
+        known = group[group["estimate"].notna() & group["truth"].notna()]
+        judged = known["inside"].dropna()
+        inside, n = int(judged.sum()), len(judged)
         low, high = share_bounds(inside, n)
         error = (known["estimate"] - known["truth"]).astype(float)
         relative = str(name).startswith("E_f.") or "_" in str(name)
@@ -62,19 +73,25 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
             {
                 "estimation": str(estimation),
                 "unknown": str(name),
-                "patients": f"{n} of {len(group)}",
-                "95 % interval contains the truth": f"{inside} ({100 * inside / max(n, 1):.0f} %)",
-                "95 % bounds of that share": f"{100 * low:.0f} to {100 * high:.0f} %",
+                "patients": f"{len(known)} of {len(group)}",
+                "95 % interval contains the truth": f"{inside} ({100 * inside / n:.0f} %)"
+                if n
+                else MISSING,
+                "95 % bounds of that share": f"{100 * low:.0f} to {100 * high:.0f} %"
+                if n
+                else MISSING,
                 "mean error": _amount((error / scale).mean(), relative),
                 "median size of the error": _amount((error / scale).abs().median(), relative),
                 "mean width": _amount(width.mean(), relative),
             }
         )
     distances = table3(records)
+    unknowns = [row for record in records for row in record.findings.case.unknowns]
     notes = [
         *cautions(records),
         "Simulated valves with anatomies and moduli drawn at random; the truth was revealed after "
         "the estimation.",
+        skill_words([row for row in unknowns if row.is_modulus]),
         *_both_moduli(table),
         *distance_words(distances),
     ]
@@ -85,7 +102,9 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
 
 def _both_moduli(table: pd.DataFrame) -> list[str]:
     out = []
-    for estimation, group in table.groupby("estimation", sort=False):
+    for estimation, group in table[table["estimation"] != GENERIC].groupby(
+        "estimation", sort=False
+    ):
         known = group[group["name"].str.startswith("E_f.") & group["inside"].notna()]
         inside = int(known["inside"].sum())
         out.append(
@@ -98,7 +117,7 @@ def _both_moduli(table: pd.DataFrame) -> list[str]:
 def population_figure(table: pd.DataFrame) -> Figure:
     """Estimates with their intervals against the truth, with and without nuisances."""
     names = [n for n in table["name"].unique() if n.startswith("E_f.")]
-    kinds = list(table["estimation"].unique())
+    kinds = [kind for kind in table["estimation"].unique() if kind not in (GENERIC, PRIOR)]
     figure = Figure(figsize=(4.2 * len(names), 3.9 * len(kinds)), layout="constrained")
     grid = figure.subplots(len(kinds), len(names), squeeze=False)
     for i, kind in enumerate(kinds):

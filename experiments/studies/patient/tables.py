@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import interval_words
+from experiments.common.cases.skill import baselines, prior_alone, skill_words
 from experiments.common.record import Record
 from experiments.common.report import cautions
 from experiments.common.tables import write_table
@@ -96,7 +97,14 @@ def table2(records: Sequence[Record[Findings]]) -> pd.DataFrame:
                     f"{words} inside": other and other.inside,
                     f"{words} ended": alone and alone.reason,
                 }
-            plain["paper's estimate for its patient [MPa]"] = paper[k] if paper else None
+            before = prior_alone(row)
+            plain |= {
+                "generic guess [MPa]": row.prior_mean,
+                "prior alone 95 % low [MPa]": before.low,
+                "prior alone 95 % high [MPa]": before.high,
+                "prior alone inside": before.inside,
+                "paper's estimate for its patient [MPa]": paper[k] if paper else None,
+            }
             rows.append(plain)
     return pd.DataFrame(rows)
 
@@ -171,7 +179,20 @@ def _readable2(records: Sequence[Record[Findings]]) -> list[dict[str, str]]:
             row[f"{short} without nuisances"] = _other_words(case.without_nuisances, k)
             row[f"{short} paper's filter"] = _other_words(case.as_in_the_paper, k)
         rows.append(row)
-    return rows
+    return [*rows, *_guessed2(records, rows[0])]
+
+
+def _guessed2(records: Sequence[Record[Findings]], like: Mapping[str, str]) -> list[dict[str, str]]:
+    """Rows of the generic guess and of the prior alone, with the columns of a patient's."""
+    rows: dict[str, dict[str, str]] = {}
+    moduli = [row for record in records for row in _moduli(record.findings.case.unknowns)]
+    names = list(dict.fromkeys(row.name for row in moduli))
+    for one in baselines(moduli):
+        row = rows.setdefault(one.what, dict.fromkeys(like, MISSING))
+        row["patient (simulated)"] = one.what
+        short = "E_AL" if one.row.name == names[0] else "E_PL"
+        row[f"{short} estimate, 95 %"] = one.words
+    return list(rows.values())
 
 
 def _other_words(other: ModuliAlone | None, k: int) -> str:
@@ -220,11 +241,13 @@ def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[st
         column = table[f"{words} inside"]
         if column.notna().any():
             said.append(f"{words} for {int(column.sum())} of {int(column.notna().sum())}")
+    moduli = [row for record in records for row in _moduli(record.findings.case.unknowns)]
     if known.empty:
         return ["No estimation of these patients ended with moduli."]
     relative = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
     out = [
         "; ".join(said) + ".",
+        skill_words(moduli),
         f"Width of the interval over the estimate: {relative.min():.2f} to {relative.max():.2f}, "
         f"mean {relative.mean():.2f}.",
     ]

@@ -1,7 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 from experiments.common.cases.skill import (
+    PRIOR_STD,
+    baselines,
     generic_guess,
     log_width,
     prior_alone,
@@ -81,3 +86,25 @@ def test_scores_are_of_the_logarithm():
 )
 def test_bounds_of_a_share(inside, n, low, high):
     assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
+
+
+def test_what_stands_below_a_table_of_estimates():
+    rows = [
+        answered(10.0, 11.0, 9.0, 13.0, 5.0),
+        answered(4.0, 8.0, 7.0, 9.0, 5.0),
+        answered(8.0, None, None, None, 5.0),
+    ]
+    guess, before = baselines(rows)
+    # 5 for 10, 4 and 8: 50 %, 25 % and 37.5 %, runs without an estimate included.
+    assert (guess.what, guess.n, guess.error) == ("generic guess", 0, pytest.approx(0.375))
+    assert guess.words == "5; median error 37.5 %"
+    # 5 within a factor of exp(1.96 x 0.2) = 1.48 of 4, and neither of 10 nor of 8.
+    assert (before.what, before.inside, before.n) == ("prior alone", 1, 3)
+    assert before.words == "5 (3.38 to 7.4); median error 37.5 %, 1 of 3 inside"
+
+
+def test_the_prior_of_tables_is_that_of_the_configuration():
+    text = (Path(__file__).parents[3] / "conf" / "personal" / "nuisances.yaml").read_text()
+    for name, about in yaml.safe_load(text)["unknowns"].items():
+        if name.startswith("E_f."):
+            assert about["std"] / about["mean"] == pytest.approx(PRIOR_STD, abs=0.005)

@@ -250,8 +250,17 @@ def test_the_population_counts_how_often_intervals_hold(tmp_path):
     assert "-2.9 %" in scale
     assert "9.5 %" in scale
     table = population_frame(population())
-    assert len(table) == 20 * (4 + 2)
-    assert set(table["estimation"]) == {"with nuisances", "without nuisances"}
+    # Both moduli again as they are guessed.
+    assert len(table) == 20 * (4 + 2 + 2 + 2)
+    guesses = {"generic guess", "prior alone"}
+    assert set(table["estimation"]) == {"with nuisances", "without nuisances", *guesses}
+    # 1 for 6 is off by 83 %, and has no interval of its own; within exp(1.96) of 1 lies no 8.
+    guess, before = (
+        next(x for x in text.splitlines() if what in x and "anterior" in x)
+        for what in ("| generic guess", "| prior alone")
+    )
+    assert guess.split(" | ")[3:] == ["–", "–", "-83.3 %", "83.3 %", "– |"]
+    assert before.split(" | ")[3:5] == ["20 (100 %)", "83 to 100 %"]
 
 
 def test_failures_of_the_population_are_counted_and_not_drawn(tmp_path):
