@@ -7,12 +7,13 @@ It says nothing about valves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
@@ -150,6 +151,23 @@ class MadeUpClosure:
             np.concatenate([np.zeros_like(jacobian), jacobian]),
         )
 
+    def predict_held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[Prediction]:
+        """The closed frame by the formula, and those under other loads, with derivatives."""
+        whole = self(m)
+        half = len(whole.y) // 2
+        parts = [replace(whole, y=whole.y[half:], jacobian=whole.jacobian[half:])]
+        for state in states:
+            self.states.append(state)
+            lift = np.tile((state.annulus - CLOSED_ANNULUS).mean(axis=0), (len(BASE), 1))
+            columns = []
+            for k in range(len(m)):
+                h = 1e-5 * m[k] * np.eye(len(m))[k]
+                two = [shape(self._values(m + s * h), state.pressure_mmHg) for s in (1, -1)]
+                columns.append(((two[0] - two[1]) / (2 * h[k])).ravel())
+            at = shape(self._values(m), state.pressure_mmHg) + lift
+            parts.append(Prediction(at.ravel(), np.stack(columns, axis=1)))
+        return parts
+
     def held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[np.ndarray | None]:
         """The formula under other pressures; it is carried along with the annulus."""
         self.states += states
@@ -215,7 +233,8 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
     built: list[MadeUpClosure] = []
 
     def build(case: ValveCase, wanted: PersonaliseSettings, store: Any = None) -> MadeUpClosure:
-        own = [u for u in wanted.unknowns if u.name not in REGISTRATION]
+        other = (*REGISTRATION, OFFSET, ERROR)
+        own = [u for u in wanted.unknowns if not u.name.startswith(other)]
         free = tuple(u.name for u in own if u.treatment is not Treatment.FIXED)
         fixed = {u.name: u.mean for u in own if u.treatment is Treatment.FIXED}
         built.append(MadeUpClosure(free, fixed, **changes))

@@ -96,6 +96,7 @@ RANGES = (
         "no heart makes more; below zero it opens the valve",
         "*pressure_mmHg *pressures_mmHg",
     ),
+    Range(0, 100, "mmHg", "errors of pressures", "*offset_mmHg *each_mmHg"),
     Range(0, 10_000, "", "a frame and, in mmHg, its pressure", "imaged.held_out imaged.landmarks"),
     Range(0.01, 10, "mm", "no leaflet is thicker", "*thickness *thickness_mm"),
     Range(1e-5, 10, "s", "time steps of a beat", "dt cycle_dt time_steps"),
@@ -155,7 +156,7 @@ RANGES = (
         0, 1, "", "shares of a whole",
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
-        "marginal_s *confidence dropout rate held_relaxation held_pressure",
+        "marginal_s *confidence dropout rate *_relaxation held_pressure",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
     Range(-1e12, 1e12, "", "variances, in the units of any model squared", "P0 Q R linear_P0"),

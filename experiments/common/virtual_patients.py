@@ -70,7 +70,7 @@ def draw_patient_values(patient: PatientSettings, rng: np.random.Generator) -> d
         name: float(value * np.exp(patient.moduli_spread * rng.standard_normal()))
         for name, value in sorted(patient.moduli.items())
     }
-    return draw_hidden(moduli, patient.deviations, rng)
+    return draw_hidden(moduli, patient.deviations, rng, patient.simulation.fitted_frames)
 
 
 def first_that_closes(

@@ -27,13 +27,14 @@ class Role(Enum):
     """What a frame is for.
 
     ``REFERENCE`` is the open frame from which the model's geometry is taken; ``CLOSED`` the closed
-    frame that is fitted; ``HELD_OUT`` a further frame of the closed valve (under another pressure,
-    with the annulus and the papillary tips elsewhere) that no filter is shown and against which the
-    fitted valve is judged.
+    frame that is fitted; ``FITTED`` a further frame of the closed valve (under another pressure,
+    with the annulus and the papillary tips elsewhere) that is fitted with it; ``HELD_OUT`` one that
+    no filter is shown and against which the fitted valve is judged.
     """
 
     REFERENCE = "reference"
     CLOSED = "closed"
+    FITTED = "fitted"
     HELD_OUT = "held_out"
 
 
@@ -299,6 +300,11 @@ class ValveCase:
     def frame(self, role: Role) -> Frame:
         """The only frame of a role (reference or closed)."""
         return next(frame for frame in self.frames if frame.role is role)
+
+    @property
+    def fitted(self) -> tuple[Frame, ...]:
+        """The further frames that are fitted with the closed one."""
+        return tuple(frame for frame in self.frames if frame.role is Role.FITTED)
 
     @property
     def held_out(self) -> tuple[Frame, ...]:

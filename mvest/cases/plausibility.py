@@ -105,6 +105,8 @@ RANGES: Mapping[str, HumanRange] = {
 
 REACH_MM = 4.0
 """Distance over which stretch is judged: several edges, so that noise counts less."""
+ORDER_STDS = 3.0
+"""Standard deviations by which the leaflets lie the wrong way before pressures are doubted."""
 MAX_VERTICES = 1500
 """As many are looked at, evenly, so that the time is milliseconds for any surface."""
 EXTREME_SHARE = 0.02
@@ -170,12 +172,47 @@ def _outside(field: str, what: str, value: float, name: str, hint: str = "") -> 
 
 
 def _of_pressure(case: ValveCase) -> Iterator[Doubt]:
-    pressure = case.frame(Role.CLOSED).pressure_mmHg
-    # kPa taken for mmHg: 120 mmHg are 16 kPa.
-    hint = "is it in kPa?" if 8.0 <= pressure <= 27.0 else ""
-    yield from _outside(
-        "frames.pressure", "the pressure on the closed valve", pressure, "closing_pressure", hint
-    )
+    closed = case.frame(Role.CLOSED)
+    for frame in (closed, *case.fitted):
+        pressure = frame.pressure_mmHg
+        # kPa taken for mmHg: 120 mmHg are 16 kPa.
+        hint = "is it in kPa?" if 8.0 <= pressure <= 27.0 else ""
+        field = "frames.pressure" if frame is closed else f"frames.{frame.name}.pressure"
+        what = "the pressure on the closed valve"
+        yield from _outside(field, what, pressure, "closing_pressure", hint)
+    for frame in case.fitted:
+        yield from _of_order(case, closed, frame)
+
+
+def _of_order(case: ValveCase, closed: Frame, other: Frame) -> Iterator[Doubt]:
+    """Whether the leaflets are nearer to the atrium under the larger of two pressures."""
+    heights = []
+    for frame in (closed, other):
+        plane = _plane(case, frame)
+        if plane is None:
+            return
+        heights.append(-float(plane.coordinates(frame.vertices)[:, 2] @ _weights(frame)))
+    rise = (heights[1] - heights[0]) * np.sign(other.pressure_mmHg - closed.pressure_mmHg)
+    doubt = case.uncertainty
+    size = float(areas(closed.vertices, closed.triangles).sum())
+    alike = 2.0 * np.pi * doubt.correlation_length_mm**2
+    independent = len(closed.vertices) if alike == 0.0 else max(size / alike, 1.0)
+    if rise < -ORDER_STDS * doubt.typical_mm * np.sqrt(2.0 / independent):
+        high, low = sorted((closed, other), key=lambda f: f.pressure_mmHg, reverse=True)
+        yield Doubt(
+            f"frames.{other.name}.pressure",
+            f"under {high.pressure_mmHg:.3g} mmHg in {high.name!r} the leaflets lie {-rise:.1f} mm "
+            f"farther from the atrium than under {low.pressure_mmHg:.3g} mmHg in {low.name!r}: are "
+            "frames or pressures exchanged?",
+            mistake=True,
+        )
+
+
+def _weights(frame: Frame) -> FloatArray:
+    """Share of a frame's area ``(n,)`` about each of its vertices."""
+    own = np.repeat(areas(frame.vertices, frame.triangles) / 3.0, 3)
+    about = np.bincount(frame.triangles.ravel(), own, len(frame.vertices))
+    return about / about.sum()
 
 
 def _of_thickness(case: ValveCase) -> Iterator[Doubt]:

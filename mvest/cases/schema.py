@@ -94,8 +94,9 @@ class FrameEntry(_Model):
 
     name: Name = Field(description="text, different for every frame")
     time: Number = Field(description="a number in units.time, larger than that of the frame before")
-    role: Literal["reference", "closed", "held_out"] = Field(
-        description="reference (open; the model starts from it), closed (fitted) or held_out"
+    role: Literal["reference", "closed", "fitted", "held_out"] = Field(
+        description="reference (open; the model starts from it), closed (fitted), fitted (a "
+        "further closed frame, under another pressure, fitted with it) or held_out"
     )
     surface: SurfaceFiles = Field(
         description="a file (.vtp, .vtu, .stl, .obj, .ply), or one file for every region"

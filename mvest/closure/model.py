@@ -403,19 +403,52 @@ class ClosureModel:
         MaterialError
             If a modulus is inadmissible.
         """
-        closure = self.close(m, sensitivities=False)
-        system, simulation = closure.system, closure.simulation
-        frames: list[FloatArray | None] = []
+        ends = [end for end in self.rests(m, states)[1:] if end.converged]
+        frames: list[FloatArray | None] = [self.observed(end.frames[-1]) for end in ends]
+        return frames + [None] * (len(states) - len(frames))
+
+    def predict_held(self, m: FloatArray, states: Sequence[HeldState]) -> list[Prediction]:
+        """The observed vertices of the closed valve, and of equilibria under other loads.
+
+        As `held`, with derivatives. The last prediction is the first that fails, if one does.
+        """
+        try:
+            ends = self.rests(m, states, sensitivities=True)
+        except MaterialError as error:
+            return [Prediction.failed(str(error))]
+        return [self._seen(end) for end in ends]
+
+    def _seen(self, simulation: Simulation) -> Prediction:
+        if not simulation.converged:
+            return Prediction.failed(
+                f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
+            )
+        moved = [self.observed(dx).ravel() for dx in simulation.sensitivities[-1]]
+        return Prediction(self.observed(simulation.frames[-1]).ravel(), np.stack(moved, axis=1))
+
+    def rests(
+        self, m: FloatArray, states: Sequence[HeldState], *, sensitivities: bool = False
+    ) -> list[Simulation]:
+        """The closure and the ways from one state to the next, up to the first that fails.
+
+        As `held`, not yet embedded.
+        """
+        closure = self.close(m, sensitivities=sensitivities)
+        parameters = self.tuned(m)[1] if sensitivities else ()
+        ends = [closure.simulation]
         for state in states:
-            loading = held_loading(system, self.contact_valve, state)
-            if simulation.converged:
-                simulation = self._rest(system, loading, simulation.frames[-1])
-            converged = simulation.converged
-            frames.append(self.observed(simulation.frames[-1]) if converged else None)
-        return frames
+            if not ends[-1].converged:
+                break
+            loading = held_loading(closure.system, self.contact_valve, state)
+            ends.append(self._rest(closure.system, loading, ends[-1].frames[-1], parameters))
+        return ends
 
     def _rest(
-        self, system: System, loading: Callable[[float], Loads], start: FloatArray
+        self,
+        system: System,
+        loading: Callable[[float], Loads],
+        start: FloatArray,
+        parameters: Sequence[Parameter] = (),
     ) -> Simulation:
         """Equilibrium under constant loads from nodal positions ``start (n, 3)``."""
         end = self.settings.protocol.end
@@ -427,6 +460,7 @@ class ClosureModel:
                 steps,
                 damping=self.settings.damping,
                 newton=self.settings.newton,
+                parameters=list(parameters),
                 final_only=True,
                 solver=self._solver,
                 initial_positions=start,
@@ -459,18 +493,11 @@ class ClosureModel:
 
         Inadmissible moduli and closures that do not converge are failed predictions, not errors.
         """
-        try:
-            simulation = self.close(m).simulation
-        except MaterialError as error:
-            return Prediction.failed(str(error))
-        if not simulation.converged:
-            return Prediction.failed(
-                f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
-            )
-        open_, closed = self.observed(self.mesh.nodes), self.observed(simulation.frames[-1])
-        derivative = np.stack([self.observed(dx) for dx in simulation.sensitivities[-1]], axis=-1)
-        y = np.concatenate([open_.ravel(), closed.ravel()])
-        jacobian = np.concatenate(
-            [np.zeros((open_.size, len(self.names))), derivative.reshape(-1, len(self.names))]
+        (closed,) = self.predict_held(m, ())
+        if not closed.converged:
+            return closed
+        open_ = self.observed(self.mesh.nodes).ravel()
+        still = np.zeros((len(open_), len(self.names)))
+        return Prediction(
+            np.concatenate([open_, closed.y]), np.concatenate([still, closed.jacobian])
         )
-        return Prediction(y, jacobian)

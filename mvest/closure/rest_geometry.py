@@ -7,6 +7,7 @@ they are, so that the same material points are observed, touch and are held.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -15,7 +16,12 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics.reference import RestVariation, vary_equilibrium
-from mvest.mechanics.valve_system import boundary_loading, patch_members
+from mvest.mechanics.valve_system import (
+    HeldState,
+    boundary_loading,
+    held_loading,
+    patch_members,
+)
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.band import leaflet_normals
 from mvest.valve.anatomy.valve import lumped_areas
@@ -145,14 +151,20 @@ class RestGeometry:
         patches = np.einsum("csi,qci->qcs", slope, moves)
         return RestVariation(self._still(len(moves)), patches=patches, members=members)
 
-    def change(self, m: FloatArray, variation: RestVariation) -> FloatArray | str:
-        """Derivatives ``(2, n, 3, q)`` of the observed open and closed valve, or why none.
+    def change(
+        self, m: FloatArray, variation: RestVariation, states: Sequence[HeldState] = ()
+    ) -> FloatArray | str:
+        """Derivatives ``(f, n, 3, q)`` of the observed open and closed valve, or why none.
+
+        Those of the states come between them.
 
         Parameters
         ----------
         m : (p,)
             Parameters of the closure; it is gone to from the last closed state, if that is another.
         variation : RestVariation
+        states : sequence of HeldState
+            Under other loads, gone to from the closed valve.
         """
         model = self.model
         if model.closed is None or not np.array_equal(model.closed.at, m):
@@ -162,7 +174,15 @@ class RestGeometry:
         assert model.closed is not None
         system, _ = model.tuned(m)
         loading = boundary_loading(system, model.valve, model.contact_valve, model.settings)
-        loads = loading(model.settings.protocol.end)
-        dx = vary_equilibrium(system, model.solver, model.closed.positions, loads, variation)
-        both = [[model.observed(move) for move in moves] for moves in (variation.nodes, dx)]
-        return np.moveaxis(np.array(both), 1, -1)
+        ends = [(model.closed.positions, loading(model.settings.protocol.end))]
+        for state, end in zip(states, model.rests(m, states)[1:] if states else (), strict=False):
+            if not end.converged:
+                return end.reason.value
+            held = held_loading(system, model.contact_valve, state)
+            ends.append((end.frames[-1], held(0.0)))
+        moves = [
+            vary_equilibrium(system, model.solver, positions, loads, variation)
+            for positions, loads in ends
+        ]
+        frames = (variation.nodes, *moves[1:], moves[0])
+        return np.moveaxis(np.array([[model.observed(dx) for dx in one] for one in frames]), 1, -1)

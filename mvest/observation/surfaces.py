@@ -31,7 +31,7 @@ What to know:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -227,6 +227,8 @@ class SurfaceObservation:
     correlation_length_mm : float
         Over which the errors of the distances are alike, see ``SpatialCorrelation``, within a frame
         and a leaflet; 0: independent. Errors of the curves are independent.
+    predicted : tuple of str
+        Frames that the model predicts, in the order in which it stacks them.
     R : NoiseCovariance
         Covariance in mm² of the observation.
 
@@ -242,6 +244,7 @@ class SurfaceObservation:
     std_mm: float
     curve_std_mm: float | None = None
     correlation_length_mm: float = 0.0
+    predicted: tuple[str, ...] = FRAMES
     R: NoiseCovariance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -268,9 +271,7 @@ class SurfaceObservation:
         """Zeros: the seen points have no distance to the surface that was seen."""
         return np.zeros(sum(self.size_of(seen) for seen in self.seen))
 
-    def of(
-        self, model: ObservationModel, all_frames: Sequence[str] = FRAMES, /
-    ) -> ObservationModel:
+    def of(self, model: ObservationModel, /) -> ObservationModel:
         """The distances of what was seen to what a model predicts.
 
         What it hands on with a prediction are the observed frames with all vertices, (f, n, 3) mm.
@@ -280,20 +281,18 @@ class SurfaceObservation:
         Parameters
         ----------
         model : ObservationModel
-            Predicts the stacked positions ``(3 n f,)`` mm of all frames.
-        all_frames : sequence of str, (f,)
-            Names of its frames in the order in which it stacks them.
+            Predicts the stacked positions ``(3 n f,)`` mm of all frames of ``predicted``.
 
         Raises
         ------
         InputError
             If the model does not predict a frame that was seen.
         """
-        unknown = set(self.frames) - set(all_frames)
+        unknown = set(self.frames) - set(self.predicted)
         if unknown:
-            raise InputError(f"observed frames {sorted(unknown)}, predicted {list(all_frames)}")
-        chosen = [all_frames.index(frame) for frame in self.frames]
-        shape = (len(all_frames), self.surface.n_vertices, 3)
+            raise InputError(f"observed frames {sorted(unknown)}, predicted {list(self.predicted)}")
+        chosen = [self.predicted.index(frame) for frame in self.frames]
+        shape = (len(self.predicted), self.surface.n_vertices, 3)
 
         def distances(m: FloatArray) -> Prediction:
             prediction = predict(model, m)
@@ -302,7 +301,7 @@ class SurfaceObservation:
             if prediction.y.size != np.prod(shape):
                 raise InputError(
                     f"the model predicts {prediction.y.size} coordinates; expected 3 of each of "
-                    f"{shape[1]} vertices in each of the frames {', '.join(all_frames)}"
+                    f"{shape[1]} vertices in each of the frames {', '.join(self.predicted)}"
                 )
             whole = prediction.y.reshape(shape)[chosen]
             motion = prediction.jacobian.reshape(*shape, prediction.jacobian.shape[1])[chosen]

@@ -34,6 +34,8 @@ class Observation:
         Variance of each coordinate in each frame that the filter is to assume.
     scale : (n,) or None
         Standard deviation of each vertex as a part of that of its frame; None: all alike.
+    predicted : tuple of str
+        Frames that the model predicts, in the order in which it stacks them.
     correlation : SpatialCorrelation or None
         Correlation between vertices that the filter is to assume; None for independent errors.
     """
@@ -43,9 +45,10 @@ class Observation:
     variance: FloatArray
     correlation: SpatialCorrelation | None = None
     scale: FloatArray | None = None
+    predicted: tuple[str, ...] = FRAMES
 
     def __post_init__(self) -> None:
-        require_frames(self.frames)
+        require_frames(self.frames, self.predicted)
         positions = np.array(self.positions, dtype=np.float64)
         if positions.ndim != 3 or positions.shape[0] != len(self.frames) or positions.shape[2] != 3:
             raise InputError(
@@ -100,7 +103,7 @@ class Observation:
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
         """What a model predicts of this observation; see :func:`observed_frames`."""
-        return observed_frames(model, self.frames, self.seen)
+        return observed_frames(model, self.frames, self.seen, self.predicted)
 
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Distance ``(n,)`` mm of each vertex of the last frame from fitted ``(f, n, 3)``.
@@ -133,16 +136,19 @@ class Observation:
         return stacked_noise(blocks)
 
 
-def require_frames(frames: Sequence[str]) -> None:
-    """Raise InputError unless ``frames`` are different frames that a model predicts."""
-    if not frames or not set(frames) <= set(FRAMES) or len(set(frames)) != len(frames):
-        raise InputError(f"observed frames {list(frames)}, expected some of {list(FRAMES)}")
+def require_frames(frames: Sequence[str], predicted: Sequence[str] = FRAMES) -> None:
+    """Raise InputError unless ``frames`` are different frames of those that a model predicts."""
+    if not frames or not set(frames) <= set(predicted) or len(set(frames)) != len(frames):
+        raise InputError(f"observed frames {list(frames)}, expected some of {list(predicted)}")
 
 
 def observed_frames(
-    model: ObservationModel, frames: Sequence[str], seen: BoolArray | None = None
+    model: ObservationModel,
+    frames: Sequence[str],
+    seen: BoolArray | None = None,
+    predicted: Sequence[str] = FRAMES,
 ) -> Callable[[FloatArray], Prediction]:
-    """The observed frames of a model that predicts all of ``FRAMES``, stacked.
+    """The observed frames of a model that predicts all of ``predicted``, stacked.
 
     What it hands on with a prediction are these frames with all vertices, ``(f, n, 3)`` mm.
 
@@ -152,6 +158,7 @@ def observed_frames(
     frames : sequence of str, (f,)
     seen : (f, n), optional
         Vertices that are predicted in each frame; default all.
+    predicted : sequence of str
     """
     rows = slice(None) if seen is None else np.repeat(seen, 3)
 
@@ -159,15 +166,19 @@ def observed_frames(
         prediction = predict(model, m)
         if not prediction.converged:
             return prediction
-        y, jacobian = (select_frames(a, frames) for a in (prediction.y, prediction.jacobian))
+        y, jacobian = (
+            select_frames(a, frames, predicted) for a in (prediction.y, prediction.jacobian)
+        )
         whole = y.reshape(len(frames), -1, 3)
         return replace(prediction, y=y[rows], jacobian=jacobian[rows], aux=whole)
 
     return observed
 
 
-def select_frames(stacked: FloatArray, frames: Sequence[str]) -> FloatArray:
-    """Rows of the named frames out of all ``FRAMES``."""
-    size = len(stacked) // len(FRAMES)
-    starts = [size * FRAMES.index(frame) for frame in frames]
+def select_frames(
+    stacked: FloatArray, frames: Sequence[str], predicted: Sequence[str] = FRAMES
+) -> FloatArray:
+    """Rows of the named frames out of all that are ``predicted``."""
+    size = len(stacked) // len(predicted)
+    starts = [size * predicted.index(frame) for frame in frames]
     return np.concatenate([stacked[start : start + size] for start in starts])

@@ -7,5 +7,6 @@ from .result import Personalised as Personalised
 from .settings import CaseMesh as CaseMesh
 from .settings import PaperSettings as PaperSettings
 from .settings import PersonaliseSettings as PersonaliseSettings
+from .settings import PressureErrors as PressureErrors
 from .settings import Treatment as Treatment
 from .settings import Unknown as Unknown

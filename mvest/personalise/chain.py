@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.errors import GeometryError
+from mvest.closure.frames import is_frame_pressure
+from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.filters.considered import SchmidtFilter
@@ -24,7 +25,6 @@ from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.update import kalman_update
 from mvest.estimation.wrappers import SharedStart, of_some
-from mvest.mechanics.valve_system import HeldState
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.learned import error_family
 from mvest.observation.surfaces import (
@@ -42,7 +42,7 @@ from mvest.personalise.geometry_errors import (
     errors_of,
     sample_geometry,
 )
-from mvest.personalise.model import build_model
+from mvest.personalise.model import build_model, frames_model, held_state, with_pressures
 from mvest.personalise.result import FrameDistance, Personalised
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.estimate import StudyResult, estimate
@@ -50,7 +50,6 @@ from mvest.problem.expectation import Expectation, expect
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy.band import Band
 
 __all__ = ["expect_case", "personalise_case"]
 
@@ -135,7 +134,7 @@ def personalise_case(
         timed("confirm", began)
     return Personalised(
         case,
-        settings,
+        chain.settings,
         chain.model.mesh,
         chain.names,
         chain.prior,
@@ -191,10 +190,17 @@ class _Chain:
         on_step: OnStep | None,
         on_iterate: OnIterate | None = None,
     ) -> None:
-        self.case, self.settings = case, settings
+        self.case, self.settings = case, with_pressures(case, settings)
+        settings = self.settings
         self.closed = case.frame(Role.CLOSED)
+        if case.fitted and case.error_samples is not None:
+            raise InputError(
+                f"case {case.name}: error samples and several fitted frames; expected one closed "
+                "frame, or no samples"
+            )
         self.model = build_model(case, settings, store)
         self.model.on_step = on_step
+        self.frames = frames_model(case, settings, self.model)
         self.on_iterate = on_iterate
         free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
         # Those of the closure first, in its order; then the displacement.
@@ -202,7 +208,7 @@ class _Chain:
         rigid = [u for u in free if u.name in REGISTRATION]
         self.unknowns = (*own, *rigid)
         self.names = tuple(u.name for u in self.unknowns)
-        self.registered = RegisteredModel(self.model, self.names)
+        self.registered = RegisteredModel(self.frames or self.model, self.names)
         self.prior = Gaussian.from_variance(
             np.array([u.mean for u in self.unknowns]),
             np.array([u.std for u in self.unknowns]) ** 2,
@@ -350,41 +356,61 @@ class _Chain:
         return 0.0 if sampled else self.case.uncertainty.correlation_length_mm
 
     def plain_observation(self, *, stated: bool = False) -> Observation | SurfaceObservation:
-        """The closed frame, with the uncertainty of single observations.
+        """The frames that are fitted, with the uncertainty of single observations.
 
         That is what the case states (see `length`); independent where it is to be learned.
         """
         uncertainty = self.case.uncertainty
-        frame, std = self.closed, uncertainty.typical_mm
+        std = uncertainty.typical_mm
         learned = self.settings.errors is not None
         length = 0.0 if learned else self.length(stated=stated)
         scale = uncertainty.std_mm / std if isinstance(uncertainty.std_mm, np.ndarray) else None
-        kept = _thinned(len(frame.vertices))
+        names = ("closed",) if self.frames is None else self.frames.frames
+        predicted = ("open", *names)
         if self.corresponding:
             correlation = (
                 SpatialCorrelation(self.case.surface.vertices, length) if length > 0 else None
             )
-            seen = np.where(kept[:, None], frame.vertices, np.nan)
-            return Observation(("closed",), seen[None], np.array(std**2), correlation, scale)
+            kept = _thinned(len(self.closed.vertices))[:, None]
+            seen = np.stack([np.where(kept, frame.vertices, np.nan) for frame in self.fitted])
+            return Observation(names, seen, np.array(std**2), correlation, scale, predicted)
+        points = tuple(
+            self._points(name, frame, scale) for name, frame in zip(names, self.fitted, strict=True)
+        )
+        surface = replace(PredictedSurface.of_valve(self.model.valve), annulus=None)
+        return SurfaceObservation(points, surface, std, std, length, predicted)
+
+    def _points(self, name: str, frame: Frame, scale: FloatArray | None) -> ObservedSurface:
+        """What is compared of a frame whose vertices are not known again."""
+        uncertainty = self.case.uncertainty
+        kept = _thinned(len(frame.vertices))
         points = ObservedSurface(
-            "closed",
+            name,
             frame.vertices[kept],
             _vertex_region(frame)[kept],
             frame.free_edge,
             scale=None if scale is None else scale[kept],
         )
-        if learned or uncertainty.correlation_length_mm > 0:
+        if self.settings.errors is not None or uncertainty.correlation_length_mm > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
-            border = BORDER * std * (1.0 if points.scale is None else points.scale)
+            far = 1.0 if points.scale is None else points.scale
+            border = BORDER * uncertainty.typical_mm * far
             near = replace(points, annulus=frame.annulus).inner(border)
             points = replace(near, annulus=None)
-        surface = replace(PredictedSurface.of_valve(self.model.valve), annulus=None)
-        return SurfaceObservation((points,), surface, std, std, length)
+        return points
+
+    @property
+    def fitted(self) -> tuple[Frame, ...]:
+        """The frames that are fitted, in the order in which they are predicted, the closed last."""
+        if self.frames is None:
+            return (self.closed,)
+        by_name = {frame.name: frame for frame in self.case.frames}
+        return tuple(by_name[name] for name in self.frames.frames)
 
     @property
     def corresponding(self) -> bool:
         """Whether vertices are compared one by one."""
-        return self.settings.correspondence and self.closed.corresponds
+        return self.settings.correspondence and all(one.corresponds for one in self.fitted)
 
     def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
         """All unknowns."""
@@ -462,14 +488,22 @@ class _Chain:
         """The moduli alone, with the paper's filter and its independent R."""
         observation: Observed
         if self.corresponding:
-            observation = Observation(("closed",), self.closed.vertices[None], np.array(paper.R))
-        else:
             seen = self.plain_observation()
-            assert isinstance(seen, SurfaceObservation)
-            std = float(np.sqrt(paper.R))
+            assert isinstance(seen, Observation)
             observation = replace(
                 seen,
-                seen=tuple(replace(points, scale=None) for points in seen.seen),
+                positions=np.stack([frame.vertices for frame in self.fitted]),
+                variance=np.array(paper.R),
+                correlation=None,
+                scale=None,
+            )
+        else:
+            points = self.plain_observation()
+            assert isinstance(points, SurfaceObservation)
+            std = float(np.sqrt(paper.R))
+            observation = replace(
+                points,
+                seen=tuple(replace(each, scale=None) for each in points.seen),
                 std_mm=std,
                 curve_std_mm=std,
                 correlation_length_mm=0.0,
@@ -487,9 +521,13 @@ class _Chain:
             Predicted frames at ``m``, stacked, the closed one last.
         """
         n = len(self.case.surface.vertices)
-        frames = {self.closed.name: closed.reshape(-1, n, 3)[-1]}
-        states = [self.held_state(frame) for frame in self.case.held_out]
+        shown = closed.reshape(-1, n, 3)[-len(self.fitted) :]
+        frames = {frame.name: points for frame, points in zip(self.fitted, shown, strict=True)}
+        further = {frame.name: held_state(self.model, frame) for frame in self.case.held_out}
+        states = list(further.values())
         if states:
+            if self.frames is not None:
+                states = self.frames.under(self.registered.own(m), further)
             held = self.model.held(self.registered.mechanical(m), states)
             for frame, points in zip(self.case.held_out, held, strict=True):
                 if points is not None:
@@ -502,28 +540,23 @@ class _Chain:
         """How far the frames that both valves have are from where they were seen."""
         turn, origin, target = self._alignment(generic[self.closed.name])
         registered = {name: (points - origin) @ turn.T + target for name, points in generic.items()}
+        # The closed frame first, wherever others are fitted with it.
+        shown = sorted(
+            self.case.frames, key=lambda f: bool(self.case.fitted) and f is not self.closed
+        )
         distances = [
             FrameDistance(
                 frame.name,
-                frame.role is Role.CLOSED,
+                frame.role in (Role.CLOSED, Role.FITTED),
                 *(
                     self._distance(frame, positions[frame.name])
                     for positions in (generic, registered, fitted)
                 ),
             )
-            for frame in self.case.frames
+            for frame in shown
             if frame.name in generic and frame.name in fitted
         ]
         return _Frames(generic, registered, fitted, tuple(distances))
-
-    def held_state(self, frame: Frame) -> HeldState:
-        """The loads of a further frame, on the contact valve's annulus."""
-        contact = self.model.contact_valve
-        annulus = frame.annulus
-        if contact is not self.model.valve:
-            phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
-            annulus = Band(self.model.valve).annulus_positions(phi, frame.annulus)
-        return HeldState(frame.pressure_mmHg, annulus, frame.papillary_tips)
 
     def _alignment(self, generic: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Turn, origin and its target that lay the generic closed valve on the closed frame."""
@@ -557,7 +590,9 @@ class _Chain:
             errors = errors and replace(errors, base=self.noise(learned))
             doubt[np.ix_(self.estimated, self.estimated)] = learned.covariance
         groups = {
-            "pressure known": ("pressure_scale",),
+            "pressure known": tuple(
+                n for n in self.names if n == "pressure_scale" or is_frame_pressure(n)
+            ),
             "rest lengths known": ("chord_rest_length",),
             "chordal stiffness known": ("chord_stiffness",),
             "registration known": REGISTRATION,
@@ -595,10 +630,11 @@ class _Chain:
         assert result.estimate is not None
         assert result.fitted is not None
         anew = replace(self.model, continuation=False, guide=None, repeat=True)
-        prediction = RegisteredModel(anew, self.names)(result.estimate)
+        frames = frames_model(self.case, self.settings, anew)
+        prediction = RegisteredModel(frames or anew, self.names)(result.estimate)
         if not prediction.converged:
             return None
-        closed = prediction.y.reshape(2, -1, 3)[1]
+        closed = prediction.y.reshape(1 + len(self.fitted), -1, 3)[-1]
         return float(np.linalg.norm(closed - result.fitted[-1], axis=1).max())
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import ErrorSamples, ValveCase
 from mvest.cases.displaced import displaced_case
+from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise_family import ErrorColumns, smooth_basis
@@ -117,18 +118,22 @@ def geometry_columns(
     m : (p,)
         Parameters at which the model is linearised.
     predicted : array
-        Both frames as predicted at ``m``, stacked.
+        All frames as predicted at ``m``, stacked.
     """
-    kinds = _variations(case, considered, RestGeometry(registered.model))
+    model, states = registered.model, []
+    if isinstance(model, FramesModel):
+        states = model.under(registered.own(m), model.states)
+        model = model.model
+    geometry = RestGeometry(model)
+    kinds = _variations(case, considered, geometry)
     if not kinds:
         return ()
-    change = RestGeometry(registered.model).change(
-        registered.mechanical(m), RestVariation.joined([variation for _, variation, _ in kinds])
-    )
+    joined = RestVariation.joined([variation for _, variation, _ in kinds])
+    change = geometry.change(registered.mechanical(m), joined, states)
     if isinstance(change, str):
         return change
     turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
-    change[1] = np.einsum("ij,njq->niq", turn, change[1])
+    change[1:] = np.einsum("ij,fnjq->fniq", turn, change[1:])
     jacobian = change.reshape(len(predicted), -1)
     linear = observation.of(lambda _: Prediction(predicted, jacobian))
     rows = predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian

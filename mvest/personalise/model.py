@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from mvest.cases.case import Role, ValveCase
+import numpy as np
+
+from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.anchors import Anchors
+from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
-from mvest.mechanics.valve_system import check_parameters
+from mvest.mechanics.valve_system import HeldState, check_parameters
 from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.valve.anatomy.band import Band
@@ -19,7 +22,56 @@ from mvest.valve.mesh.structured import structured_mesh
 from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
 from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
-__all__ = ["build_coarse", "build_model"]
+__all__ = ["build_coarse", "build_model", "frames_model", "held_state", "with_pressures"]
+
+
+def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> PersonaliseSettings:
+    """The settings with the pressures' errors among the unknowns, where a case has several frames.
+
+    With one closed frame the factor on the pressure stands for all of them.
+    """
+    if settings.pressures is None or not case.fitted:
+        return settings
+    frames = (case.frame(Role.CLOSED).name, *(frame.name for frame in case.fitted))
+    own = [u for u in settings.unknowns if not is_frame_pressure(u.name)]
+    return replace(settings, unknowns=(*own, *settings.pressures.unknowns(frames)))
+
+
+def frames_model(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel
+) -> FramesModel | None:
+    """All closed frames that are fitted, if they are several; nearest in pressure go first.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+        From `with_pressures`.
+    model : ClosureModel
+        Of the case.
+
+    Raises
+    ------
+    InputError
+        If errors of pressures are unknown and the factor on all of them is not.
+    """
+    if not case.fitted:
+        return None
+    closed = case.frame(Role.CLOSED)
+    ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
+    states = {frame.name: held_state(model, frame) for frame in ordered}
+    errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
+    return FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
+
+
+def held_state(model: ClosureModel, frame: Frame) -> HeldState:
+    """The loads of a further frame, on the contact valve's annulus."""
+    contact = model.contact_valve
+    annulus = frame.annulus
+    if contact is not model.valve:
+        phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
+        annulus = Band(model.valve).annulus_positions(phi, frame.annulus)
+    return HeldState(frame.pressure_mmHg, annulus, frame.papillary_tips)
 
 
 def build_model(
@@ -85,7 +137,9 @@ def build_coarse(
 
 
 def _mechanical(settings: PersonaliseSettings) -> list[Unknown]:
-    return [u for u in settings.unknowns if u.name not in REGISTRATION]
+    return [
+        u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
+    ]
 
 
 def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
+from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
 from mvest.errors import InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
@@ -15,7 +17,14 @@ from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.considered_geometry import ConsideredGeometry
 from mvest.problem.registration import REGISTRATION
 
-__all__ = ["CaseMesh", "PaperSettings", "PersonaliseSettings", "Treatment", "Unknown"]
+__all__ = [
+    "CaseMesh",
+    "PaperSettings",
+    "PersonaliseSettings",
+    "PressureErrors",
+    "Treatment",
+    "Unknown",
+]
 
 
 class Treatment(Enum):
@@ -62,7 +71,46 @@ class Unknown:
     @property
     def is_positive(self) -> bool:
         """Whether it is estimated by its logarithm."""
-        return self.name not in REGISTRATION and is_positive(self.name)
+        if self.name in REGISTRATION or is_frame_pressure(self.name):
+            return False
+        return is_positive(self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class PressureErrors:
+    """How well the stated pressures of several closed frames are known, besides a common factor.
+
+    With one closed frame they and the factor (``pressure_scale``) are one and the same, and the
+    factor's prior stands for all.
+
+    Attributes
+    ----------
+    offset_mmHg : float
+        Standard deviation of an offset that all of them have, as where the zero of a measurement
+        is not that of the left atrium; 0: none.
+    each_mmHg : float
+        Of the error that each has for itself, as where a frame falls on a steep part of the curve
+        that its pressure is read from; 0: none.
+    considered : bool
+        Whether they only widen the intervals, instead of being estimated.
+    """
+
+    offset_mmHg: float = 5.0
+    each_mmHg: float = 5.0
+    considered: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("offset_mmHg", "each_mmHg"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"pressures {name} = {value}, expected >= 0")
+
+    def unknowns(self, frames: Iterable[str]) -> tuple[Unknown, ...]:
+        """What is not known of the pressures of these frames."""
+        stds = {OFFSET: self.offset_mmHg}
+        stds |= {f"{ERROR}.{frame}": self.each_mmHg for frame in frames}
+        treatment = Treatment.CONSIDERED if self.considered else Treatment.ESTIMATED
+        return tuple(Unknown(name, 0.0, std, treatment) for name, std in stds.items() if std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +194,9 @@ class PersonaliseSettings:
     considered_geometry : ConsideredGeometry or None
         How well the geometry is known that the model is built from: what is not counts as an error
         of the observation. None takes it as it was seen.
+    pressures : PressureErrors or None
+        How well stated pressures are known where several closed frames are fitted; None: each of
+        them but for the common factor, if that is an unknown.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -160,6 +211,7 @@ class PersonaliseSettings:
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
     considered_geometry: ConsideredGeometry | None = None
+    pressures: PressureErrors | None = None
 
     def __post_init__(self) -> None:
         IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none

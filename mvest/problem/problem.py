@@ -37,7 +37,7 @@ class Observed(Protocol):
         ...
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
-        """What a model that predicts all of ``FRAMES``, stacked, predicts of this observation.
+        """What a model that predicts all frames, stacked, predicts of this observation.
 
         Its predictions have for ``aux`` the observed frames ``(f, n, 3)`` mm with all vertices.
         """
@@ -57,7 +57,7 @@ class Problem:
     parameters : tuple of str, (p,)
         Names of the unknowns, for example ``E_f.anterior``.
     model : ObservationModel
-        Predicts all of ``FRAMES``, stacked.
+        Predicts all frames, stacked.
     prior : Gaussian
         Of the parameters themselves.
     filter : Filter

@@ -1,9 +1,9 @@
-"""A rigid displacement between the frame of the model and that of what was seen.
+"""A rigid displacement between the axes of the model and those of what was seen.
 
 The model is bounded by the annulus and the papillary tips as they were tracked. If the leaflets of
 the later frames were seen displaced against these (by an error of tracking common to all their
-points), every modulus is fitted to that displacement. So it is a parameter: the predicted closed
-frame is turned and shifted before it is compared.
+points), every modulus is fitted to that displacement. So it is a parameter: predicted closed frames
+are turned and shifted before they are compared.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
@@ -35,6 +36,8 @@ def unit_of(name: str) -> str:
     """Unit of a parameter of a closure or of a displacement; empty for what has none."""
     if name in REGISTRATION:
         return "mm" if name.startswith("shift") else "degrees"
+    if is_frame_pressure(name):
+        return "mmHg"
     kind = KINDS.get(name.partition(".")[0])
     return "" if kind is None else kind.unit
 
@@ -76,12 +79,12 @@ def _cross(v: FloatArray) -> FloatArray:
 
 
 class RegisteredModel:
-    """A closure whose closed frame is displaced before it is seen.
+    """A closure of which every frame but the open one is displaced before it is seen.
 
     Parameters
     ----------
-    model : ClosureModel
-        Predicts the open and the closed frame.
+    model : ClosureModel or FramesModel
+        Predicts the open frame and closed ones.
     names : tuple of str, (p,)
         Those of the model, and some of ``REGISTRATION``, in any order.
 
@@ -91,7 +94,7 @@ class RegisteredModel:
         If a parameter of the model is missing or an unknown one is named.
     """
 
-    def __init__(self, model: ClosureModel, names: tuple[str, ...]) -> None:
+    def __init__(self, model: ClosureModel | FramesModel, names: tuple[str, ...]) -> None:
         own = [k for k, name in enumerate(names) if name not in REGISTRATION]
         if tuple(names[k] for k in own) != model.names:
             raise InputError(
@@ -101,8 +104,8 @@ class RegisteredModel:
         self.model = model
         self.names = names
         self._own = np.array(own, dtype=np.int64)
-        closed = model.valve.motion.annulus[-1]
-        self.centre: FloatArray = closed.mean(axis=0)
+        self._frames = 1 + (len(model.frames) if isinstance(model, FramesModel) else 1)
+        self.centre: FloatArray = model.valve.motion.annulus[-1].mean(axis=0)
 
     @property
     def closed(self) -> ClosedState | None:
@@ -115,6 +118,11 @@ class RegisteredModel:
 
     def mechanical(self, m: FloatArray) -> FloatArray:
         """The parameters of the closure out of all."""
+        own = self.own(m)
+        return self.model.of_closure(own) if isinstance(self.model, FramesModel) else own
+
+    def own(self, m: FloatArray) -> FloatArray:
+        """All parameters but those of the displacement."""
         return np.asarray(m, dtype=np.float64)[self._own]
 
     def seen(self, points: FloatArray, m: FloatArray) -> FloatArray:
@@ -123,27 +131,28 @@ class RegisteredModel:
 
     def __call__(self, m: FloatArray, /) -> Prediction:
         """Predict, as an ``ObservationModel`` does."""
-        prediction = self.model(self.mechanical(m))
+        prediction = self.model(self.own(m))
         if not prediction.converged:
             return prediction
-        half = len(prediction.y) // 2
-        closed = prediction.y[half:].reshape(-1, 3)
+        start = len(prediction.y) // self._frames
+        closed = prediction.y[start:].reshape(-1, 3)
         registration = registration_of(self.names, m)
         turn = Rotation.from_rotvec(registration[3:], degrees=True).as_matrix()
-        by_own = prediction.jacobian[half:].reshape(len(closed), 3, -1)
+        by_own = prediction.jacobian[start:].reshape(len(closed), 3, -1)
         jacobian = np.zeros((len(prediction.y), len(self.names)))
-        jacobian[:half, self._own] = prediction.jacobian[:half]
-        jacobian[half:, self._own] = np.einsum("ij,njp->nip", turn, by_own).reshape(half, -1)
+        jacobian[:start, self._own] = prediction.jacobian[:start]
+        turned = np.einsum("ij,njp->nip", turn, by_own)
+        jacobian[start:, self._own] = turned.reshape(closed.size, -1)
         turns = _turn_derivatives(np.deg2rad(registration[3:]))
         for k, name in enumerate(self.names):
             kind, _, axis = name.partition(".")
             i = "xyz".find(axis)
             if kind == "shift":
-                jacobian[half + i :: 3, k] = 1.0
+                jacobian[start + i :: 3, k] = 1.0
             elif kind == "turn":
                 by_radian = (closed - self.centre) @ turns[i].T
-                jacobian[half:, k] = np.deg2rad(by_radian).ravel()
+                jacobian[start:, k] = np.deg2rad(by_radian).ravel()
         seen = displace(closed, registration, self.centre)
         return replace(
-            prediction, y=np.concatenate([prediction.y[:half], seen.ravel()]), jacobian=jacobian
+            prediction, y=np.concatenate([prediction.y[:start], seen.ravel()]), jacobian=jacobian
         )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
+from mvest.closure.frames import ERROR, OFFSET, FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import MechanicsSettings
@@ -38,13 +39,16 @@ __all__ = [
 ]
 
 REFERENCE, CLOSED = "open", "closed"
-"""Names of the frames of a virtual patient that are shown; the others are held out."""
+"""Names of the first two frames of a virtual patient."""
+
+FITTED, HELD = "fitted", "held"
+"""What the names of further frames begin with, which are fitted or held out."""
 
 GUIDES = (("hex18", 24, 3), ("hex18", 36, 4))
 """Element, columns and rows of the coarser meshes on which a closure is followed."""
 
 FRAME_INTERVAL = 0.05
-"""s between the closed frame and those that are held out."""
+"""s between the closed frame and those that follow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +59,8 @@ class Deviations:
     ----------
     pressure, chord_rest_length, chord_stiffness : float
         Relative.
+    pressure_offset_mmHg, pressure_each_mmHg : float
+        Of the pressures of several fitted frames, see `mvest.closure.frames`; not drawn for one.
     shift_mm, turn_degrees : float
         Of each component.
     """
@@ -64,6 +70,8 @@ class Deviations:
     chord_stiffness: float = 0.20
     shift_mm: float = 1.0
     turn_degrees: float = 2.0
+    pressure_offset_mmHg: float = 5.0
+    pressure_each_mmHg: float = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,10 +121,12 @@ class PatientSimulation:
         Of further errors in these frames that are independent, and that the case does not state.
     rest_std_mm : float
         Error of the open shape from which an estimator takes its model; 0: it is seen exactly.
-    held_pressure_mmHg : tuple of float
-        In the frames that are held out, one after another.
-    held_relaxation : tuple of float
+    fitted_pressure_mmHg : tuple of float
+        In further frames that an estimator is to fit with the closed one.
+    fitted_relaxation : tuple of float
         Share of its way back to the open shape that the annulus has gone in each.
+    held_pressure_mmHg, held_relaxation : tuple of float
+        The same of the frames that are held out, one after another.
     held_tips : (float, float, float)
         mm, displacement of the papillary tips per unit of relaxation.
     world : World
@@ -135,30 +145,44 @@ class PatientSimulation:
     correlation_length_mm: float = 10.0
     rough_std_mm: float = 0.0
     rest_std_mm: float = 0.0
+    fitted_pressure_mmHg: tuple[float, ...] = ()
+    fitted_relaxation: tuple[float, ...] = ()
     held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
     held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
     held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
     world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:
-        if len(self.held_pressure_mmHg) != len(self.held_relaxation):
-            raise InputError(
-                f"held_pressure_mmHg has {len(self.held_pressure_mmHg)} frames, held_relaxation "
-                f"{len(self.held_relaxation)}; expected as many"
-            )
-        if len(set(self.held_pressure_mmHg)) != len(self.held_pressure_mmHg):
-            raise InputError(
-                f"held_pressure_mmHg = {self.held_pressure_mmHg}, expected different ones: they "
-                "name the frames"
-            )
+        for kind in ("fitted", "held"):
+            pressures = getattr(self, f"{kind}_pressure_mmHg")
+            relaxation = getattr(self, f"{kind}_relaxation")
+            if len(pressures) != len(relaxation):
+                raise InputError(
+                    f"{kind}_pressure_mmHg has {len(pressures)} frames, {kind}_relaxation "
+                    f"{len(relaxation)}; expected as many"
+                )
+            if len(set(pressures)) != len(pressures):
+                raise InputError(
+                    f"{kind}_pressure_mmHg = {pressures}, expected different ones: they name the "
+                    "frames"
+                )
+
+    @property
+    def fitted_frames(self) -> tuple[str, ...]:
+        """Names of the frames that are fitted, the closed one first."""
+        return (CLOSED, *(_name(FITTED, pressure) for pressure in self.fitted_pressure_mmHg))
 
 
 def draw_hidden(
-    moduli: Mapping[str, float], deviations: Deviations, rng: np.random.Generator
+    moduli: Mapping[str, float],
+    deviations: Deviations,
+    rng: np.random.Generator,
+    fitted: tuple[str, ...] = (CLOSED,),
 ) -> dict[str, float]:
     """True values of all parameters: the moduli as given, everything else drawn.
 
-    Factors are log-normal, so that they are positive; displacements are normal.
+    Factors are log-normal, so that they are positive; displacements are normal, and so are errors
+    of the pressures of several ``fitted`` frames.
     """
     factors = {
         "pressure_scale": deviations.pressure,
@@ -169,6 +193,10 @@ def draw_hidden(
     for name in REGISTRATION:
         std = deviations.shift_mm if name.startswith("shift") else deviations.turn_degrees
         drawn[name] = float(std * rng.standard_normal())
+    if len(fitted) > 1:
+        errors = {OFFSET: deviations.pressure_offset_mmHg}
+        errors |= {f"{ERROR}.{frame}": deviations.pressure_each_mmHg for frame in fitted}
+        drawn |= {name: float(std * rng.standard_normal()) for name, std in errors.items()}
     return {**{name: float(value) for name, value in moduli.items()}, **drawn}
 
 
@@ -244,7 +272,11 @@ def patient_model(
     names = tuple(
         name
         for name in values
-        if name not in REGISTRATION and not (exponential and name.startswith("E_f."))
+        if not (
+            name in REGISTRATION
+            or is_frame_pressure(name)
+            or (exponential and name.startswith("E_f."))
+        )
     )
     protocol = replace(mechanics.protocol, dt=mechanics.protocol.dt * simulation.dt_factor)
     guide = None
@@ -276,28 +308,41 @@ def close_patient(
 ) -> dict[str, FloatArray]:
     """Close a virtual patient: frame -> ``(n, 3)`` mm of the vertices that are seen.
 
-    The first frame is the closed one; those that are held out follow.
+    The first frame is the closed one; those that are fitted with it and held out follow.
 
     Raises
     ------
     GeometryError
-        If the valve does not close, or has no equilibrium in a frame that is held out.
+        If the valve does not close, or has no equilibrium in one of these.
     """
-    at = np.array([values[parameter] for parameter in model.names])
+    states = held_states(simulation, model.contact_valve)
+    errors = tuple(name for name in values if is_frame_pressure(name))
+    frames = FramesModel(
+        model,
+        CLOSED,
+        {frame: states[frame] for frame in simulation.fitted_frames[1:]},
+        model.settings.protocol.pressure_mmHg,
+        errors,
+    )
+    m = np.array([values[parameter] for parameter in frames.names])
+    at = frames.of_closure(m)
     prediction = model(at)
     if not prediction.converged:
         raise GeometryError(f"virtual patient {name} does not close: {prediction.reason}")
     true = {CLOSED: prediction.y.reshape(2, -1, 3)[1]}
-    held = held_states(simulation, model.contact_valve)
-    for frame, vertices in zip(held, model.held(at, tuple(held.values())), strict=True):
+    for frame, vertices in zip(states, model.held(at, frames.under(m, states)), strict=True):
         if vertices is None:
             raise GeometryError(f"virtual patient {name} has no equilibrium in the frame {frame}")
         true[frame] = vertices
     return true
 
 
+def _name(kind: str, pressure_mmHg: float) -> str:
+    return f"{kind}_{pressure_mmHg:g}_mmHg"
+
+
 def held_states(simulation: PatientSimulation, valve: Valve) -> dict[str, HeldState]:
-    """The frames that are held out, on the annulus of a valve.
+    """The frames after the closed one, fitted with it or held out, on the annulus of a valve.
 
     Tips that move while the valve closes return with the annulus.
     """
@@ -305,14 +350,16 @@ def held_states(simulation: PatientSimulation, valve: Valve) -> dict[str, HeldSt
     tips = valve.motion.papillary_tips[-1]
     back = valve.motion.papillary_tips[0] - tips
     return {
-        f"held_{pressure:g}_mmHg": HeldState(
+        _name(kind, pressure): HeldState(
             pressure,
             end + relaxation * (start - end),
             tips + relaxation * (np.array(simulation.held_tips) + back),
         )
-        for pressure, relaxation in zip(
-            simulation.held_pressure_mmHg, simulation.held_relaxation, strict=True
+        for kind, pressures, relaxations in (
+            (FITTED, simulation.fitted_pressure_mmHg, simulation.fitted_relaxation),
+            (HELD, simulation.held_pressure_mmHg, simulation.held_relaxation),
         )
+        for pressure, relaxation in zip(pressures, relaxations, strict=True)
     }
 
 
@@ -362,11 +409,12 @@ def _case(
 
     rest = HeldState(0.0, surface.vertices[seen.annulus], seen.papillary_tips + at_tips)
     end = mechanics.protocol.ramp
+    roles = {**dict.fromkeys(simulation.fitted_frames, Role.FITTED), CLOSED: Role.CLOSED}
     later = [
         frame(
             which,
             end + k * FRAME_INTERVAL,
-            Role.CLOSED if which == CLOSED else Role.HELD_OUT,
+            roles.get(which, Role.HELD_OUT),
             states[which],
             vertices,
         )

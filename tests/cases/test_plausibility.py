@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
+from mvest.cases.case import Role, Uncertainty
 from mvest.cases.folder import read_case
-from mvest.cases.plausibility import RANGES, doubts, require_plausible
+from mvest.cases.plausibility import RANGES, _plane, doubts, require_plausible
 from mvest.errors import InputError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "case"
@@ -147,3 +147,39 @@ def test_every_range_is_one_and_says_why():
     for name, one in RANGES.items():
         assert one.low < one.high, name
         assert one.why, name
+
+
+def with_second(case, pressure, rise):
+    """The case with a further frame, ``rise`` mm nearer to the atrium than the closed one."""
+    closed = case.frame(Role.CLOSED)
+    axis = _plane(case, closed).normal
+    inside = np.ones(len(closed.vertices))
+    inside[case.annulus] = 0.0
+    second = replace(
+        closed,
+        name="second",
+        role=Role.FITTED,
+        time=closed.time + 0.01,
+        pressure_mmHg=pressure,
+        vertices=closed.vertices - rise * inside[:, None] * axis,
+    )
+    return replace(case, frames=(*case.frames, second))
+
+
+def test_pressures_in_the_wrong_order_are_named(case):
+    exact = replace(case, uncertainty=Uncertainty(0.2, 0.0))
+    # Under 80 mmHg instead of 120 the leaflets lie farther from the atrium, not nearer to it.
+    assert doubts(with_second(exact, 80.0, -0.5)) == ()
+    (doubt,) = doubts(with_second(exact, 80.0, 0.5))
+    assert doubt.mistake
+    assert "are frames or pressures exchanged?" in doubt.text
+    assert doubts(with_second(exact, 160.0, 0.5)) == ()
+    assert doubts(with_second(exact, 160.0, -0.5)) != ()
+    # What such errors may do is no mistake.
+    smooth = replace(case, uncertainty=Uncertainty(1.0, 10.0))
+    assert doubts(with_second(smooth, 80.0, 0.5)) == ()
+
+
+def test_every_pressure_is_looked_at(case):
+    (doubt,) = [d for d in doubts(with_second(case, 10.7, -0.5)) if "kPa" in d.text]
+    assert doubt.field == "frames.second.pressure"

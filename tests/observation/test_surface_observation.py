@@ -630,7 +630,7 @@ def test_frames_are_chosen_by_name_out_of_any_number() -> None:
     frames = tuple(
         ObservedSurface(name, points, np.zeros(5, dtype=int)) for name in ("closed", "half")
     )
-    predict = SurfaceObservation(frames, surface, 1.0).of(last, names)
+    predict = SurfaceObservation(frames, surface, 1.0, predicted=names).of(last)
     m = np.array([0.0, 0.0, 0.4])
     prediction = predict(m)
     # Only the closed frame, here the first observed one, moves.
@@ -638,7 +638,7 @@ def test_frames_are_chosen_by_name_out_of_any_number() -> None:
     np.testing.assert_allclose(prediction.jacobian[:, 2], np.repeat([-1.0, 0.0], 5), atol=1e-14)
     np.testing.assert_array_equal(prediction.aux, [vertices + m, vertices])
     with pytest.raises(InputError, match="half"):
-        SurfaceObservation(frames, surface, 1.0).of(last, FRAMES)
+        SurfaceObservation(frames, surface, 1.0).of(last)
 
 
 def test_a_model_that_fails_or_does_not_fit_says_so() -> None:

@@ -23,6 +23,7 @@ from mvest.personalise import (
     personalise_case,
 )
 from mvest.personalise.chain import _Chain, _thinned
+from mvest.personalise.model import held_state
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.valve.anatomy.valve import LeafletSurface
 from tests.made_up_closure import (
@@ -492,9 +493,9 @@ def test_a_further_frame_s_annulus_is_laid_on_the_samples_of_contact():
     contact = chain.model.contact_valve
     assert len(contact.annulus) == 60
     # The closed frame held is the closed frame.
-    closed = chain.held_state(case.frame(Role.CLOSED))
+    closed = held_state(chain.model, case.frame(Role.CLOSED))
     np.testing.assert_allclose(closed.annulus, contact.motion.annulus[-1], atol=1e-9)
-    late = chain.held_state(case.held_out[0])
+    late = held_state(chain.model, case.held_out[0])
     np.testing.assert_allclose(late.annulus - closed.annulus, [[0.1, -0.2, 0.5]] * 60, atol=1e-9)
     assert late.pressure_mmHg == 70.0
 
@@ -526,7 +527,7 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
     found = twin(true)
     assert found.converged
     late = case.held_out[0]
-    held = _Chain(case, wanted, None, None).held_state(replace(late, pressure_mmHg=95.0))
+    held = held_state(model, replace(late, pressure_mmHg=95.0))
     seen = {
         "closed": found.y.reshape(2, -1, 3)[1],
         "late": twin.seen(model.held(true[:2], [held])[0], true),

@@ -8,6 +8,7 @@ import pytest
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
+from mvest.closure.frames import ERROR, OFFSET
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import NewtonSettings
@@ -150,6 +151,26 @@ def test_what_a_case_states_is_not_what_is_true(patient, values):
     assert patient.case.simulated
     assert patient.case.uncertainty.std_mm == 0.4
     assert patient.case.uncertainty.correlation_length_mm == 8.0
+
+
+def test_further_fitted_frames_are_closed_under_pressures_with_errors(patient, values):
+    errors = {OFFSET: 2.0, f"{ERROR}.closed": -1.0, f"{ERROR}.fitted_95_mmHg": 0.0}
+    further = {"fitted_pressure_mmHg": (95.0,), "fitted_relaxation": (0.1,)}
+    both = make(values | errors, replace(SMALL, held_pressure_mmHg=(97.0,), **further))
+    assert [(f.name, f.role) for f in both.case.frames[1:]] == [
+        ("closed", Role.CLOSED), ("fitted_95_mmHg", Role.FITTED), ("held_97_mmHg", Role.HELD_OUT),
+    ]  # fmt: skip
+    assert both.case.fitted == (both.case.frames[2],)
+    # The frame held out is under 97 + 2 mmHg; that of the other patient under 95 without an error,
+    # and the one fitted here under 95 + 2.
+    true, other = both.hidden.positions, patient.hidden.positions
+    rise = [true[name] - other["held_95_mmHg"] for name in ("fitted_95_mmHg", "held_97_mmHg")]
+    assert np.linalg.norm(rise[1]) == pytest.approx(2 * np.linalg.norm(rise[0]), rel=0.05)
+    np.testing.assert_allclose(true["closed"] - other["closed"], 0.5 * rise[0], atol=0.02)
+    drawn = draw_hidden(MODULI, Deviations(), np.random.default_rng(1), ("closed", "b"))
+    alone = draw_hidden(MODULI, Deviations(), np.random.default_rng(1))
+    assert alone.items() <= drawn.items()
+    assert set(drawn) - set(alone) == {OFFSET, f"{ERROR}.closed", f"{ERROR}.b"}
 
 
 def test_errors_have_the_size_and_the_reach_that_the_case_states(patient):

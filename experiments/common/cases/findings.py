@@ -16,6 +16,7 @@ from experiments.common.findings import vector
 from experiments.common.record import NOT_GATED, Mesh, Model, Outcome, has_passed
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
+from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation.information.consistency import moran, zero_mean
 from mvest.personalise.indications import indications_of
 from mvest.personalise.result import Personalised
@@ -48,6 +49,7 @@ T = TypeVar("T")
 
 LABELS = {
     "pressure_scale": "pressure (factor)",
+    OFFSET: "offset of pressures",
     "chord_stiffness": "chordal stiffness (factor)",
     "chord_rest_length": "chordal rest length (factor)",
 }
@@ -225,11 +227,12 @@ def fields_of(fit: Personalised) -> dict[str, Any]:
     else:
         reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
     if filtered is not None and filtered.prediction is not None:
-        sensitivity = filtered.prediction.jacobian
-        if sensitivity.size == surface.vertices.size * len(fit.names):
-            reals["sensitivity"] = sensitivity.reshape(-1, 3, len(fit.names))
+        sensitivity, own = filtered.prediction.jacobian, surface.vertices.size
+        # Of the closed frame, which comes last.
+        if len(sensitivity) == own * (1 + len(case.fitted)):
+            reals["sensitivity"] = sensitivity[-own:].reshape(-1, 3, len(fit.names))
             if filtered.innovation is not None:
-                arrays["innovation"] = filtered.innovation.standardised.reshape(-1, 3)
+                arrays["innovation"] = filtered.innovation.standardised[-own:].reshape(-1, 3)
     return (
         arrays
         | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
@@ -331,9 +334,9 @@ def _whiteness(fit: Personalised) -> tuple[WhitenessTest, ...]:
         return ()
     standardised = filtered.innovation.standardised
     tests = [("mean zero", zero_mean(standardised))]
-    if standardised.size == surface.vertices.size:
+    if standardised.size == surface.vertices.size * (1 + len(fit.case.fitted)):
         adjacency = _adjacency(len(surface.vertices), surface.triangles)
-        by_axis = standardised.reshape(-1, 3)
+        by_axis = standardised[-surface.vertices.size :].reshape(-1, 3)
         tests += [
             (f"neighbours alike, {axis}", moran(by_axis[:, k], adjacency))
             for k, axis in enumerate("xyz")
@@ -425,6 +428,8 @@ def _label(name: str) -> str:
     kind, _, part = name.partition(".")
     if kind == "E_f":
         return f"E_f {part}"
+    if kind == ERROR:
+        return f"pressure in frame {part}"
     if kind in ("shift", "turn"):
         return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
     return LABELS.get(name, name)

@@ -19,6 +19,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
 from mvest.personalise.chain import personalise_case
+from mvest.personalise.model import with_pressures
 from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import ImageStep
@@ -64,6 +65,7 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         personal.correspondence,
         personal.errors,
         considered_geometry=personal.considered_geometry,
+        pressures=personal.pressures,
     )
 
 
@@ -98,7 +100,7 @@ def run_case(
         print(f"derived: {sentence}", file=sys.stderr)
     for doubt in doubts(case):
         print(f"doubtful: {doubt}", file=sys.stderr)
-    settings = settings_of(values, personal)
+    settings = with_pressures(case, settings_of(values, personal))
     steps = len(settings.mechanics.protocol.steps())
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
     # As they are estimated: those of the closure first.

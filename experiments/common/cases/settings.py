@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from experiments.common.schema import InputFile, Reads, contents
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.considered_geometry import ConsideredGeometry
-from mvest.personalise.settings import CaseMesh, PaperSettings
+from mvest.personalise.settings import CaseMesh, PaperSettings, PressureErrors
 
 __all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
 
@@ -59,6 +59,7 @@ class PersonalSettings:
     correspondence: bool = True  # use corresponding vertices as such, where there are any
     errors: ErrorBeliefs | None = None  # learn the errors that the case states
     considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
+    pressures: PressureErrors | None = None  # of several closed frames, beside a common factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
