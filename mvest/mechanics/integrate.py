@@ -50,6 +50,13 @@ RUNAWAY = 1.5
 """Times its own size that a body may be displaced by the iterations of one step, which have run
 away beyond it: nothing comes of them, and detecting collisions there needs any amount of memory."""
 
+NEAR = 1e-3
+"""Relative residual from which the tangent no longer changes enough to be factorised again: solving
+with the last factor takes no more iterations of GMRES, or one more."""
+
+DERIVATIVES = 1e-11
+"""Relative error of derivatives, as far as the solver can tell."""
+
 SETTLINGS = 2
 """How often a body may be let rest before an equilibrium that is not found at once."""
 SETTLING_STEPS = 3
@@ -346,7 +353,8 @@ class _Stepper:
             nonlocal pairs
             pairs = self._candidates(x)  # the line search may have tried other places since
             blocks = system.tangent(x, loads, pairs, current.solid)
-            self.solver.factorize(system.matrix(blocks, mass_factor))
+            near = residuals[-1] <= NEAR and iteration > 0
+            self.solver.factorize(system.matrix(blocks, mass_factor), near=near)
 
         def linearize(at: FloatArray, stress: FloatArray | None) -> Evaluation:
             result = evaluate(at)
@@ -474,7 +482,7 @@ class _Stepper:
                 r -= self.damping.alpha * mass * old.dx[k] / dt
             r[system.held] = 0.0
             right[:, k] = -r.ravel()
-        dx = self.solver.solve(right).T.reshape(-1, system.n, 3)
+        dx = self.solver.solve(right, DERIVATIVES).T.reshape(-1, system.n, 3)
         new.dx = dx
         new.dv = np.zeros_like(dx) if static else (dx - old.dx) / dt
         new.d_strain = np.stack(

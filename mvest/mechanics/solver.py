@@ -50,8 +50,12 @@ class LinearSolver(Protocol):
     def name(self) -> str:
         """What solves, and what had to take its place."""
 
-    def factorize(self, matrix: BlockMatrix) -> None:
-        """Factorise ``matrix``; a symbolic analysis serves while the pattern is the same object."""
+    def factorize(self, matrix: BlockMatrix, *, near: bool = False) -> None:
+        """Factorise ``matrix``; a symbolic analysis serves while the pattern is the same object.
+
+        ``near``: it hardly differs from the last one, whose factor may serve where solutions are
+        improved by iteration.
+        """
 
     def solve(self, right: FloatArray, tolerance: float = EXACT) -> FloatArray:
         """Solution of the same shape ``(n,)`` or ``(n, p)`` as ``right``.
@@ -88,6 +92,9 @@ class PardisoSolver:
     The symbolic analysis, which works on blocks and costs a fraction of a factorisation, is
     repeated when other blocks come to matter.
 
+    The factor of one matrix serves for those near to it as well, as in the last steps of Newton's
+    method and for derivatives; it is renewed where GMRES does not get to the end with it.
+
     The condition of a thin shell's tangent is about 1e13 (its layer is squeezed 1e9 times less
     easily than it bends). A factor of single precision says nothing about it: where GMRES does not
     get to the end with one, this and all further matrices are factorised in double precision, and
@@ -106,7 +113,7 @@ class PardisoSolver:
         self._factor: _Blocks | None = None
         self._matrix: BlockMatrix | None = None
         self._whole: SuperLUSolver | None = None
-        self._single, self._all = True, False
+        self._single, self._all, self._stale = True, False, False
         self._substituted = 0
 
     @property
@@ -115,15 +122,19 @@ class PardisoSolver:
         times = f"{self._substituted} matri{'x' if self._substituted == 1 else 'ces'}"
         return f"pardiso, superlu for {times}" if self._substituted else "pardiso"
 
-    def factorize(self, matrix: BlockMatrix) -> None:
-        """Numeric factorisation; the symbolic one only when other blocks matter.
+    def factorize(self, matrix: BlockMatrix, *, near: bool = False) -> None:
+        """Numeric factorisation, of a ``near`` matrix none; the symbolic one when blocks change.
 
         The matrix is not copied: its entries are needed until the last ``solve``.
         """
-        if self._pattern is not matrix.pattern:
-            self._pattern, self._kept = matrix.pattern, None
         self._matrix = matrix
-        self._whole = None
+        self._stale = near and self._factor is not None and self._whole is None
+        if not self._stale:
+            self._whole = None
+            self._try_to_renew(matrix)
+
+    def _try_to_renew(self, matrix: BlockMatrix) -> None:
+        self._stale = False
         try:
             self._renew(matrix)
         except RuntimeError:
@@ -132,6 +143,8 @@ class PardisoSolver:
     def _renew(self, matrix: BlockMatrix) -> None:
         """Factorise, in the precision that is due."""
         pattern = matrix.pattern
+        if self._pattern is not pattern:
+            self._pattern, self._kept = pattern, None
         needed = _significant(pattern.pointer, pattern.columns, matrix.blocks)
         if self._all:
             needed[:] = True
@@ -188,12 +201,10 @@ class PardisoSolver:
             )
             if good.all():
                 return solution
-            if not self._all:
-                self._single, self._all = False, not self._single
-                try:
-                    self._renew(matrix)
-                except RuntimeError:
-                    self._substitute(matrix)
+            if self._stale or not self._all:
+                if not self._stale:
+                    self._single, self._all = False, not self._single
+                self._try_to_renew(matrix)
                 return self._solve(matrix, right, tolerance)
             self._substitute(matrix)
         assert self._whole is not None
@@ -361,7 +372,7 @@ class SuperLUSolver:
     def __init__(self) -> None:
         self._factor: SuperLU | None = None
 
-    def factorize(self, matrix: BlockMatrix) -> None:
+    def factorize(self, matrix: BlockMatrix, *, near: bool = False) -> None:
         """Symbolic and numeric factorisation."""
         self._factor = splu(
             matrix.tobsr().tocsc(),

@@ -62,6 +62,25 @@ def test_a_factor_is_renewed_with_the_matrix(tangent, name):
 
 
 @pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("change", [1e-3, 1e6])
+def test_a_matrix_that_is_called_near_is_solved_with_whether_it_is_or_not(tangent, name, change):
+    matrix, right = tangent
+    blocks, own = matrix.blocks.copy(), np.arange(3)
+    rows = np.arange(0, matrix.shape[0] // 3, 2)
+    blocks[matrix.pattern.pointer[rows, None], own, own] *= 1 + change
+    changed = matrix.pattern.matrix(blocks)
+    solver = linear_solver(name)
+    solver.factorize(matrix)
+    factors = []
+    if name == "pardiso":
+        renew = solver._pardiso.factorize
+        solver._pardiso.factorize = lambda: factors.append(renew())
+    solver.factorize(changed, near=True)
+    np.testing.assert_allclose(changed @ solver.solve(right), right, atol=1e-9)
+    assert len(factors) == (name == "pardiso" and change > 1)
+
+
+@pytest.mark.parametrize("name", available())
 def test_blocks_of_zeros_may_come_to_life(tangent, name):
     """Contact does this; an analysis that kept to the first blocks would miss the new ones."""
     matrix, right = tangent
