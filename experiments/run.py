@@ -8,7 +8,6 @@ stopped by Ctrl-C, SIGTERM or SIGHUP (nothing is left half-written).
 from __future__ import annotations
 
 import difflib
-import gc
 import os
 import sys
 from itertools import takewhile
@@ -40,10 +39,6 @@ REFUSED = (MvestError, HydraException, OmegaConfBaseException, OSError)
 TRACEBACKS = "HYDRA_FULL_ERROR"
 """Environment variable with which a user asks for tracebacks."""
 
-GARBAGE = 50_000
-"""Objects after which garbage is looked for: the many that imports make stay, and looking through
-them every 700, as Python does, takes a tenth of a run."""
-
 
 @interruptible
 def main() -> int:
@@ -57,8 +52,6 @@ def main() -> int:
         except (MvestError, FailedRunError) as error:
             ended.append(error)
 
-    usual = gc.get_threshold()
-    gc.set_threshold(GARBAGE)
     register()
     register_plugins()
     # Hydra then lets exceptions through, so that they can be told in one line here.
@@ -78,7 +71,6 @@ def main() -> int:
         print(f"error: {explain(error)}", file=sys.stderr)
         return 2
     finally:
-        gc.set_threshold(*usual)
         if not wants_tracebacks:
             del os.environ[TRACEBACKS]
     return 0
