@@ -2,28 +2,41 @@
 
 import numpy as np
 
-from mvest.reporting.case.drawing import ATRIUM, draw_valve, leaflet_colours, same_scale
+from mvest.reporting.case.drawing import (
+    ATRIUM,
+    draw_valve,
+    leaflet_colours,
+    paint_leak,
+    same_scale,
+)
 from mvest.reporting.case.fields import CaseFields
 
 __all__ = ["draw", "fields_of", "same_scale"]
 
 
-def fields_of(valve):
-    """What the drawing needs of a valve."""
+def fields_of(valve, reach=None):
+    """What the drawing needs of a valve, whose leaflets touch within ``reach`` mm."""
     surface, chords = valve.surface, valve.chordae
     gaps = np.linalg.norm(surface.vertices[:, None] - chords.insertion, axis=2)
     return CaseFields(
         surface.triangles, surface.region, surface.vertices, valve.annulus, valve.free_edge,
         ("closed",), np.array([True]), valve.motion.papillary_tips, chords.tip,
-        gaps.argmin(axis=0), {},
+        gaps.argmin(axis=0), {}, reach_mm=reach,
     )  # fmt: skip
 
 
-def draw(axes, valve, points=None, view=ATRIUM, values=None, cmap=None, norm=None, chords=False):
-    """Draw a shape ``(n, 3)`` of a valve, coloured by leaflet or by values at its vertices."""
-    fields, surface = fields_of(valve), valve.surface
+def draw(
+    axes, valve, points=None, view=ATRIUM, values=None, cmap=None, norm=None, chords=False,
+    reach=None,
+):  # fmt: skip
+    """Draw a shape ``(n, 3)`` of a valve, coloured by leaflet or by values at its vertices.
+
+    Of a closed one, whose leaflets touch within ``reach`` mm, the slit is grey and a gap is red.
+    """
+    fields, surface = fields_of(valve, reach), valve.surface
     points = surface.vertices if points is None else points
     colours = leaflet_colours(surface.region)
     if values is not None:
         colours = cmap(norm(values))[:, :3][surface.triangles]
     draw_valve(axes, fields, points, colours, view, 0, chords=chords, strength=0.3)
+    paint_leak(axes, fields, points, 0)

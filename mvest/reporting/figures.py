@@ -1,4 +1,4 @@
-"""Figures of a run: how the estimate came about, and the valve open and closed.
+"""Figures of a run: how the estimate came about, and what all figures have in common.
 
 Colours are those of Okabe and Ito, which people with colour-blindness can tell apart; every line is
 also distinguished by its marker. Nothing touches matplotlib's global state or needs a display.
@@ -10,20 +10,15 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.reading.npz import read_npz
 from mvest.reporting.markup import shown_text
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 __all__ = [
     "ATRIUM",
@@ -35,7 +30,6 @@ __all__ = [
     "View",
     "iterates_figure",
     "save_figure_with",
-    "valve_figure",
 ]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -47,7 +41,6 @@ curves show their moduli, light enough to be shaded."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
-UNSEEN = (0.75, 0.75, 0.75)
 DPI = 200
 
 LONGEST_TEXT, LONGEST_LINE = 160, 400
@@ -129,47 +122,6 @@ def iterates_figure(
     return figure
 
 
-def valve_figure(fields: Path) -> Figure:
-    """The fitted valve open and closed, from the atrium and from the side.
-
-    The closed valve is coloured by the distance of each vertex from where it was observed, and grey
-    where it was not seen (NaN).
-
-    Parameters
-    ----------
-    fields : Path
-        An ``.npz`` file with ``triangles (m, 3)``, ``region (m,)``, ``fitted (f, n, 3)`` mm with
-        the closed frame last, ``rest (n, 3)`` mm and ``distance (n,)`` mm.
-    """
-    try:
-        data = read_npz(fields, ("triangles", "region", "rest", "fitted", "distance"))
-        triangles, region = data["triangles"], data["region"]
-        rest, closed = data["rest"].astype(float), data["fitted"][-1].astype(float)
-        distance = data["distance"]
-    except (LookupError, ValueError) as error:
-        raise InputError(f"{fields}: no fields of a valve ({error})") from error
-    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
-    tissue = LEAFLET_COLOURS[region % len(LEAFLET_COLOURS)]
-    unit, factor = next(
-        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * np.nanmax(distance) >= 0.1),
-        ("nm", 1e6),
-    )
-    distance = factor * distance
-    norm = Normalize(0.0, max(float(np.nanmax(distance)), 1e-3))
-    shown = ScalarMappable(norm, DISTANCE_MAP)
-    mean = distance[triangles].mean(axis=1)
-    coloured = np.where(np.isnan(mean)[:, None], UNSEEN, shown.to_rgba(mean)[:, :3])
-    columns = (("open", rest, tissue), ("closed", closed, coloured))
-    panels = figure.subplots(2, 2, sharex="row", sharey="row")
-    for row, view in zip(panels, VIEWS, strict=True):
-        for axes, (frame, points, colours) in zip(row, columns, strict=True):
-            _draw(axes, points, triangles, colours, view)
-            axes.set_title(f"{frame}, {view.name}", fontsize=10)
-    bar = figure.colorbar(shown, ax=panels[:, 1], shrink=0.6, pad=0.02)
-    bar.set_label(f"distance, fitted to observed [{unit}]")
-    return figure
-
-
 def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     """Write ``base.png`` and ``base.pdf`` with one line in print and in their metadata.
 
@@ -218,29 +170,3 @@ def _printed(text: str) -> str:
         return text
     cut = text if len(text) <= LONGEST_TEXT else f"{text[:KEPT]}…"
     return re.sub(r"\\?\$", r"\\$", shown_text(cut).replace("\t", " "))
-
-
-def _draw(
-    axes: Any, points: FloatArray, triangles: IntArray, colours: FloatArray, view: View
-) -> None:
-    """Shaded triangles seen from one side, the farthest first, in axes in millimetres."""
-    corners = points[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    light = LightSource(azdeg=225, altdeg=55).direction
-    # Both sides of a leaflet are seen: what faces away is lit as if it faced the light.
-    shade = 0.6 + 0.4 * np.abs(normal @ light)
-    seen = corners @ view.axes
-    order = np.argsort(seen[..., 2].mean(axis=1), kind="stable")
-    outlines: Any = seen[order, :, :2]
-    faces = PolyCollection(
-        outlines,
-        facecolors=(colours * shade[:, None])[order],
-        edgecolors="none",
-        antialiased=False,
-        rasterized=True,
-    )
-    axes.add_collection(faces)
-    axes.autoscale_view()
-    axes.set_aspect("equal")
-    axes.set_axis_off()

@@ -20,6 +20,7 @@ from mvest.cases.plausibility import doubts, require_plausible
 from mvest.personalise.gate import gate_case, gate_lines
 from mvest.personalise.model import build_model
 from mvest.reporting.case.fields import turn_of
+from mvest.scenarios.measures import contact_reach
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,8 +47,9 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
     case = _read(values)
     settings = settings_of(values, build(PersonalSettings, values["personal"]))
     model = build_model(case, settings, meshes_of(values))
-    files = save_figure_with(folder / "case", _drawn(case), f"case {case.sha256[:12]}")
     surface = case.surface
+    figure = _drawn(case, contact_reach(model))
+    files = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
     lines = [
         f"{case.name}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles, "
         f"leaflets {', '.join(surface.region_names)}; {len(case.chordae)} chordae from "
@@ -81,7 +83,7 @@ def _read(values: Mapping[str, Any]) -> ValveCase:
     return case
 
 
-def _drawn(case: ValveCase) -> Figure:
+def _drawn(case: ValveCase, reach_mm: float) -> Figure:
     from mvest.reporting.case.frames import frame_fields, frames_figure
 
     surface, chordae = case.surface, case.chordae
@@ -99,6 +101,7 @@ def _drawn(case: ValveCase) -> Figure:
             (frame.papillary_tips - middle) @ axes,
             chordae.tip if at_rest else None,
             (chordae.insertion - middle) @ axes if at_rest else None,
+            reach_mm if frame.role is Role.CLOSED else None,
         )
     return frames_figure(shapes, case.surface.region_names)
 

@@ -22,7 +22,7 @@ from mvest.reporting.case.drawing import (
     draw_valve,
     leaflet_colours,
     name_leaflets,
-    paint_gap,
+    paint_leak,
     same_scale,
 )
 from mvest.reporting.case.fields import CaseFields
@@ -79,8 +79,8 @@ def closure_figure(record: Record[Findings], fields: Path) -> Figure:
     record : Record
     fields : Path
         An ``.npz`` file with ``frames (f, n, 3)`` mm, ``times (f,)`` s, ``triangles``, ``region``,
-        ``annulus`` in loop order, ``tips (f, t, 3)`` mm, ``chord_end (f, c, 3)`` mm and
-        ``chord_tip (c,)``.
+        ``annulus`` in loop order, ``tips (f, t, 3)`` mm, ``chord_end (f, c, 3)`` mm,
+        ``chord_tip (c,)`` and ``reach_mm``, the distance of faces within which leaflets touch.
 
     Raises
     ------
@@ -122,6 +122,7 @@ def _valve(arrays: Mapping[str, Any], shapes: FloatArray) -> CaseFields:
         chord_tip=arrays["chord_tip"].astype(np.int64),
         chord_insertion=shapes.shape[1] - count + np.arange(count),
         observed_points={},
+        reach_mm=float(arrays["reach_mm"]),
     )
 
 
@@ -144,7 +145,7 @@ def _draw_moments(
         at_rest = found.equilibrium and k == len(found.rows) - 1
         when = "at rest" if at_rest else f"{row.time:.2f} s"
         panels[0, column].set_title(f"{when}, {row.pressure_mmhg:.0f} mmHg", fontsize=10)
-    paint_gap(panels[0, -1], valve, shapes[moments[-1]], moments[-1])
+    paint_leak(panels[0, -1], valve, shapes[moments[-1]], moments[-1])
     name_leaflets(panels[0, 0], valve, ("anterior", "posterior"))
     shown = [shapes[k] for k in moments]
     same_scale(list(panels[0]), shown, ATRIUM)

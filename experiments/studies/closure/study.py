@@ -25,6 +25,7 @@ from experiments.studies.closure.settings import Settings
 from mvest.closure.measures import measure_steps
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.mechanics.valve_system import boundary_loading
+from mvest.scenarios.measures import contact_reach
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.embedding import embed
@@ -78,6 +79,8 @@ def _write_fields(
         tips=np.stack([loading(float(t)).tips for t in simulation.times]).astype(np.float32),
         chord_end=np.stack([cables.patches(x) for x in simulation.frames]).astype(np.float32),
         chord_tip=cables.tip,
+        # Of faces, which are half a thickness nearer than midsurfaces on both sides.
+        reach_mm=contact_reach(model) - valve.surface.thickness[valve.free_edge].mean(),
     )
 
 

@@ -238,7 +238,8 @@ def _figures(
     folder: Path, names: Mapping[str, str], record: Twin, fields: Path | None
 ) -> list[Path]:
     """How the estimate came about, and the fitted valve if its arrays are there."""
-    from mvest.reporting.figures import iterates_figure, save_figure_with, valve_figure
+    from mvest.reporting.case.figures import fitted_figure
+    from mvest.reporting.figures import iterates_figure, save_figure_with
 
     first, written = record.findings.first, []
     if first.iterates:
@@ -251,7 +252,7 @@ def _figures(
         )
         written += save_figure_with(folder / names.get(ITERATES, ITERATES), figure, record.line)
     if fields is not None:
-        figure = valve_figure(fields)
+        figure = fitted_figure(fields)
         written += save_figure_with(folder / names.get(VALVE, VALVE), figure, record.line)
     return written
 

@@ -43,7 +43,7 @@ from mvest.files import write_atomically
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.synthetic import simulate_observation
-from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
 
@@ -68,7 +68,7 @@ def run_twin(job: Job[Settings]) -> Outcome[Findings]:
     confirmed = _confirm(twin, result) if values["confirm"] else None
     computing = time.perf_counter() - began
     if values["figures"] and result.fitted is not None:
-        _write_fields(job.folder / "fields.npz", twin.valve.surface, result)
+        _write_fields(job.folder / "fields.npz", twin, result)
     repeats = tuple(seed_run(s, r) for s, r in zip(seeds, results, strict=True))
     first, paper = repeats[0], values["paper"]
     mesh = twin.model.mesh
@@ -174,17 +174,24 @@ def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements 
     return measured
 
 
-def _write_fields(path: Path, surface: LeafletSurface, result: StudyResult) -> None:
-    """The observed and the fitted frames as compressed arrays."""
+def _write_fields(path: Path, twin: Twin, result: StudyResult) -> None:
+    """The last observed and fitted frame as compressed arrays, as those of a case."""
     assert isinstance(result.observation, Observation)
     assert result.fitted is not None
+    valve, surface = twin.valve, twin.valve.surface
     arrays: dict[str, Any] = {
         "triangles": surface.triangles.astype(np.int32),
         "region": surface.region.astype(np.int8),
         "rest": surface.vertices.astype(np.float32),
-        "observed": result.observation.positions.astype(np.float32),
-        "fitted": result.fitted.astype(np.float32),
-        "distance": np.asarray(result.distance, dtype=np.float64),
+        "annulus": valve.annulus.astype(np.int32),
+        "free_edge": valve.free_edge.astype(np.int32),
+        "frames": np.array(result.observation.frames[-1:]),
+        "seen": np.array([True]),
+        "tips": np.stack([valve.papillary_tips] * 2).astype(np.float32),
+        "observed": result.observation.positions[-1:].astype(np.float32),
+        "fitted": result.fitted[-1:].astype(np.float32),
+        "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],
+        "reach_mm": contact_reach(twin.model),
     }
     write_atomically(path, partial(np.savez_compressed, **arrays))
 

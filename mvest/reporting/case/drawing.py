@@ -11,13 +11,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import PolyCollection
+from scipy.ndimage import distance_transform_edt
 
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
-from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane
+from mvest.valve.measure.gap import Gap, find_gap
 
 __all__ = [
     "ATRIUM",
@@ -29,6 +30,8 @@ __all__ = [
     "VIEWS",
     "View",
     "draw_valve",
+    "gap_corners",
+    "gap_of",
     "leaflet_colours",
     "name_leaflets",
     "paint_gap",
@@ -39,6 +42,9 @@ __all__ = [
 
 BLOOD = (0.70, 0.05, 0.10)
 """Of a gap."""
+UNDER_MM = 0.5
+"""By which a gap is drawn wider than it is, beneath leaflets: it was looked for along the normal of
+the annulus, and not along the line of sight."""
 TISSUE = (0.80, 0.76, 0.72)
 """Of the slit between midsurfaces that touch, a thickness apart."""
 UNSEEN = np.array([0.75, 0.75, 0.75])
@@ -187,6 +193,36 @@ def _dots(centres: FloatArray, view: View, colour: FloatArray) -> Part:
     )
 
 
+def gap_of(
+    fields: CaseFields, points: FloatArray, frame: int, reach_mm: float
+) -> tuple[Gap, AnnulusPlane]:
+    """The gap of a valve at ``points (n, 3)`` mm, and the plane of its annulus; see `paint_gap`."""
+    annulus = points[fields.annulus]
+    first = annulus[fields.vertex_region[fields.annulus] == 0]
+    plane = annulus_plane(annulus, fields.tips[frame].mean(axis=0), first.mean(axis=0))
+    return find_gap(points, fields.triangles, annulus, plane, reach_mm), plane
+
+
+def gap_corners(gap: Gap, plane: AnnulusPlane, coarser: int = 1) -> FloatArray:
+    """Where the corners ``(rows + 1, columns + 1, 3)`` mm of a gap's pixels lie.
+
+    They are as deep as the nearest leaflet. Of ``coarser`` pixels along both directions there is
+    one.
+    """
+    level = np.pad(gap.level[::coarser, ::coarser], ((0, 1), (0, 1)), mode="edge")
+    anterior, lateral = (
+        first + gap.resolution * coarser * (np.arange(count) - 0.5)
+        for first, count in zip((gap.anterior[0], gap.lateral[0]), level.shape, strict=True)
+    )
+    corners: FloatArray = (
+        plane.origin
+        + anterior[:, None, None] * plane.anterior
+        + lateral[:, None] * plane.lateral
+        + level[..., None] * plane.normal
+    )
+    return corners
+
+
 def paint_gap(
     axes: Any, fields: CaseFields, points: FloatArray, frame: int, reach_mm: float = 0.0
 ) -> None:
@@ -203,26 +239,15 @@ def paint_gap(
     reach_mm : float
         Distance of midsurfaces within which leaflets touch.
     """
-    annulus = points[fields.annulus]
-    first = annulus[fields.vertex_region[fields.annulus] == 0]
-    plane = annulus_plane(annulus, fields.tips[frame].mean(axis=0), first.mean(axis=0))
-    gap, origin = find_gap(points, fields.triangles, annulus, plane, reach_mm), plane.origin
-    image = np.zeros((*gap.open.shape, 4))
-    image[gap.slit] = (*TISSUE, 1.0)
-    image[gap.open] = (*BLOOD, 1.0)
-    half = 0.5 * gap.resolution
-    axes.imshow(
-        image,
-        extent=(
-            origin[0] + gap.lateral[0] - half,
-            origin[0] + gap.lateral[-1] + half,
-            origin[1] + gap.anterior[0] - half,
-            origin[1] + gap.anterior[-1] + half,
-        ),
-        origin="lower",
-        interpolation="nearest",
-        zorder=3,
-    )
+    gap, plane = gap_of(fields, points, frame, reach_mm)
+    between = gap.slit | gap.open
+    if not between.any():
+        return
+    away, nearest = distance_transform_edt(~between, return_indices=True)
+    image = np.where(gap.open[tuple(nearest)][..., None], (*BLOOD, 1.0), (*TISSUE, 1.0))
+    image[gap.resolution * away > UNDER_MM, 3] = 0.0
+    x, y, _ = np.moveaxis(gap_corners(gap, plane), 2, 0)
+    axes.pcolormesh(x, y, image, zorder=0, rasterized=True)
 
 
 def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) -> None:

@@ -149,6 +149,52 @@ def figure3_caption(fields: CaseFields) -> str:
     )
 
 
+def fitted_figure(fields: Path) -> Figure:
+    """A fitted valve open and closed, from the atrium and from the side.
+
+    The closed valve is coloured by the distance of each vertex from where it was observed, and grey
+    where it was not seen (NaN).
+
+    Parameters
+    ----------
+    fields : Path
+        As `mvest.reporting.case.fields.read_case_fields` reads it, with the fitted shape and its
+        distances.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or has none.
+    """
+    valve = read_case_fields(fields)
+    if valve.fitted is None or valve.distance_fitted is None:
+        raise InputError(f"{fields}: no fields of a fitted valve")
+    k = valve.closed
+    largest = float(np.nanmax(valve.distance_fitted[k]))
+    # In the unit in which the largest is a number above 0.1.
+    unit, factor = next(
+        ((name, f) for name, f in (("mm", 1.0), ("µm", 1e3)) if f * largest >= 0.1), ("nm", 1e6)
+    )
+    scale = ScalarMappable(Normalize(0.0, max(factor * largest, 1e-3)), DISTANCE_MAP)
+    coloured = corner_colours(scale, factor * valve.distance_fitted[k], valve.triangles)
+    shapes = (
+        ("open", valve.rest, leaflet_colours(valve.region), 0),
+        ("closed", valve.fitted[k], coloured, k + 1),
+    )
+    figure = Figure(figsize=(8.4, 6.4), layout="constrained")
+    panels = figure.subplots(2, 2)
+    for row, view in zip(panels, VIEWS, strict=True):
+        for axes, (name, points, colours, frame) in zip(row, shapes, strict=True):
+            draw_valve(axes, valve, points, colours, view, frame, strength=0.3)
+            if view is ATRIUM and frame:
+                paint_leak(axes, valve, points, frame)
+            axes.set_title(f"{name}, {view.name}", fontsize=10)
+        same_scale(row, [points for _, points, _, _ in shapes], view)
+    bar = figure.colorbar(scale, ax=panels[:, 1], shrink=0.6, pad=0.02)
+    bar.set_label(f"distance, fitted to observed [{unit}]")
+    return figure
+
+
 def distance_top(*distances: FloatArray) -> float:
     """Upper end in mm of a scale for several fields: a round number at or above nearly all."""
     top = max(float(np.nanquantile(values, HIGH_QUANTILE)) for values in distances)
@@ -180,6 +226,7 @@ def information_figure(fields: CaseFields, informations: Sequence[Information]) 
             axes = grid[row, column]
             colours = corner_colours(scale, field, fields.triangles)
             draw_valve(axes, fields, points, colours, ATRIUM, fields.closed + 1, strength=0.2)
+            paint_leak(axes, fields, points, fields.closed + 1)
             share = "" if row == 0 else f"{100 * information.kept:.0f} % remains"
             axes.set_title(information.label if row == 0 else share, fontsize=10)
         bar = figure.colorbar(scale, ax=grid[:, column], orientation="horizontal", shrink=0.85)
@@ -207,6 +254,7 @@ def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
         draw_valve(axes, fields, points, colours, view, fields.closed + 1, strength=0.2)
         same_scale([axes], [points], view)
         axes.set_title(f"seen {view.name}", fontsize=10, pad=14)
+    paint_leak(grid[0], fields, points, fields.closed + 1)
     name_leaflets(grid[0], fields, names)
     beyond = np.nanmax(size) > top
     bar = figure.colorbar(scale, ax=grid, shrink=0.85, extend="max" if beyond else "neither")

@@ -23,6 +23,7 @@ def frame_fields(
     tips: FloatArray,
     chord_tip: IntArray | None = None,
     chord_insertion: FloatArray | None = None,
+    reach_mm: float | None = None,
 ) -> CaseFields:
     """One frame by itself.
 
@@ -33,6 +34,8 @@ def frame_fields(
         Tells which border is the annulus.
     tips : (t, 3) mm
     chord_tip, chord_insertion : (c,), (c, 3) mm, optional
+    reach_mm : float, optional
+        Of a closed frame, the distance of midsurfaces within which leaflets touch.
     """
     loops = sorted(boundary_loops(triangles), key=lambda loop: _gap(vertices[loop], annulus))
     if chord_tip is None or chord_insertion is None:
@@ -52,6 +55,7 @@ def frame_fields(
         chord_tip,
         insertion,
         {},
+        reach_mm=reach_mm,
     )
 
 
@@ -69,4 +73,6 @@ def frames_figure(frames: Mapping[str, CaseFields], names: Sequence[str]) -> Fig
     names : sequence of str
         Of the leaflets.
     """
-    return views_figure([(title, one, one.rest, 0) for title, one in frames.items()], names)
+    # Of a closed one the leak is drawn, as of a frame that is not the reference.
+    shapes = [(t, one, one.rest, 0 if one.reach_mm is None else 1) for t, one in frames.items()]
+    return views_figure(shapes, names)

@@ -12,6 +12,7 @@ import plotly.graph_objects as go
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from mvest.reporting.case.drawing import BLOOD, TISSUE, gap_corners, gap_of
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.case.figures import distance_top
 from mvest.reporting.figures import LEAFLET_COLOURS
@@ -26,6 +27,9 @@ ELEMENT = "valve"
 LINE, CHORD, TIP = "#1a1a1a", "#8a817c", "#59382f"
 GHOST, UNOBSERVED = "#8c8c8c", "#bfbfbf"
 SCALE = "Viridis"
+
+COARSER = 2
+"""Of so many pixels of a gap along both directions one is shown."""
 
 PERSONALISED = "closed, personalised"
 
@@ -120,7 +124,7 @@ def _states(fields: CaseFields, names: Sequence[str]) -> list[tuple[str, list[An
     if known:
         top = distance_top(*(distance for _, _, distance in known))
         for label, shape, distance in known:
-            states.append((f"distance, {label}", _coloured(fields, shape, distance, top)))
+            states.append((f"distance, {label}", _coloured(fields, shape, k + 1, distance, top)))
     seen = None if points is None else _cloud(points)
     if fields.observed is not None:
         seen = _ghost(fields, fields.observed[k])
@@ -141,11 +145,11 @@ def _anatomy(fields: CaseFields, points: FloatArray, frame: int, names: Sequence
         # plotly reads tags in its texts.
         mesh.update(name=escape(shown_text(str(name))), hoverinfo="name")
         parts.append(mesh)
-    return parts + _lines(fields, points, frame)
+    return parts + _leak(fields, points, frame) + _lines(fields, points, frame)
 
 
 def _coloured(
-    fields: CaseFields, points: FloatArray, distance: FloatArray, top: float
+    fields: CaseFields, points: FloatArray, frame: int, distance: FloatArray, top: float
 ) -> list[Any]:
     known = np.isfinite(distance[fields.triangles]).all(axis=1)
     mesh = _mesh(points, fields.triangles[known], distance)
@@ -156,11 +160,33 @@ def _coloured(
         colorbar={"title": {"text": "mm"}, "len": 0.6, "thickness": 14},
         hovertemplate="%{intensity:.2f} mm<extra></extra>",
     )
-    parts = [mesh, *_rings(fields, points)]
+    parts = [mesh, *_leak(fields, points, frame), *_rings(fields, points)]
     if not known.all():
         unseen = _mesh(points, fields.triangles[~known])
         unseen.update(color=UNOBSERVED, hoverinfo="skip")
         parts.append(unseen)
+    return parts
+
+
+def _leak(fields: CaseFields, points: FloatArray, frame: int) -> list[Any]:
+    """The gap of a closed valve, and the slit where leaflets touch, as high as what is nearest."""
+    if not frame or fields.reach_mm is None or not np.isfinite(points).all():
+        return []
+    gap, plane = gap_of(fields, points, frame, fields.reach_mm)
+    corners = gap_corners(gap, plane, COARSER)
+    parts = []
+    for name, pixels, colour in (("touching", gap.slit, TISSUE), ("gap", gap.open, BLOOD)):
+        row, column = np.nonzero(pixels[::COARSER, ::COARSER])
+        a = row * corners.shape[1] + column
+        b = a + corners.shape[1]
+        triangles = np.concatenate(
+            [np.stack([a, a + 1, b], axis=1), np.stack([a + 1, b + 1, b], axis=1)]
+        )
+        if len(triangles):
+            mesh = _mesh(corners.reshape(-1, 3), triangles)
+            red, green, blue = (round(255 * channel) for channel in colour)
+            mesh.update(color=f"rgb({red},{green},{blue})", name=name, hoverinfo="name")
+            parts.append(mesh)
     return parts
 
 

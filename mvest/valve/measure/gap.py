@@ -32,6 +32,8 @@ class Gap:
         ``(rows, columns)`` pixels of the gap.
     slit : ndarray
         ``(rows, columns)`` other pixels within the annulus that no midsurface covers.
+    level : ndarray
+        ``(rows, columns)`` mm below the annulus plane of the nearest midsurface.
     resolution : float
         mm.
     """
@@ -40,6 +42,7 @@ class Gap:
     lateral: FloatArray
     open: BoolArray
     slit: BoolArray
+    level: FloatArray
     resolution: float
 
     @property
@@ -84,7 +87,8 @@ def find_gap(
         raise InputError(f"reach of the contact = {reach} mm, expected >= 0")
     image = project_leaflets(vertices, triangles, annulus, plane, resolution)
     uncovered = np.isinf(image.depth)
-    distance = resolution * np.asarray(distance_transform_edt(uncovered))
+    pixels, nearest = distance_transform_edt(uncovered, return_indices=True)
     inside = image.inside & uncovered
-    open_ = inside & (distance > 0.5 * reach)
-    return Gap(image.anterior, image.lateral, open_, inside & ~open_, resolution)
+    open_ = inside & (resolution * pixels > 0.5 * reach)
+    level = image.depth[tuple(nearest)]
+    return Gap(image.anterior, image.lateral, open_, inside & ~open_, level, resolution)

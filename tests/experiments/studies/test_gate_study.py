@@ -180,5 +180,7 @@ def test_the_closure_study_measures_every_step(run):
         assert fields["triangles"].shape == (2 * 128 + 2 * 32, 3)
         assert fields["region"].shape == fields["triangles"].shape[:1]
         assert np.isfinite(fields["frames"]).all()
+        # Contact acts within two thicknesses of midsurfaces, one of faces: that of the free edge.
+        assert 0.5 < fields["reach_mm"] < 1.32
     names = {path.name for path in folder.iterdir()}
     assert {"closure.csv", "closure.md", "closure.png", "closure.pdf"} <= names

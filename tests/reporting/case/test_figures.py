@@ -4,15 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import PolyCollection, QuadMesh
 
 from mvest.errors import InputError
-from mvest.reporting.case.drawing import ATRIUM, BLOOD, LINE_PIECES, SIDE, TISSUE, quartered
+from mvest.reporting.case.drawing import (
+    ATRIUM,
+    BLOOD,
+    LINE_PIECES,
+    SIDE,
+    TISSUE,
+    gap_of,
+    quartered,
+)
 from mvest.reporting.case.fields import read_case_fields
 from mvest.reporting.case.figures import (
     case_figure,
     distance_top,
     figure3_caption,
+    fitted_figure,
     information_figure,
     innovation_map_figure,
     shapes_figure,
@@ -26,7 +35,7 @@ from mvest.reporting.case.plots import (
     iterations_figure,
     narrow_figure,
 )
-from mvest.reporting.case.view import case_view, small
+from mvest.reporting.case.view import _states, case_view, small
 from tests.reporting.case.made_up_case import COLUMNS, NOISE_MM, made_up_case
 
 NAMES = ("anterior", "posterior")
@@ -50,6 +59,10 @@ def faces(axes):
     drawn = [c for c in axes.collections if isinstance(c, PolyCollection)]
     assert len(drawn) == 1
     return drawn[0]
+
+
+def leaks(axes):
+    return [drawn for drawn in axes.collections if isinstance(drawn, QuadMesh)]
 
 
 def pieces(axes, fields, lines: int = LINES) -> int:
@@ -183,6 +196,44 @@ def test_one_outlier_does_not_hide_the_rest() -> None:
     values[3] = 50.0
     # The 0.99 quantile is 0.9, eighteen steps of 0.05.
     assert distance_top(values) == pytest.approx(0.9)
+
+
+# --- a fitted valve -----------------------------------------------------------------------------
+
+
+def test_a_fitted_valve_is_drawn_open_and_closed_from_two_sides(case, fields) -> None:
+    figure = fitted_figure(case[1])
+    assert [axes.get_title() for axes in figure.axes[:4]] == [
+        "open, from the atrium", "closed, from the atrium", "open, from the side",
+        "closed, from the side",
+    ]  # fmt: skip
+    assert figure.axes[4].get_ylabel() == "distance, fitted to observed [mm]"
+    largest = np.nanmax(fields.distance_fitted[0])
+    assert figure.axes[4].get_ylim() == pytest.approx((0.0, largest))
+    touched = np.isnan(fields.distance_fitted[0])[fields.triangles].any(axis=1).sum()
+    colour = faces(figure.axes[1]).get_facecolor()
+    grey = (np.ptp(colour[:, :3], axis=1) < 1e-9) & (colour[:, 0] > 0.3)
+    assert 0 < grey.sum() == touched * pieces(figure.axes[1], fields)
+
+
+def test_distances_of_a_fitted_valve_have_a_unit_that_shows_them(case, tmp_path) -> None:
+    with np.load(case[1]) as stored:
+        arrays = dict(stored)
+    for factor, unit in ((1e-3, "µm"), (1e-6, "nm")):
+        np.savez(tmp_path / "small.npz", **arrays | {
+            "distance_fitted": factor * arrays["distance_fitted"]
+        })  # fmt: skip
+        label = fitted_figure(tmp_path / "small.npz").axes[4].get_ylabel()
+        assert label == f"distance, fitted to observed [{unit}]"
+
+
+def test_missing_or_damaged_fields_of_a_fitted_valve_are_named(case, tmp_path) -> None:
+    with pytest.raises(InputError, match=r"none\.npz"):
+        fitted_figure(tmp_path / "none.npz")
+    with np.load(case[1]) as stored:
+        np.savez(tmp_path / "half.npz", **{k: v for k, v in stored.items() if k != "fitted"})
+    with pytest.raises(InputError, match=r"half\.npz: no fields of a fitted valve"):
+        fitted_figure(tmp_path / "half.npz")
 
 
 # --- information --------------------------------------------------------------------------------
@@ -366,7 +417,7 @@ def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> N
 def test_a_slit_of_touching_leaflets_is_told_from_a_leak_where_their_reach_is_known(fields):
     def colours(reach):
         axes = case_figure(replace(fields, reach_mm=reach)).axes[0]
-        drawn = [image.get_array()[image.get_array()[..., 3] > 0] for image in axes.images]
+        drawn = [mesh.get_array()[mesh.get_array()[..., 3] > 0] for mesh in leaks(axes)]
         return [{tuple(np.round(colour[:3], 2)) for colour in one} for one in drawn]
 
     assert colours(None) == []
@@ -375,10 +426,47 @@ def test_a_slit_of_touching_leaflets_is_told_from_a_leak_where_their_reach_is_kn
     assert colours(200.0) == [{TISSUE}]
 
 
+def test_every_picture_of_a_closed_valve_shows_its_leak(case, fields, tmp_path):
+    valve = replace(fields, reach_mm=2.0)
+    found = information(fields, case[0].unknowns, NOISE_MM)
+    assert [len(leaks(axes)) for axes in information_figure(valve, found).axes[:4]] == [1] * 4
+    assert [len(leaks(axes)) for axes in innovation_map_figure(valve, NAMES).axes[:2]] == [1, 0]
+    with np.load(case[1]) as stored:
+        np.savez(tmp_path / "reach.npz", **stored, reach_mm=2.0)
+    images = [len(leaks(axes)) for axes in fitted_figure(tmp_path / "reach.npz").axes[:4]]
+    assert images == [0, 1, 0, 0]
+
+
+def test_the_scene_has_the_gap_where_it_is(fields):
+    def parts(reach):
+        seen = replace(fields, reach_mm=reach, observed=None)
+        states = dict(_states(seen, NAMES))
+        leaks = {part.name: part for part in states["closed, personalised"] if part.name in KINDS}
+        return states, leaks
+
+    KINDS = ("touching", "gap")
+    states, leaks = parts(200.0)
+    assert list(leaks) == ["touching"]
+    assert not [part for part in states["open"] if part.name in KINDS]
+    assert [part.name for part in states["distance, generic"]].count("touching") == 1
+    assert not parts(None)[1]
+    _, leaks = parts(0.0)
+    (gap,) = leaks.values()
+    assert gap.name == "gap"
+    # It lies within the annulus, between the free edges, and is as large as it is drawn flat.
+    points = fields.fitted[fields.closed]
+    flat, _ = gap_of(fields, points, fields.closed + 1, 0.0)
+    corner = np.stack([gap.x, gap.y, gap.z], axis=1)[np.stack([gap.i, gap.j, gap.k], axis=1)]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])[:, 2]
+    assert np.abs(across).sum() / 2 == pytest.approx(flat.area, rel=0.1)
+    assert points[:, 2].min() <= corner[..., 2].min()
+    assert corner[..., 2].max() <= points[:, 2].max()
+
+
 def test_of_an_open_or_half_seen_valve_no_leak_is_drawn(fields):
     whole = replace(fields, reach_mm=2.0, observed=fields.fitted)
     seen = fields.fitted.copy()
     seen[fields.closed, 0] = np.nan
     for valve, images in ((whole, [0, 1, 1]), (replace(whole, observed=seen), [0, 0, 1])):
         axes = shapes_figure(valve, NAMES).axes[:3]
-        assert [len(panel.images) for panel in axes] == images
+        assert [len(leaks(panel)) for panel in axes] == images
