@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 from mvest.cases.plausibility import doubts, free_orifice
+from mvest.estimation.check import ApproximationCheck
 from mvest.estimation.evidence import LENGTH
 from mvest.estimation.information.consistency import moran
 from mvest.estimation.transform import to_filter
@@ -16,7 +17,7 @@ from mvest.observation.vertices import Observation
 from mvest.personalise.geometry_errors import WeighedObservation
 from mvest.personalise.result import Personalised
 from mvest.problem.problem import Observed
-from mvest.problem.verdict import Held, Indications
+from mvest.problem.verdict import APPROXIMATION, Held, Indications
 from mvest.typing import FloatArray
 
 __all__ = ["indications_of"]
@@ -60,9 +61,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         estimated=True,
         ended=f"{result.reason} ({result.detail})" if result.detail else result.reason,
         converged=result.converged,
-        approximation=None
-        if filtered.check is None
-        else ("" if filtered.check.holds else filtered.check.sentence),
+        approximation=_approximation(filtered.check),
         nis=None if innovation is None else innovation.nis / innovation.size,
         nis_band=None
         if innovation is None
@@ -99,6 +98,13 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         mistakes=mistakes,
         doubts=doubtful,
     )
+
+
+def _approximation(check: ApproximationCheck | None) -> str | None:
+    """What is wrong with the filter's own approximation, if it is much; None if not checked."""
+    if check is None:
+        return None
+    return "" if check.value <= APPROXIMATION * check.limit else check.sentence
 
 
 def _alike(observation: Observed, standardised: FloatArray) -> float | None:

@@ -4,8 +4,9 @@ That a filter has converged says that its iterations have ended. Whether moduli 
 seen is another question, and none of its answers need the truth: what is left over by the fit has
 the size and the looks of noise, nothing known beforehand had to be stretched, the fitted valve does
 what the observed one does, and the data have moved what was believed. Each is a `Ground` with its
-number and its limit. Limits are choices, made before the results that they judge were looked at;
-the calibration against wrong worlds says what they are worth.
+number and its limit. Limits are choices. Some were set anew on simulated valves (seeds above 9000)
+in worlds that are not as the estimator assumes, where right estimates failed them; calibration on
+other valves says what they are worth.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 __all__ = [
+    "APPROXIMATION",
     "DOUBTFUL",
     "NONE",
     "ONE_STATE",
@@ -111,7 +113,8 @@ class Indications:
         Why the estimation ended.
     converged : bool
     approximation : str or None
-        What is wrong with the filter's approximation of the posterior; empty if nothing is.
+        What is wrong with the filter's approximation of the posterior; empty if nothing is, or
+        not enough (`APPROXIMATION`).
     nis : float or None
         Normalised innovation squared over the number of observations.
     nis_band : (float, float) or None
@@ -123,7 +126,8 @@ class Indications:
     alike : float or None
         Correlation of what is left over at neighbouring points, standardised (Moran's I).
     residual_mm, generic_mm : float or None
-        Mean distance of the closed frame from the fitted, and from the generic valve.
+        Mean distance of the closed frame from the fitted valve, and from the generic one laid
+        rigidly on it.
     held_out : tuple of Held
     orifice_mm2, observed_orifice_mm2 : float or None
         Free in the line of sight, of the fitted valve and of the observed one.
@@ -155,6 +159,10 @@ class Indications:
     mistakes: tuple[str, ...] = ()
 
 
+APPROXIMATION = 2.0
+"""Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
+The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
+failed by less."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
@@ -169,6 +177,10 @@ ALIKE = 0.25
 LEAK = (10.0, 30.0)
 """mm² by which the fitted valve may be more open than the observed one: about the error of such an
 area from a jagged edge, and what no closed valve has."""
+FARTHER = (1.25, 2.0)
+"""Distance of the closed frame, fitted over generic, that is doubtful, and that contradicts. The
+generic valve is laid on the frame freely, and takes smooth errors up with that; the fitted one is
+held by what is believed of its displacement. Where all is as assumed it comes out 1 % farther."""
 WORSE = 1.05
 """Distance of a held-out frame, fitted over generic, that counts as farther."""
 
@@ -305,12 +317,14 @@ def _informed(e: Indications) -> Seen:
 def _fits(e: Indications) -> Seen:
     if e.residual_mm is None or e.generic_mm is None:
         yield None
-    elif e.residual_mm > e.generic_mm:
+        return
+    doubtful, contradicted = FARTHER
+    if e.residual_mm > doubtful * e.generic_mm:
         yield Ground(
             "distance",
-            NONE,
+            NONE if e.residual_mm > contradicted * e.generic_mm else DOUBTFUL,
             f"the fitted valve is farther from the closed frame ({e.residual_mm:.2f} mm) than the "
-            f"generic one ({e.generic_mm:.2f} mm)",
+            f"generic one laid rigidly on it ({e.generic_mm:.2f} mm)",
             "errors or priors contradict the frame: check units, pressure and correspondence",
         )
 

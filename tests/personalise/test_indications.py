@@ -90,3 +90,9 @@ def test_a_posterior_that_is_not_the_filters_is_named(fit):
     seen = indications_of(replace(found, result=replace(found.result, filtered=bent)))
     assert seen.approximation == bent.check.sentence
     assert "approximation" in [ground.check for ground in judge(seen).grounds]
+    # The check is of the worst direction among all unknowns.
+    hardly = replace(bent, check=replace(bent.check, value=1.9 * bent.check.limit))
+    assert not hardly.check.holds
+    assert not indications_of(
+        replace(found, result=replace(found.result, filtered=hardly))
+    ).approximation
