@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import PolyCollection
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mvest.reporting.case.fields import CaseFields
 from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
@@ -45,6 +45,9 @@ BLOOD = (0.70, 0.05, 0.10)
 UNDER_MM = 0.5
 """By which a gap is drawn wider than it is, beneath leaflets: it was looked for along the normal of
 the annulus, and not along the line of sight."""
+SMOOTHED_MM = 0.6
+"""Over which the depth of a gap is smoothed, which leaps between two leaflets."""
+NEGLIGIBLE = 1e-6
 TISSUE = (0.80, 0.76, 0.72)
 """Of the slit between midsurfaces that touch, a thickness apart."""
 UNSEEN = np.array([0.75, 0.75, 0.75])
@@ -206,10 +209,15 @@ def gap_of(
 def gap_corners(gap: Gap, plane: AnnulusPlane, coarser: int = 1) -> FloatArray:
     """Where the corners ``(rows + 1, columns + 1, 3)`` mm of a gap's pixels lie.
 
-    They are as deep as the nearest leaflet. Of ``coarser`` pixels along both directions there is
-    one.
+    They are about as deep as the nearest leaflets. Of ``coarser`` pixels along both directions
+    there is one.
     """
-    level = np.pad(gap.level[::coarser, ::coarser], ((0, 1), (0, 1)), mode="edge")
+    between = (gap.slit | gap.open).astype(np.float64)
+    width = SMOOTHED_MM / gap.resolution
+    near = gaussian_filter(between, width)
+    smooth = gaussian_filter(np.where(between > 0, gap.level, 0.0), width)
+    level = np.divide(smooth, near, out=gap.level.copy(), where=near > NEGLIGIBLE)
+    level = np.pad(level[::coarser, ::coarser], ((0, 1), (0, 1)), mode="edge")
     anterior, lateral = (
         first + gap.resolution * coarser * (np.arange(count) - 0.5)
         for first, count in zip((gap.anterior[0], gap.lateral[0]), level.shape, strict=True)
