@@ -147,7 +147,7 @@ RANGES = (
     Range(0, 20, "", "multiples of the thickness", "reference_distance activation_distance"),
     Range(
         0, 100, "", "factors and exponents",
-        "errors.*_factor errors.deviation "
+        "errors.*_factor errors.deviation length_factor "
         "*_slack dt_factor finer_dt_factor growth factor scale *exponent stretch orifice "
         "pressure_scale* chord_stiffness* chord_rest_length chord_rest_length.* largest_r_hat",
     ),
@@ -156,7 +156,7 @@ RANGES = (
         0, 1, "", "shares of a whole",
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
-        "marginal_s *confidence dropout rate *_relaxation held_pressure",
+        "marginal_s *confidence dropout rate *_relaxation held_pressure missing outliers *_off",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
     Range(-1e12, 1e12, "", "variances, in the units of any model squared", "P0 Q R linear_P0"),

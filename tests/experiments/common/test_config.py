@@ -11,7 +11,12 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
 from tests.places import CONF
 
-HAVING = {"personal": "own_valve", "patient": "patients", "imaging": "imaging"}
+HAVING = {
+    "personal": "own_valve",
+    "patient": "patients",
+    "imaging": "imaging",
+    "world": "calibration",
+}
 """Group that only some studies have -> an experiment of one that has it."""
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

@@ -32,7 +32,12 @@ NAMED_BY_PARAMETERS = (
     "truth.fixed",
 )
 
-HAVING = {"personal": "own_valve", "patient": "patients", "imaging": "imaging"}
+HAVING = {
+    "personal": "own_valve",
+    "patient": "patients",
+    "imaging": "imaging",
+    "world": "calibration",
+}
 
 EXAMPLE = {"REGION": "anterior", "FAMILY or tipN": "tip1", "REGION.K": "anterior.3", "": ""}
 

@@ -11,10 +11,14 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments.common.build import build_filter, build_twin
+from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register
 from experiments.common.estimates import SeedRun
+from experiments.common.ranges import require_in_range
 from experiments.common.record import Outcome
+from experiments.common.schema import build
 from experiments.common.study import Job
+from experiments.common.virtual_patients import PatientSettings
 from experiments.runner.compose import expand, grids, make_plan
 from experiments.runner.limits import TIME_LIMIT_S
 from experiments.runner.plugins import register_plugins
@@ -210,3 +214,27 @@ def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override
     _, config = composed(*DEBUG, override)
     with pytest.raises(MvestError, match=words):
         build_twin(config)
+
+
+def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> None:
+    worlds = sorted(path.stem for path in (CONF / "world").glob("*.yaml"))
+    config = compose("config", ["sweep=calibration"], return_hydra_config=True)
+    planned = expand(grids(config), [], GlobalHydra.instance().config_loader())
+    assert len(planned) == 20 * len(worlds)
+    # A seed is a valve in all worlds, so that a sweep that is not at its end has all of them.
+    assert {line.partition("=")[2] for job in planned[: len(worlds)] for line in job
+            if line.startswith("world=")} == set(worlds)  # fmt: skip
+    assert all("seed=2001" in job for job in planned[: len(worlds)])
+    alone = composed("sweep=calibration", "world=reference")[1]
+    made, labels = [], set()
+    for world in worlds:
+        config = composed("sweep=calibration", f"world={world}")[1]
+        require_in_range(config)
+        made.append(build(PatientSettings, config["patient"]))
+        labels.add(made[-1].world)
+        # All else, and with it what the estimator is given, is the same.
+        assert {key: value for key, value in config.items() if key not in SECRET} == {
+            key: value for key, value in alone.items() if key not in SECRET
+        }
+    simulations = {repr(one.simulation) for one in made}
+    assert len(simulations) == len(labels) == len(worlds)
