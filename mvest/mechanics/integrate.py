@@ -353,7 +353,7 @@ class _Stepper:
             nonlocal pairs
             pairs = self._candidates(x)  # the line search may have tried other places since
             blocks = system.tangent(x, loads, pairs, current.solid)
-            near = residuals[-1] <= NEAR and iteration > 0
+            near = residuals[-1] <= NEAR and len(residuals) > 1
             self.solver.factorize(system.matrix(blocks, mass_factor), near=near)
 
         def linearize(at: FloatArray, stress: FloatArray | None) -> Evaluation:
