@@ -7,9 +7,10 @@ none, is not what was written under this name, whatever its reader thinks of it,
 from __future__ import annotations
 
 import hashlib
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -19,7 +20,7 @@ from filelock import FileLock
 from mvest.errors import cannot_write
 from mvest.files import remove_parts, sha256_of, write_atomically
 
-__all__ = ["Counts", "Entry", "get_or_make"]
+__all__ = ["Counts", "Entry", "get_or_make", "prune"]
 
 T = TypeVar("T")
 
@@ -61,16 +62,20 @@ class Entry(Generic[T]):
             return None
         try:
             # What cannot be made again has its digest within, which its reader checks.
-            if self.remake and self._digest(self.path) != self._seal.read_text(encoding="utf-8"):
+            if self.remake and self._digest(self.path) != self.seal.read_text(encoding="utf-8"):
                 return None
-            return self.read(self.path)
+            value = self.read(self.path)
         except DAMAGE:
             if not self.remake:
                 raise
             return None
+        with suppress(OSError):  # a store that may only be read
+            os.utime(self.path)
+        return value
 
     @property
-    def _seal(self) -> Path:
+    def seal(self) -> Path:
+        """The file of its digest."""
         return self.path.with_name(f".{self.path.name}.sha256")
 
     def _digest(self, path: Path) -> str:
@@ -91,7 +96,7 @@ class Entry(Generic[T]):
         """Keep a value; what others will read."""
         write_atomically(self.path, lambda part: write(part, value), sync=True)
         # Who dies in between leaves an entry without its digest, which is made again.
-        write_atomically(self._seal, self._digest(self.path))
+        write_atomically(self.seal, self._digest(self.path))
         return self.read(self.path)
 
     @contextmanager
@@ -162,3 +167,35 @@ def get_or_make(
     for k in set(range(len(entries))) - set(left):
         entries[k].counts.hits += 1
     return values
+
+
+def prune(folder: Path, pattern: str, largest_mb: float) -> None:
+    """Keep the files of a store within a size: those go first that were not used for longest.
+
+    Parameters
+    ----------
+    folder : Path
+    pattern : str
+        Of the names of the entries, which are files.
+    largest_mb : float
+        Size in 10^6 bytes up to which they stay; of a larger store nine tenths of it.
+    """
+    used = []
+    for path in folder.glob(pattern):
+        with suppress(OSError):  # gone meanwhile
+            about = path.stat()
+            used.append((about.st_mtime_ns, about.st_size, path))
+    size, removed = sum(bytes_ for _, bytes_, _ in used), 0
+    if size <= 1e6 * largest_mb:
+        return
+    for _, bytes_, path in sorted(used)[:-1]:
+        if size <= 0.9e6 * largest_mb:
+            break
+        for part in (path, Entry(path, Path.read_bytes).seal):
+            part.unlink(missing_ok=True)
+        size, removed = size - bytes_, removed + 1
+    print(
+        f"note: {folder} holds more than {largest_mb:g} MB; of its entries {removed} were removed "
+        "that were not used for longest",
+        file=sys.stderr,
+    )

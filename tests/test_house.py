@@ -29,6 +29,7 @@ LEAVES = (
     "mvest.units",
     "mvest.typing",
     "mvest.elements",
+    "mvest.source",
 )
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
@@ -50,6 +51,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.typing": LEAVES,
     "mvest.elements": LEAVES,
     "mvest.provenance": LEAVES,
+    "mvest.source": LEAVES,
     "mvest.valve": LEAVES,
     "mvest.mechanics": (*LEAVES, *VALUE_OBJECTS),
     "mvest.imaging": (*LEAVES, *VALUE_OBJECTS),

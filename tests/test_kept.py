@@ -1,6 +1,7 @@
 """Entries of a store: made once, whole, in the order in which they are asked for."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -12,7 +13,7 @@ from filelock import FileLock
 
 import mvest.kept
 from mvest.errors import InputError, MeshingError
-from mvest.kept import Counts, Entry, get_or_make
+from mvest.kept import Counts, Entry, get_or_make, prune
 
 
 def read(path: Path) -> str:
@@ -260,3 +261,22 @@ def test_an_unwritable_store_is_one_line_of_the_family(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"^cannot write .*entry: "):
         Entry(tmp_path / "file" / "entry", read).get_or_make(made("a"), write)
+
+
+def test_a_store_is_pruned_to_its_size_from_what_was_used_last(tmp_path, capsys):
+    entries = [Entry(tmp_path / f"kept-{k}", read) for k in range(6)]
+    for k, entry in enumerate(entries):
+        entry.get_or_make(made("a" * 998), write)  # 1000 bytes with its quotes
+        os.utime(entry.path, (k, k))
+    (tmp_path / "of-others").write_bytes(b"x" * 10_000)
+    prune(tmp_path, "kept-*", 0.006)
+    assert not capsys.readouterr().err
+    assert entries[1].found()  # is used now
+    prune(tmp_path, "kept-*", 0.0045)
+    assert [entry.path.exists() for entry in entries] == [False, True, False, True, True, True]
+    assert "of its entries 2 were removed" in capsys.readouterr().err
+    assert not entries[0].seal.exists()
+    assert entries[1].seal.exists()
+    assert (tmp_path / "of-others").exists()
+    prune(tmp_path, "kept-*", 1e-6)
+    assert entries[1].path.exists()  # the last one used stays, however large

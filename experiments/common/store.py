@@ -1,7 +1,7 @@
 """What studies make on their way and share: simulations, cycles, virtual patients, samples.
 
 All of it is kept by one rule. An entry is named by what it was made from and by the code that made
-it (:mod:`experiments.common.source`), is made once, and appears whole or not at all.
+it (:mod:`mvest.source`), is made once, and appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from experiments.common.source import source_key
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
 from mvest.kept import Counts, Entry
 from mvest.provenance import config_hash
 from mvest.reading.npz import read_npz
+from mvest.source import source_key
 from mvest.typing import FloatArray
 
 __all__ = ["Store", "StoredModel", "key_of"]

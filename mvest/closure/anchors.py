@@ -14,21 +14,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.kept import Entry
+from mvest.kept import Entry, prune
 from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
 __all__ = ["NOT_FOUND", "Anchors", "Kept", "content_digest"]
 
-CODE = ("closure/**/*.py", "elements.py", "mechanics/**/*.py", "valve/**/*.py")
-"""What of the library decides a closed state."""
 DIGITS = 32
 """Of a name."""
 
@@ -64,14 +61,20 @@ class Anchors:
     spacing : float
         Of the lattice, in the logarithm of each parameter (of a field's coefficient: times its
         standard deviation of log E_f).
+    largest_mb : float
+        Size of the folder, 10^6 bytes, beyond which the states that were not used for longest are
+        removed. One takes 0.2 MB on the default mesh with two parameters.
     """
 
     folder: Path
     spacing: float = 0.4
+    largest_mb: float = 1000.0
 
     def __post_init__(self) -> None:
         if not self.spacing > 0:
             raise InputError(f"spacing of the anchors = {self.spacing}, expected > 0")
+        if not self.largest_mb > 0:
+            raise InputError(f"largest_mb of the anchors = {self.largest_mb}, expected > 0")
 
     def get_or_make(self, key: str, place: FloatArray, make: Callable[[], Kept]) -> Kept:
         """The state that is kept at a point of the lattice, or is made and kept now.
@@ -79,16 +82,21 @@ class Anchors:
         Parameters
         ----------
         key : str
-            Of all that decides the state but its parameters, by :func:`content_digest`.
+            Of all that decides the state but its parameters, by :func:`content_digest`, and of the
+            code, by :func:`mvest.source.source_key`.
         place : (p,)
             Whole numbers, the point over the spacing.
         make : callable
             Of several processes that need the state, one makes it and the others wait.
         """
         at = ",".join(f"{k:.0f}" for k in place)
-        about = f"{key} {self.spacing!r} {at} {_code()}"
+        about = f"{key} {self.spacing!r} {at}"
         name = hashlib.sha256(about.encode()).hexdigest()[:DIGITS]
-        return Entry(self.folder / f"closed-{name}.npz", _read).get_or_make(make, _write)
+        entry = Entry(self.folder / f"closed-{name}.npz", _read)
+        kept = entry.get_or_make(make, _write)
+        if entry.counts.misses:
+            prune(self.folder, "closed-*.npz", self.largest_mb)
+        return kept
 
 
 def content_digest(*values: Any) -> str:
@@ -126,17 +134,6 @@ def _feed(digest: hashlib._Hash, value: Any) -> None:
         digest.update(f"{plain!r};".encode())
     else:
         raise InputError(f"no digest of a {type(value).__name__}")
-
-
-@cache
-def _code() -> str:
-    """Digest of the modules that decide a closed state."""
-    root = Path(__file__).parents[1]
-    files = [file for part in CODE for file in sorted(root.glob(part))]
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(f"{file.relative_to(root).as_posix()} ".encode() + file.read_bytes())
-    return digest.hexdigest()
 
 
 def _write(path: Path, kept: Kept) -> None:

@@ -30,6 +30,7 @@ from mvest.mechanics.valve_system import (
     held_loading,
     retune,
 )
+from mvest.source import source_key
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.embedding import Embedding, embed
@@ -254,7 +255,7 @@ class ClosureModel:
         guide = "" if self.guide is None else self.guide._digest()
         return content_digest(
             self.valve, self.contact_valve, self.mesh, self.settings, self.names, self.fixed,
-            self.ties, self.repeat, guide, self.perturbation,
+            self.ties, self.repeat, guide, self.perturbation, source_key(ClosureModel),
         )  # fmt: skip
 
     def close(

@@ -1,13 +1,13 @@
 """Kept closed states: the same digits with and without them, in any order, and after damage."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import mvest
-from mvest.closure import anchors
+import mvest.source
 from mvest.closure.anchors import Anchors, Kept, content_digest
 from mvest.closure.batch import predict_many
 from mvest.closure.coordinates import Coordinates
@@ -15,6 +15,7 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.settings import ModulusField
 from mvest.mechanics.steps import StepReason
+from mvest.source import SOURCES, Sources
 from tests.closure.test_model import AT, CLOSING, GENTLE, MODULI, OPEN, TINY, model_of
 
 SPACING = 0.4
@@ -26,6 +27,17 @@ def gentle(folder, **changes):
     """A valve that closes in no time, where its closed states are kept."""
     model = replace(model_of(GENTLE, **TINY), continuation=True, **changes)
     return replace(model, anchors=Anchors(folder, SPACING))
+
+
+def edited(folder):
+    """The code of mvest with another number in the time integration."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.npz", "*.nbi", "*.nbc")
+    shutil.copytree(Path(mvest.__file__).parent, folder, ignore=ignored)
+    place = folder / "mechanics" / "integrate.py"
+    text = place.read_text()
+    assert "RUNAWAY = 1.5" in text
+    place.write_text(text.replace("RUNAWAY = 1.5", "RUNAWAY = 2.5"))
+    return folder
 
 
 def files(folder):
@@ -131,7 +143,7 @@ def test_a_kept_state_belongs_to_all_that_decides_it(tmp_path, monkeypatch):
     for k, model in enumerate(changed):
         model.close(NEAR)
         assert len(files(tmp_path)) == k + 1
-    monkeypatch.setattr(anchors, "_code", lambda: "other code")
+    monkeypatch.setattr(mvest.source, "SOURCES", Sources(mvest=edited(tmp_path / "code")))
     gentle(tmp_path).close(NEAR)
     assert len(files(tmp_path)) == len(changed) + 1
     # What only decides where a closure begins is none of it.
@@ -235,9 +247,33 @@ def test_processes_share_anchors(tmp_path):
         np.testing.assert_allclose(prediction.y, plain.y, rtol=0, atol=1e-9)
 
 
-def test_a_spacing_is_positive(tmp_path):
+def test_a_spacing_and_a_size_are_positive(tmp_path):
     with pytest.raises(InputError, match=r"spacing of the anchors = 0\.0"):
         Anchors(tmp_path, 0.0)
+    with pytest.raises(InputError, match=r"largest_mb of the anchors = 0\.0"):
+        Anchors(tmp_path, largest_mb=0.0)
+
+
+def test_the_states_that_were_not_used_for_longest_make_room(tmp_path, anchored, capsys):
+    def close(m):
+        model = gentle(tmp_path)
+        replace(model, anchors=replace(model.anchors, largest_mb=room)).close(m)
+
+    room = 1.0
+    close(NEAR)
+    size = files(tmp_path)[0].stat().st_size
+    room = 2.5e-6 * size
+    close(OTHER)
+    close(NEAR)  # used again: now the other one goes first
+    assert not capsys.readouterr().err
+    close(2.0 * NEAR)
+    assert len(files(tmp_path)) == 2
+    assert f"{tmp_path} holds more than" in capsys.readouterr().err
+    anchored.clear()
+    close(NEAR)
+    assert not anchored
+    close(OTHER)
+    assert len(anchored) == 1
 
 
 def test_a_digest_tells_values_apart_and_nothing_else():
@@ -280,8 +316,7 @@ def test_coordinates_there_and_back():
 
 
 def test_the_code_that_closes_valves_is_part_of_what_decides_them():
-    root = Path(mvest.__file__).parent
-    files = {file for part in anchors.CODE for file in root.glob(part)}
-    named = ("elements.py", "closure/model.py", "mechanics/law/biot.py", "valve/mesh/embedding.py")
-    assert all(root / name in files for name in named)
-    assert root / "reporting/style.py" not in files
+    parts = SOURCES.parts(("mvest.closure.model", "ClosureModel"))
+    reached = ("elements", "closure.coordinates", "mechanics.law.biot", "valve.mesh.embedding")
+    assert parts.keys() >= {f"mvest.{name}" for name in reached}
+    assert "mvest.reporting.style" not in parts

@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import experiments.common.source
+import experiments
 import mvest.closure.model
 import mvest.files
+import mvest.source
 from experiments.common.build import MADE_BY
-from experiments.common.source import Sources
 from experiments.common.store import Store, StoredModel, key_of
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.kept import Counts
+from mvest.source import Sources
 
 
 class Model:
@@ -200,7 +201,7 @@ def truth(tmp_path, monkeypatch):
     def is_simulated() -> bool:
         model = Model()
         with monkeypatch.context() as patched:
-            patched.setattr(experiments.common.source, "SOURCES", Sources(**roots))
+            patched.setattr(mvest.source, "SOURCES", Sources(**roots))
             Store(tmp_path / "outputs").model("truth", model, VALUES, MADE_BY)(AT)
         return model.calls == 1
 

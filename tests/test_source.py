@@ -8,13 +8,13 @@ import pytest
 import experiments
 import mvest
 from experiments.common import build
-from experiments.common.source import SOURCES, Sources, source_key
 from experiments.studies.imaged_patient import study as imaged_patient
 from experiments.studies.imaging import store as imaging_store
 from experiments.studies.imaging import trials
 from experiments.studies.patient import study as patient
 from mvest.errors import InputError
 from mvest.simulation.motion.population import draw_population
+from mvest.source import SOURCES, Sources, source_key
 
 FILES = {
     "mvest/__init__.py": "import lazy_loader\n__getattr__, _, __all__ = lazy_loader.attach()\n",

@@ -1,11 +1,12 @@
 """Which code made something: a key of what it does, wherever it lies and whatever it is called.
 
-The imports of the code are followed through `mvest` and `experiments`, those within functions
-included. What is reached counts by the content of its syntax tree: comments, docstrings, layout,
-``__all__`` and the places of modules do not count. So a key outlives that a module is moved or
-renamed, with the import lines that name it, and ends with every change of code that is reached.
+The imports of the code are followed through this package and those that join it by
+:meth:`Sources.include`, as `experiments` does, those within functions included. What is reached
+counts by the content of its syntax tree: comments, docstrings, layout, ``__all__`` and the places
+of modules do not count. So a key outlives that a module is moved or renamed, with the import lines
+that name it, and ends with every change of code that is reached.
 
-* Of a module of `mvest` all counts. Of one of `experiments`, where building, estimating and
+* Of a module of `mvest` all counts. Of one of another package, where building, estimating and
   reporting meet, and of the ``__init__`` of a package, the definitions that are reached count and
   the statements that define nothing.
 * ``from package import name`` leads to the module that defines the name: past an ``__init__`` that
@@ -27,14 +28,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import experiments
-import mvest
 from mvest.errors import InputError
 
-__all__ = ["Sources", "source_key"]
+__all__ = ["SOURCES", "Sources", "source_key"]
 
-SLICED = "experiments"
-"""Package of whose modules only the definitions count that are reached."""
+WHOLE = "mvest"
+"""Package of whose modules all counts that they hold."""
 
 
 class _Import(NamedTuple):
@@ -60,7 +59,7 @@ class _Module:
     def __init__(self, name: str, path: Path, sources: Sources) -> None:
         self.name, self.path, self._sources = name, path, sources
         self.is_package = path.name == "__init__.py"
-        self.is_sliced = self.is_package or name.partition(".")[0] == SLICED
+        self.is_sliced = self.is_package or name.partition(".")[0] != WHOLE
         self.statements: list[_Statement] = []
         self.imports: list[_Import] = []
         stub, for_types = path.with_suffix(".pyi"), list[_Import]()
@@ -153,7 +152,13 @@ class Sources:
     """
 
     def __init__(self, **folders: Path) -> None:
-        self._folders = folders
+        self._folders: dict[str, Path] = {}
+        self.include(**folders)
+
+    def include(self, **folders: Path) -> None:
+        """Follow imports into further packages."""
+        self._folders |= folders
+        # What was read before might name modules of theirs.
         self._paths: dict[str, Path | None] = {}
         self._modules: dict[str, _Module] = {}
         self._keys: dict[tuple[tuple[str, str | None], ...], str] = {}
@@ -263,7 +268,7 @@ def _binds(node: ast.stmt) -> frozenset[str]:
     return frozenset(plain if len(plain) == len(names) else ())
 
 
-SOURCES = Sources(mvest=Path(mvest.__file__).parent, experiments=Path(experiments.__file__).parent)
+SOURCES = Sources(mvest=Path(__file__).parent)
 
 
 def source_key(*made_by: Any) -> str:
