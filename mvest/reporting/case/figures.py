@@ -66,8 +66,10 @@ def views_figure(
         reach = []
         for axes, (title, fields, points, frame) in zip(grid[row], shapes, strict=True):
             colours = leaflet_colours(fields.region)
-            draw_valve(axes, fields, points, colours, view, frame, chords=True)
-            if row == 0 and frame:
+            shut = view is ATRIUM and frame > 0
+            # Seen from the atrium, a closed valve hides them.
+            draw_valve(axes, fields, points, colours, view, frame, chords=not shut)
+            if shut:
                 paint_leak(axes, fields, points, frame)
             reach += [points, fields.tips[frame]] if view is SIDE else [points]
             if row == 0:

@@ -322,7 +322,9 @@ def test_a_valve_with_holes_is_drawn_without_them(fields) -> None:
     counts = [len(faces(axes).get_paths()) for axes in figure.axes[:3]]
     lost = np.isnan(fields.observed[0]).any(axis=1)[fields.triangles].any(axis=1).sum()
     assert lost > 0
-    assert counts[0] == counts[2] > counts[1] + lost
+    # A closed valve hides its chordae and the tips, which are discs of 24 triangles.
+    chords = len(fields.chord_tip) * LINE_PIECES + 24 * fields.tips.shape[1]
+    assert counts[0] - chords == counts[2] > counts[1] + lost
 
 
 def test_triangles_are_split_where_leaflets_are_close() -> None:
