@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
+from mvest.problem.verdict import DOUBTFUL, NONE, ONE_STATE, TRUSTWORTHY, Ground, Verdict
 from mvest.reporting.case.words import answer, badges, verdict_words
 from tests.reporting.case.made_up_case import made_up_case
 
@@ -38,4 +38,8 @@ def test_what_is_trusted_is_answered_by_its_numbers(case):
     assert answer(judged) == answer(case)
     assert "TRUSTWORTHY" in badges(judged)
     assert verdict_words(judged)[0] == "Trustworthy: all 2 checks were passed."
+    # Of one's own valve the gate is not asked, and how to ask it is said.
+    unasked = replace(judged, verdict=Verdict(TRUSTWORTHY, (), ("distance",), (ONE_STATE,)))
+    assert verdict_words(unasked)[0] == "Trustworthy: all 1 checks were passed."
+    assert "check=true gate=true asks it" in verdict_words(unasked)[2][0]
     assert verdict_words(case) == ("The run did not judge its estimate.", [], [])
