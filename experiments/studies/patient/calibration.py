@@ -205,15 +205,15 @@ def _judged(worlds: Worlds) -> list[str]:
             low.append(f"{name} ({inside} of {n})")
         if n and inside > 0.98 * n:
             high.append(f"{name} ({inside} of {n})")
-        believed = sum(_is_wrong(row) for row in _all_moduli(trusted))
-        if n and believed > 0.05 * n:
-            wrong.append(f"{name} ({believed} of {n})")
+        believed, off = (sum(map(_is_wrong, _all_moduli(some))) for some in (trusted, runs))
+        if believed > 0.05 * off:
+            wrong.append(f"{name} ({believed} of {off})")
     return [
         f"{what}: {'; '.join(names) or 'none'}."
         for what, names in (
             ("Worlds in which less than 90 % of the intervals called trustworthy hold", low),
             ("In which more than 98 % do, so that they are wider than need be", high),
-            (f"In which more than 5 % of them are off by more than {WRONG:g} SD", wrong),
+            (f"In which more than 5 % of those more than {WRONG:g} SD off are trustworthy", wrong),
         )
     ]
 
