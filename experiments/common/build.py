@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.extrapolated import Extrapolated
 from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
 from mvest.closure.anchors import Anchors
@@ -124,8 +125,9 @@ class Twin:
         The estimator's.
     truth_model : ClosureModel
         The observation's; an object of its own.
-    source : StoredModel
-        ``truth_model`` behind its store on disk.
+    source : StoredModel or Extrapolated
+        ``truth_model`` behind its store on disk, carried on to cells of no size where that is asked
+        for.
     truth_values : (p,)
     valve : Valve
         The observed surface.
@@ -138,7 +140,7 @@ class Twin:
     problem: Problem
     model: ClosureModel
     truth_model: ClosureModel
-    source: StoredModel
+    source: StoredModel | Extrapolated
     truth_values: FloatArray
     valve: Valve
     variance: float | FloatArray
@@ -201,33 +203,13 @@ def build_twin(config: Values) -> Twin:
         model.guide = guide_of(model, template, config["mesh"])
         model.anchors = Anchors(Path(config["paths"]["outputs"]) / "anchors")
 
-    element = config["mechanics"]["element"]
-    changed = truth_mesh(config["mesh"], truth)
-    other = truth["element"] or element
-    same = changed == dict(config["mesh"]) and other == element
-    truth_model = replace(
-        plain,
-        mesh=plain.mesh if same else build_mesh(template, changed, other, _meshes(config)),
-        settings=true_settings,
-        fixed={**config["fixed"], **truth["fixed"]},
-    )
-    described = {
-        "valve": config["valve"],
-        "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
-        "mesh": changed if changed["source"] == "tetwild" else _cells(changed),
-        "element": other,
-        "dt_factor": truth["dt_factor"],
-        "tissue": {region: asdict(tissue) for region, tissue in true_settings.tissue.items()},
-        "fixed": truth_model.fixed,
-        "observed": [observation["columns"], observation["rows"]],
-        "parameters": list(parameters),
-    }
+    truth_model, source = _truth(config, plain, true_settings, template)
     problem = Problem(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
         problem,
         model,
         truth_model,
-        Store(config["paths"]["outputs"]).model("truth", truth_model, described, MADE_BY),
+        source,
         values,
         valve,
         variance,
@@ -235,6 +217,56 @@ def build_twin(config: Values) -> Twin:
         frames,
         errors,
     )
+
+
+def _truth(
+    config: Values, plain: ClosureModel, settings: MechanicsSettings, template: Template
+) -> tuple[ClosureModel, StoredModel | Extrapolated]:
+    """The model that the observation is made from, and the same behind its store."""
+    truth, element = config["truth"], config["mechanics"]["element"]
+    changed, other = truth_mesh(config["mesh"], truth), truth["element"] or element
+    coarser = list(truth["extrapolated_from"])
+
+    def on(mesh: dict[str, Any]) -> tuple[ClosureModel, StoredModel]:
+        same = mesh == dict(config["mesh"]) and other == element
+        model = replace(
+            plain,
+            mesh=plain.mesh if same else build_mesh(template, mesh, other, _meshes(config)),
+            settings=settings,
+            fixed={**config["fixed"], **truth["fixed"]},
+        )
+        if coarser:  # meshes as fine as these take minutes from the open valve
+            model.guide = guide_of(model, template, mesh)
+        described = {
+            "valve": config["valve"],
+            "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
+            "mesh": mesh if mesh["source"] == "tetwild" else _cells(mesh),
+            "element": other,
+            "dt_factor": truth["dt_factor"],
+            "tissue": {region: asdict(tissue) for region, tissue in settings.tissue.items()},
+            "fixed": model.fixed,
+            "observed": [config["observation"]["columns"], config["observation"]["rows"]],
+            "parameters": list(config["parameters"]),
+            **({"guided": True} if coarser else {}),
+        }
+        store = Store(config["paths"]["outputs"])
+        return model, store.model("truth", model, described, MADE_BY)
+
+    model, fine = on(changed)
+    if not coarser:
+        return model, fine
+    if len(coarser) != 2 or changed["source"] != "structured":
+        raise ConfigurationError(
+            f"truth.extrapolated_from = {coarser}, expected columns and rows of a structured mesh"
+        )
+    share = coarser[0] / changed["columns"]
+    if not 0 < share < 1 or share * changed["rows"] != coarser[1]:
+        raise ConfigurationError(
+            f"truth.extrapolated_from = {coarser}, expected fewer cells than {changed['columns']} "
+            f"x {changed['rows']}, by the same share in both directions"
+        )
+    _, coarse = on({**changed, "columns": coarser[0], "rows": coarser[1]})
+    return model, Extrapolated(fine, coarse, share)
 
 
 class Correlations:
@@ -377,9 +409,9 @@ def filter_of(settings: Values, mean: FloatArray) -> Filter:
     """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
     tolerance, most = settings["tolerance"], settings["max_iterations"]
     check = settings.get("check_runs", 0)
+    Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
     match settings["mode"]:
         case "paper":
-            Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
             return PaperFilter(Q, tolerance, most, check_runs=check)
         case "extended":
             return ExtendedFilter(check_runs=check)

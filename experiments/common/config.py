@@ -29,7 +29,7 @@ from mvest.valve.anatomy.template import TemplateParameters
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
-AS_BEFORE = {"check_runs": 0}
+AS_BEFORE: dict[str, Any] = {"check_runs": 0, "curve": [], "active": True, "extrapolated_from": []}
 """Settings that came after results which are as with these values; so they leave no trace in the
 hash, wherever they stand in a configuration."""
 
@@ -130,6 +130,8 @@ class TruthConfig:
     rows: int | None = None
     layers: int | None = None
     element: str | None = None
+    # Columns and rows of a coarser mesh: closures on both are carried on to cells of no size.
+    extrapolated_from: list[int] = field(default_factory=list)
     dt_factor: float = 1.0
     reading: str | None = None  # of the Poisson ratio
     ratio: dict[str, float] = field(default_factory=dict)  # region -> E_f over E_perp

@@ -46,6 +46,9 @@ QUESTIONS = {
     "discrepancy": "What does an estimate cost when the truth is not the filter's own model?",
     "filter": "Which filter finds the moduli, how well, and with how many forward solves?",
 }
+NEXT, NOTABLE_PERCENT = 3, 5.0
+"""Of the errors after the largest, these many are named, and all that are as large as this."""
+
 UNKNOWN_QUESTION = "How do the estimates depend on what was varied?"
 
 
@@ -233,14 +236,17 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
 
 
 def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
+    """The largest error under each discrepancy, of any modulus on any mesh."""
     names = short_names(sweep.parameters)
     effects = []
     groups = discrepancies(runs)
+    meshes = len({run.cells for run in runs}) > 1
     for what, group in groups.items():
-        found = [accuracy(group, k) for k in range(len(names))]
-        if found[0].n and np.isfinite([f.bias_percent for f in found]).all():
-            k = int(np.argmax([abs(f.bias_percent) for f in found]))
-            effects.append((abs(found[k].bias_percent), found[k].bias_percent, names[k], what))
+        worst = _worst(group)
+        if worst is not None:
+            k = int(np.argmax(np.abs(worst.error)))
+            on = f" on {' x '.join(map(str, worst.cells))} cells" if meshes else ""
+            effects.append((worst.largest_error, worst.error[k], names[k], what, on))
     effects.sort(key=lambda effect: -effect[0])
     own = {what for what, group in groups.items() if is_own_model(group)}
     real = [effect for effect in effects if effect[3] not in own]
@@ -248,11 +254,13 @@ def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
         return ["No discrepancy left a result, so nothing can be said about what dominates."]
     first = real[0]
     sentences = [
-        f"The largest error comes from “{first[3]}”: {first[1]:+.3g} % of the {first[2]} modulus."
+        f"The largest error comes from “{first[3]}”: {first[1]:+.3g} % of the {first[2]} modulus"
+        f"{first[4]}."
     ]
-    if len(real) > 1:
-        following = _listed([f"“{e[3]}” ({e[1]:+.3g} %, {e[2]})" for e in real[1:4]])
-        sentences.append(f"Next come {following}.")
+    following = [e for n, e in enumerate(real[1:]) if n < NEXT or e[0] >= NOTABLE_PERCENT]
+    if following:
+        listed = _listed([f"“{e[3]}” ({e[1]:+.3g} %, {e[2]}{e[4]})" for e in following])
+        sentences.append(f"Next come {listed}.")
     alone = [effect for effect in effects if effect[3] in own]
     if alone:
         sentences.append(f"Without any discrepancy the error is {number(alone[0][0])} %.")

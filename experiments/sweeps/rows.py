@@ -66,6 +66,8 @@ class Run:
         None where a job left no run behind and does not say which seeds it had.
     mode : str
         Of the filter.
+    cells : tuple of int
+        Of the estimator's mesh; empty where a job does not say it.
     truth, start, estimate, std, bound : FloatArray
         ``(p,)`` MPa for moduli. ``bound`` is the Cramér–Rao standard deviation.
     iterates, iterate_std : FloatArray
@@ -77,6 +79,7 @@ class Run:
     factors: Mapping[str, Any]
     seed: int | None
     mode: str
+    cells: tuple[int, ...]
     converged: bool
     reason: str
     truth: FloatArray
@@ -132,6 +135,7 @@ def _run(sweep: Sweep, job: SweepJob, run: SeedRun) -> Run:
         factors=job.factors,
         seed=run.seed,
         mode=factor_text(job.factors.get("filter") or job.filter),
+        cells=job.model.cells if job.model else (),
         converged=run.converged,
         reason=run.reason or job.reason or "no reason given",
         truth=_values(job.truth, p),

@@ -290,6 +290,7 @@ def _settings(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
             error = found.rmse_percent if repeated else found.bias_percent
             text[f"{'RMSE' if repeated else 'error'} {name} [%]"] = number(error)
             if repeated:
+                text[f"largest error {name} [%]"] = number(found.worst_percent)
                 row[f"RMSE / bound {name}"] = found.ratio
                 row[f"coverage of 95 % {name} [%]"] = 100 * covered.share
                 row[f"coverage of 95 % {name}, low [%]"] = 100 * covered.low

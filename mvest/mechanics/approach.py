@@ -80,7 +80,7 @@ def approach(
             break
         last = move
         d *= move / longest
-        stress = solid.extrapolated_stress(current.solid, d)
+        stress = solid.extrapolated(current.solid, d).stress
         x = x + d
         if not float(np.abs(x - start).max()) <= far:
             break

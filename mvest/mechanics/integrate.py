@@ -8,8 +8,9 @@ Backward Euler: with :math:`v_{n+1} = (x_{n+1} - x_n)/\Delta t` each step solves
 by Newton's method with the consistent tangent A. A static step drops inertia and damping. A step
 that fails (no convergence, leaflets through each other) is halved; a static one with contact, or
 from a moving body, is tried again after the body has had more time to come to rest. Nothing is ever
-accepted unconverged, except in the single-solve mode, which takes one linearised solve per step by
-definition.
+accepted unconverged, except in the single-solve mode: one exact solve a step of the equations
+linearised where the body is, without what the pressure adds to the stiffness. There sensitivities
+are those of the linearised step at fixed stiffness, from the same factor: cheap, and not exact.
 
 Sensitivities differentiate these discrete equations (Michaleris, Tortorelli and Vidal 1994, Int. J.
 Numer. Meth. Engng 37:2471): with the factorised A of the converged step, for each parameter m,
@@ -31,7 +32,8 @@ from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.passing import HARMLESS
-from mvest.mechanics.solver import LinearSolver, linear_solver
+from mvest.mechanics.solid import SolidState
+from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
 from mvest.mechanics.steps import (
     Damping,
     NewtonSettings,
@@ -81,6 +83,7 @@ class _Solved:
     evaluation: Evaluation
     residuals: list[float] = field(default_factory=list)
     pairs: ContactPairs | None = None
+    linearised: SolidState | None = None  # of a single solve, where it ends: what it was solved for
 
 
 class _StepError(Exception):
@@ -293,7 +296,7 @@ class _Stepper:
             inertia * self.damping.alpha * mass * state.x / dt
         )
         move = state.move
-        if move is None and not static and state.dt:
+        if move is None and not static and state.dt and not self.newton.single_solve:
             # The first guess continues the motion, but no farther than the last step went.
             move = min(dt, state.dt) * state.v
         solved = self._newton(state, loads, rate, mass_factor, push, move)
@@ -352,7 +355,8 @@ class _Stepper:
         def factorize() -> None:
             nonlocal pairs
             pairs = self._candidates(x)  # the line search may have tried other places since
-            blocks = system.tangent(x, loads, pairs, current.solid)
+            single = newton.single_solve
+            blocks = system.tangent(x, loads, pairs, current.solid, load_stiffness=not single)
             near = residuals[-1] <= NEAR and len(residuals) > 1
             self.solver.factorize(system.matrix(blocks, mass_factor), near=near)
 
@@ -382,6 +386,8 @@ class _Stepper:
                 # A forcing term of the size of the residual keeps the convergence quadratic
                 # (Dembo, Eisenstat and Steihaug 1982, SIAM J. Numer. Anal. 19:400).
                 forcing = 1e-3 if converged else min(1e-3, max(1e-9, residuals[-1]))
+                if newton.single_solve:
+                    forcing = EXACT
                 d = -self.solver.solve(current.residual.ravel(), forcing).reshape(-1, 3)
             except (RuntimeError, ValueError) as error:
                 raise _StepError(StepReason.SINGULAR) from error
@@ -392,14 +398,14 @@ class _Stepper:
                 # What is left of the way is gone, so that the state depends on its start by less
                 # than the tolerance admits.
                 return _Solved(x + d if size <= HARMLESS else x, current, residuals, pairs)
+            before = x, current.solid
             x, current = self._line_search(x, d, current, pairs, evaluate)
             if float(np.abs(x - state.x).max()) > self._far:
                 raise _StepError(StepReason.NO_CONVERGENCE)
             residuals.append(float(np.linalg.norm(current.residual)) / current.scale)
             if newton.single_solve:
-                if self.parameters:
-                    factorize()
-                return _Solved(x, current, residuals, pairs)
+                linearised = system.solid.extrapolated(before[1], x - before[0])
+                return _Solved(x, current, residuals, pairs, linearised)
         raise _StepError(StepReason.NO_CONVERGENCE)
 
     def _candidates(self, x: FloatArray) -> ContactPairs | None:
@@ -458,7 +464,7 @@ class _Stepper:
     ) -> None:
         """Fill the derivatives of ``new``; the solver holds the factor of the converged tangent."""
         system = self.system
-        solid, state = system.solid, solved.evaluation.solid
+        solid, state = system.solid, solved.linearised or solved.evaluation.solid
         mass = solid.lumped_mass[:, None]
         region = solid.mesh.region
         right = np.empty((3 * system.n, len(self.parameters)))

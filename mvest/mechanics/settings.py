@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
@@ -90,7 +91,8 @@ class TissueSettings:
     reading : str
         ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
     law : str
-        ``biot``, the linear law, to which all of the above belongs, or ``exponential``
+        ``biot``, the linear law, to which all of the above belongs, ``corotational``, its usual
+        form on linear tetrahedra (:mod:`mvest.mechanics.law.corotational`), or ``exponential``
         (:mod:`mvest.mechanics.law.exponential`).
     exponential : ExponentialTissue, optional
         Coefficients of the exponential law, where they are not parameters.
@@ -103,8 +105,10 @@ class TissueSettings:
     exponential: ExponentialTissue | None = None
 
     def __post_init__(self) -> None:
-        if self.law not in ("biot", "exponential"):
-            raise InputError(f"law of a tissue = {self.law!r}, expected biot or exponential")
+        if self.law not in ("biot", "corotational", "exponential"):
+            raise InputError(
+                f"law of a tissue = {self.law!r}, expected biot, corotational or exponential"
+            )
         if self.law == "exponential" and self.exponential is None:
             raise InputError("law of a tissue = 'exponential': its coefficients are missing")
         known = [reading.value for reading in PoissonReading]
@@ -231,6 +235,9 @@ class ClosureProtocol:
         s at which the dynamic phase ends.
     equilibrium : bool
         Whether a static step to exact equilibrium follows.
+    curve : tuple of (s, share)
+        Pressure over its peak at increasing times, a monotone cubic between them and constant
+        outside; empty where it rises with the motion of the boundary.
     """
 
     pressure_mmHg: float = 120.0
@@ -239,6 +246,7 @@ class ClosureProtocol:
     growth: float = 1.5
     end: float = 0.5
     equilibrium: bool = True
+    curve: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.dt > 0:
@@ -247,6 +255,12 @@ class ClosureProtocol:
             raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
         if not (self.ramp > 0 and self.end >= self.ramp and self.growth >= 1):
             raise InputError(f"closure protocol {self}: expected 0 < ramp <= end and growth >= 1")
+        times = [row[0] for row in self.curve if len(row) == 2]
+        pairs = len(times) == len(self.curve) and len(times) != 1
+        if not pairs or np.any(np.diff(times) <= 0) or not np.isfinite(self.curve).all():
+            raise InputError(
+                f"pressure curve {self.curve}: expected two or more (s, share), increasing in time"
+            )
 
     def steps(self) -> tuple[Step, ...]:
         """The time steps."""
@@ -265,6 +279,14 @@ class ClosureProtocol:
         """Share of the closure at time ``t``: quintic smooth step over the ramp."""
         return smooth_step(t / self.ramp)
 
+    def pressure(self, t: float) -> float:
+        """Pressure (mmHg) at time ``t``."""
+        if not self.curve:
+            return self.pressure_mmHg * self.phase(t)
+        times, shares = np.transpose(self.curve)
+        share = PchipInterpolator(times, shares)(np.clip(t, times[0], times[-1]))
+        return self.pressure_mmHg * float(share)
+
 
 @dataclass(frozen=True, slots=True)
 class ContactSettings:
@@ -278,11 +300,14 @@ class ContactSettings:
         c0, the midsurface distance at p0 over the thickness.
     activation_distance : float
         c_h, the midsurface distance over the thickness at which contact begins.
+    active : bool
+        Without contact leaflets go through each other, as if they did not see each other.
     """
 
     reference_pressure: float = 0.016
     reference_distance: float = 1.2
     activation_distance: float = 2.0
+    active: bool = True
 
     def __post_init__(self) -> None:
         if not self.reference_pressure > 0:

@@ -15,12 +15,13 @@ the element's polynomials p. The parameters alpha of an element solve ``int M^T 
 eliminated inside the element by Newton's method at every evaluation, so that to the outside the
 element has an energy of nodal positions only (its condensed tangent is the Schur complement). The
 modes integrate to zero against constant stress: the patch test holds. In elements for thin bodies
-E(u) is sampled at fewer points (:mod:`mvest.mechanics.sampled`).
+E(u) is sampled at fewer points (:mod:`mvest.mechanics.sampled`). With the corotational law the
+strain is the linear one in a frame that turns with the element, which takes the place of F.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -37,6 +38,7 @@ from mvest.mechanics.element import (
     strain_derivative,
     strains,
 )
+from mvest.mechanics.law.corotational import CorotationalLaw, EdgeRotations
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
@@ -159,6 +161,10 @@ class Solid:
         self.polynomials = np.ascontiguousarray(polynomials if enhanced else polynomials[:, :0])
         self.n_modes = self.polynomials.shape[1]
         self.sampling = _sampling(mesh, reference)
+        self.rotations = None
+        if isinstance(law, CorotationalLaw):
+            at_rest = strains(mesh.nodes, mesh.elements, self.gradients)[1]
+            self.rotations = EdgeRotations(mesh, at_rest)
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)
         self.reset()
 
@@ -176,6 +182,8 @@ class Solid:
         green_u, f = strains(x, elements, self.gradients)
         if self.sampling is not None:
             green_u = self.sampling.strain(green_u)
+        if self.rotations is not None:
+            green_u, f = self.rotations(x, f)
         if self.n_modes == 0:
             stress, tangent = self.law.response(green_u, region, previous, rate)
             return SolidState(green_u, stress, tangent, self.enhanced_parameters, f)
@@ -222,9 +230,11 @@ class Solid:
             stress = self.sampling.stress(state.stress, self.volumes)
             self.sampling.add_tangents(*at, stress, state.tangent, modes, positions, blocks)
             return
+        # The corotational tangent is taken at fixed rotations: it has no geometric part.
+        turned = self.rotations is not None
         add_tangents(
             *at,
-            state.stress,
+            np.zeros_like(state.stress) if turned else state.stress,
             state.tangent,
             self.direction,
             self.polynomials,
@@ -237,10 +247,14 @@ class Solid:
             stress = self.sampling.stress(stress, self.volumes)
         return internal_forces(self.gradients, self.volumes, state.deformation, stress)
 
-    def extrapolated_stress(self, state: SolidState, dx: FloatArray) -> FloatArray:
-        """Stress S ``(e, q, 6)`` MPa that a move by ``dx (n, 3)`` mm leads to, to first order."""
+    def extrapolated(self, state: SolidState, dx: FloatArray) -> SolidState:
+        """The state with the strain and the stress that a move by ``dx (n, 3)`` mm leads to.
+
+        To first order; all else is as before the move.
+        """
         change = self.green_change(state, dx, np.zeros_like(state.stress))
-        return state.stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
+        stress = state.stress + np.einsum("eqij,eqj->eqi", state.tangent, change)
+        return replace(state, green=state.green + change, stress=stress)
 
     def condensed_forces(self, state: SolidState, d_stress: FloatArray) -> FloatArray:
         """Nodal forces ``(e, k, 3)`` of a partial change of stress, alpha re-equilibrated.

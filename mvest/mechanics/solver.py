@@ -24,7 +24,7 @@ from mvest.mechanics.assembly import BlockMatrix, SparsityPattern
 from mvest.mechanics.krylov import gmres
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["LinearSolver", "PardisoSolver", "SuperLUSolver", "linear_solver"]
+__all__ = ["EXACT", "LinearSolver", "PardisoSolver", "SuperLUSolver", "linear_solver"]
 
 
 EXACT = 1e-13

@@ -62,7 +62,8 @@ class NewtonSettings:
     max_halvings : int
         How often a failing step may be halved.
     single_solve : bool
-        One linearised solve per step, as SOFA does by default; nothing is checked for convergence.
+        One exact linear solve per step, as SOFA does by default: from where the body is, without
+        the pressure's load stiffness; nothing is checked for convergence.
     largest_move : float
         mm that a node may move in one iteration.
     smallest_move : float

@@ -251,12 +251,18 @@ class System:
         return Evaluation(residual, scale, state, blocks)
 
     def tangent(
-        self, x: FloatArray, loads: Loads, pairs: ContactPairs | None, state: SolidState
+        self,
+        x: FloatArray,
+        loads: Loads,
+        pairs: ContactPairs | None,
+        state: SolidState,
+        *,
+        load_stiffness: bool = True,
     ) -> FloatArray:
         """Blocks N/mm of the derivative of the residual that was evaluated with the same.
 
         ``state`` is the solid's of that evaluation; the stress in it is only felt as the geometric
-        part of the stiffness.
+        part of the stiffness. Without ``load_stiffness`` the pressure's part is left out.
         """
         slots, y = None, None
         if self.contact is not None and pairs is not None:
@@ -265,7 +271,7 @@ class System:
         blocks = self.pattern.zeros()
         self.solid.add_tangents(state, self._at_elements, blocks)
         p = self.factors.pressure * loads.pressure
-        if self.pressure is not None and p != 0:
+        if self.pressure is not None and p != 0 and load_stiffness:
             self.pressure.add_tangent(x, -p, self._at_faces, self._at_faces_skew, blocks)
         if self.cables is not None:
             stiffness = self._cable_forces(self.cables, x, loads)[1]

@@ -18,6 +18,7 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.corotational import CorotationalLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.moduli import LeafletModuli
@@ -51,9 +52,8 @@ __all__ = [
 class Pacing(Protocol):
     """How pressure and the motion of the boundary run in time."""
 
-    @property
-    def pressure_mmHg(self) -> float:
-        """Peak transmitral pressure."""
+    def pressure(self, t: float, /) -> float:
+        """Transmitral pressure (mmHg) at time ``t`` (s)."""
         ...
 
     def phase(self, t: float, /) -> float:
@@ -140,14 +140,16 @@ def build_system(
         chordae.toe_strain,
         {name: chordae.family == k for k, name in enumerate(chordae.family_names)},
     )
-    contact = Contact(
-        midpoints,
-        midpoints(mesh.nodes),
-        surface.areas,
-        surface.thickness,
-        surface.triangles,
-        settings.contact,
-    )
+    contact = None
+    if settings.contact.active:
+        contact = Contact(
+            midpoints,
+            midpoints(mesh.nodes),
+            surface.areas,
+            surface.thickness,
+            surface.triangles,
+            settings.contact,
+        )
     return System(
         solid,
         pressure=PressureLoad(mesh.pressure_faces, mesh.reference.face),
@@ -203,8 +205,13 @@ def material_law(
     tissues = [_tissue(region, settings, values) for region in mesh.region_names]
     linear = [t for t in tissues if isinstance(t, LeafletModuli)]
     exponential = [t for t in tissues if isinstance(t, ExponentialTissue)]
+    corotational = {settings.tissue[r].law == "corotational" for r in mesh.region_names}
+    if len(corotational) > 1:
+        raise InputError("the corotational law is that of all regions of a mesh, or of none")
     law: Law
-    if not exponential:
+    if corotational == {True}:
+        law = CorotationalLaw.of_moduli(linear)
+    elif not exponential:
         law = BiotLaw.of_moduli(linear)
     elif not linear:
         law = ExponentialLaw.of(exponential)
@@ -353,12 +360,11 @@ def boundary_loading(
     shift = motion.annulus - motion.annulus[0]
     copies = len(start) // shift.shape[1]
     shift = np.tile(shift, (1, copies, 1))
-    peak = mmhg_to_mpa(protocol.pressure_mmHg)
 
     def loading(t: float) -> Loads:
         phase = protocol.phase(t)
         return Loads(
-            pressure=peak * phase,
+            pressure=mmhg_to_mpa(protocol.pressure(t)),
             tips=_interpolate(motion.phase, motion.papillary_tips, phase),
             hinge=start + _interpolate(motion.phase, shift, phase),
             tie_lengths=_tie_lengths(system, phase),

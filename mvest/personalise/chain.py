@@ -171,6 +171,10 @@ def expect_case(
     return expect(chain.problem(chain.filter), chain.observation())
 
 
+BETTER = 5.0
+"""How many times as well as beforehand a nuisance may be measured."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frames:
     generic: Mapping[str, FloatArray]
@@ -573,9 +577,10 @@ class _Chain:
         return surface_distance(frame.vertices, positions, self.case.surface.triangles)
 
     def narrower(self, result: StudyResult) -> Mapping[str, FloatArray]:
-        """Standard deviations of the moduli's logarithms if something more were known.
+        """Standard deviations of the moduli's logarithms if something more were measured.
 
-        From the linear model at the estimate, all unknowns estimated.
+        From the linear model at the estimate, all unknowns estimated. Whatever else is measured is
+        then known ``BETTER`` times as well as beforehand.
         """
         filtered = result.filtered
         assert filtered is not None
@@ -589,15 +594,7 @@ class _Chain:
         if learned is not None:
             errors = errors and replace(errors, base=self.noise(learned))
             doubt[np.ix_(self.estimated, self.estimated)] = learned.covariance
-        groups = {
-            "pressure known": tuple(
-                n for n in self.names if n == "pressure_scale" or is_frame_pressure(n)
-            ),
-            "rest lengths known": ("chord_rest_length",),
-            "chordal stiffness known": ("chord_stiffness",),
-            "registration known": REGISTRATION,
-            "all nuisances known": tuple(n for n in self.names if not n.startswith("E_f.")),
-        }
+        groups = self._measurable()
 
         def linear(P: FloatArray, scale: float = 1.0, geometry: float = 1.0) -> FloatArray:
             # Errors of the geometry stay what they are where the frame is seen better.
@@ -615,15 +612,36 @@ class _Chain:
         for words, members in groups.items():
             known = np.isin(self.names, members)
             if known.any():
-                P = np.array(prior.covariance)
-                P[known] = 0.0
-                P[:, known] = 0.0
-                stds[words] = std(P)
-        stds["half the error of the image"] = std(prior.covariance, 2.0)
-        stds["a frame without error"] = std(prior.covariance, 1e3)
+                share = np.where(known, 1 / BETTER, 1.0)
+                stds[words] = std(prior.covariance * np.outer(share, share))
+        stds["4 beats averaged"] = std(prior.covariance, 2.0)
+        stds["any number of beats averaged"] = std(prior.covariance, 1e3)
         if self.errors is not None or self.considered:
             stds["geometry known exactly"] = linear(prior.covariance, geometry=0.0)
         return stds
+
+    def _measurable(self) -> dict[str, tuple[str, ...]]:
+        """What else could be measured and how well, in words -> the nuisances that it tells of."""
+        std = {u.name: u.std / BETTER for u in self.unknowns}
+        words: dict[str, tuple[str, ...]] = {}
+        # A scale is of the closed frame's pressure, errors of several frames are in mmHg.
+        errors = {
+            name: error * (1.0 if is_frame_pressure(name) else self.closed.pressure_mmHg)
+            for name, error in std.items()
+            if name == "pressure_scale" or is_frame_pressure(name)
+        }
+        if errors:
+            words[f"pressure measured to ±{max(errors.values()):.2g} mmHg"] = tuple(errors)
+        for name, what in (
+            ("chord_rest_length", "rest lengths"),
+            ("chord_stiffness", "stiffness"),
+        ):
+            if name in std:
+                words[f"{what} of the chordae measured to ±{100 * std[name]:.2g} %"] = (name,)
+        if any(name in std for name in REGISTRATION):
+            words[f"annulus placed {BETTER:g} times as well"] = REGISTRATION
+        others = tuple(n for n in self.names if not n.startswith("E_f."))
+        return {**words, f"all of these measured {BETTER:g} times as well": others}
 
     def confirm(self, result: StudyResult) -> float | None:
         """Largest distance (mm) of the fitted closed valve from one closed from the open state."""

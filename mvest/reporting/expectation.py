@@ -14,10 +14,22 @@ from mvest.reporting.findings import Alike
 from mvest.reporting.markup import MISSING, number
 from mvest.typing import FloatArray
 
-__all__ = ["alike", "alike_words", "confounded_words", "expectation_text"]
+__all__ = ["alike", "alike_words", "confounded_words", "expectation_text", "measurement_words"]
 
 STEP = 0.1
 """Change by which it is shown how parameters make up for each other, in parts of a scale."""
+
+MEASURED = {
+    "pressure_scale": (0.02, "2 % (2.4 mmHg of 120)"),
+    "chord_rest_length": (0.005, "0.5 %"),
+    "chord_stiffness": (0.05, "5 %"),
+    "shift": (0.2, "0.2 mm"),
+    "turn": (0.5, "0.5 degrees"),
+}
+"""Kind of parameter -> how well it might be measured, in its unit and in words."""
+
+GAIN = 0.1
+"""Least part of a modulus' standard deviation that a measurement worth naming takes away."""
 
 UNITS = {"E_f": "MPa", "G": "MPa", "shift": "mm", "turn": "degrees"}
 """Of parameters by the first part of their name; the others are factors."""
@@ -83,9 +95,35 @@ def expectation_text(
         + " (1: all parameters, in parts of their size, are told equally well)",
         *(confounded_words(data) or ["The data tell all parameters apart."]),
         *(f"Known badly from the data alone: {words}" for words in data.flat()),
+        *measurement_words(data if informed is None else informed),
         "No estimation was run.",
     ]
     return "\n".join(lines)
+
+
+def measurement_words(data: Identifiability) -> list[str]:
+    """What to measure besides, how well, and what that gains; the largest gain first."""
+    moduli = [k for k, name in enumerate(data.names) if _unit(name) == "MPa"]
+    found = []
+    for name in data.names:
+        accuracy, words = MEASURED.get(name.partition(".")[0], (0.0, ""))
+        if not accuracy or not moduli:
+            continue
+        std = data.measured(name, accuracy)
+        left = [std[k] / data.std[k] if np.isfinite(data.std[k]) else 0.0 for k in moduli]
+        best = int(np.argmin(left))
+        if left[best] <= 1 - GAIN and np.isfinite(std[moduli[best]]):
+            k = moduli[best]
+            now, then = (100 * float(value[k] / data.scale[k]) for value in (data.std, std))
+            before = f"{number(now, 2)} %" if np.isfinite(now) else "not determined"
+            found.append(
+                (
+                    left[best],
+                    f"Measure {name} to {words}: {data.names[k]} would be known to "
+                    f"{number(then, 2)} % (now {before}).",
+                )
+            )
+    return [words for _, words in sorted(found)]
 
 
 def confounded_words(data: Identifiability) -> list[str]:

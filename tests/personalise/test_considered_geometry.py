@@ -100,10 +100,10 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
         exact = doubtful.narrower["geometry known exactly"]
         assert doubtful.narrower["now"][0] > 1.3 * exact[0]
-        # A frame without error leaves the errors of the geometry as they are.
+        # Averaging leaves the errors of the geometry as they are.
         assert (
-            doubtful.narrower["a frame without error"][0]
-            > 5 * known.narrower["a frame without error"][0]
+            doubtful.narrower["any number of beats averaged"][0]
+            > 5 * known.narrower["any number of beats averaged"][0]
         )
     # At the start, and once more at the estimate.
     np.testing.assert_allclose(where[0], doubtful.prior.mean)

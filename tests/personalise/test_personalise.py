@@ -271,31 +271,37 @@ def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
     by_log = filtered.prediction.jacobian[:, 0] * found.result.estimate[0]
     np.testing.assert_allclose(H[:, 0], by_log)
 
-    def by_hand(kept, std=0.3):
-        information = np.linalg.inv(P)[np.ix_(kept, kept)] + H[:, kept].T @ H[:, kept] / std**2
+    def by_hand(better=(), std=0.3):
+        share = np.where(np.isin(found.names, better), 1 / 5, 1.0)
+        information = np.linalg.inv(P * np.outer(share, share)) + H.T @ H / std**2
         return np.sqrt(np.diag(np.linalg.inv(information)))[:2]
 
-    everything = np.arange(len(found.names))
-    np.testing.assert_allclose(now, by_hand(everything), rtol=1e-6)
+    np.testing.assert_allclose(now, by_hand(), rtol=1e-6)
     np.testing.assert_allclose(now, filtered.transformed.std[:2], rtol=1e-6)
-    np.testing.assert_allclose(narrower["all nuisances known"], by_hand([0, 1]), rtol=1e-6)
-    known = {
-        "pressure known": ("pressure_scale",),
-        "rest lengths known": ("chord_rest_length",),
-        "chordal stiffness known": ("chord_stiffness",),
-        "registration known": REGISTRATION,
+    together = "all of these measured 5 times as well"
+    np.testing.assert_allclose(narrower[together], by_hand(found.names[2:]), rtol=1e-6)
+    prior = dict(zip(found.names, found.prior.std, strict=True))
+    mmhg = prior["pressure_scale"] * case.frame(Role.CLOSED).pressure_mmHg / 5
+    measured = {
+        f"pressure measured to ±{mmhg:.2g} mmHg": ("pressure_scale",),
+        f"rest lengths of the chordae measured to ±{20 * prior['chord_rest_length']:.2g} %": (
+            "chord_rest_length",
+        ),
+        f"stiffness of the chordae measured to ±{20 * prior['chord_stiffness']:.2g} %": (
+            "chord_stiffness",
+        ),
+        "annulus placed 5 times as well": REGISTRATION,
     }
-    for words, names in known.items():
-        kept = np.flatnonzero(~np.isin(found.names, names))
-        np.testing.assert_allclose(narrower[words], by_hand(kept), rtol=1e-6, err_msg=words)
-        assert np.all(narrower["all nuisances known"] <= narrower[words] * (1 + 1e-12))
+    for words, names in measured.items():
+        np.testing.assert_allclose(narrower[words], by_hand(names), rtol=1e-6, err_msg=words)
+        assert np.all(narrower[together] <= narrower[words] * (1 + 1e-12))
         assert np.all(narrower[words] <= now * (1 + 1e-12))
-    half = narrower["half the error of the image"]
-    np.testing.assert_allclose(half, by_hand(everything, 0.15), rtol=1e-6)
-    assert np.all(narrower["a frame without error"] < half)
+    half = narrower["4 beats averaged"]
+    np.testing.assert_allclose(half, by_hand(std=0.15), rtol=1e-6)
+    assert np.all(narrower["any number of beats averaged"] < half)
     assert np.all(half < now)
     assert set(narrower) == {
-        "now", *known, "all nuisances known", "half the error of the image", "a frame without error"
+        "now", *measured, together, "4 beats averaged", "any number of beats averaged"
     }  # fmt: skip
 
 

@@ -44,6 +44,9 @@ class Findings:
         Of simulating and estimating, all seeds.
     truth_store : {"hit", "miss"}
         Whether the simulated truth was in the store.
+    truth_band_percent : (p,) or None
+        By how much the estimate follows what carries a truth on to cells of no size, in percent of
+        the truth: what is not known of it. None where the truth has a mesh.
     """
 
     paper: Paper | None
@@ -58,6 +61,7 @@ class Findings:
     confirmed_mm: float | None
     seconds_computing: float
     truth_store: Literal["hit", "miss"]
+    truth_band_percent: Vector | None = None
 
     @property
     def first(self) -> SeedRun:

@@ -80,6 +80,7 @@ def _row(record: Twin) -> dict[str, Any]:
         row[f"std {name}{_unit(name)}"] = _at(first.std, k)
         error = _at(first.relative_error, k)
         row[f"error {name} [%]"] = None if error is None else 100.0 * abs(error)
+        row[f"truth of {name} known to [%]"] = _at(findings.truth_band_percent, k)
     distance = first.distance_mm
     closed = (findings.closure or {}).get("closed")
     measured = closed if isinstance(closed, ClosureMeasurements) else None
@@ -118,7 +119,8 @@ def readable(records: Sequence[Twin]) -> pd.DataFrame:
             text[f"{name}{unit}"] = with_std(
                 row[f"estimate {name}{unit}"], row.get(f"std {name}{unit}")
             )
-            text[f"error {name} [%]"] = number(row[f"error {name} [%]"])
+            band = row.get(f"truth of {name} known to [%]")
+            text[f"error {name} [%]"] = with_std(row[f"error {name} [%]"], band)
         text["error of all moduli [%]"] = with_std(
             row["moduli error mean [%]"], row["moduli error SD [%]"]
         )
@@ -169,7 +171,8 @@ def _truth(first: Twin) -> str:
     start = "/".join(map(number, first.findings.initial))
     return (
         f"Truth {values}, start {start} for {', '.join(first.parameters)}. Estimates are given "
-        f"with the filter's standard deviation, errors without sign; errors of all moduli and "
+        f"with the filter's standard deviation, errors without sign, and ± what is not known of a "
+        f"truth that was carried on to cells of no size; errors of all moduli and "
         f"distances (fitted to observed closed valve) are mean ± SD."
     )
 
@@ -277,5 +280,7 @@ def table1_answer(records: Mapping[str, Twin]) -> str:
     for record in records.values():
         error = record.findings.moduli_error_percent
         off = f"{error.mean:.2g} %" if record.converged and error else "no estimate"
+        if off != "no estimate" and (band := record.findings.truth_band_percent):
+            off += f", which the truth itself is known to {max(band):.2g} %"
         sentences.append(f"{record.row} {off}")
-    return f"Mean error of all moduli by what was seen (simulated): {', '.join(sentences)}."
+    return f"Mean error of all moduli by what was seen (simulated): {'; '.join(sentences)}."

@@ -21,7 +21,8 @@ from experiments.common.estimate_record import (
 )
 from experiments.common.estimates import Paper
 from experiments.common.expectation import TwinExpectation
-from experiments.common.findings import vector
+from experiments.common.extrapolated import Extrapolated
+from experiments.common.findings import Vector, vector
 from experiments.common.gate import gate_of
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.record import Mesh, Outcome
@@ -85,6 +86,7 @@ def run_twin(job: Job[Settings]) -> Outcome[Findings]:
         confirmed_mm=confirmed,
         seconds_computing=computing,
         truth_store="hit" if twin.source.counts.hits else "miss",
+        truth_band_percent=_truth_band(twin, result),
     )
     return Outcome(
         findings=findings,
@@ -145,6 +147,16 @@ def _confirm(twin: Twin, result: StudyResult) -> float | None:
     if not anew.converged:
         return None
     return float(np.linalg.norm(twin.model.observed(anew.frames[-1]) - fitted, axis=1).max())
+
+
+def _truth_band(twin: Twin, result: StudyResult) -> Vector | None:
+    """By how many percent the least-squares estimate follows the extrapolation of the truth."""
+    predicted = None if result.filtered is None else result.filtered.prediction
+    if not isinstance(twin.source, Extrapolated) or predicted is None:
+        return None
+    correction = twin.source.correction(twin.truth_values)
+    shift = np.linalg.lstsq(predicted.jacobian, correction)[0]
+    return vector(100 * np.abs(shift / twin.truth_values))
 
 
 def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements | str] | None:

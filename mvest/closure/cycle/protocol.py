@@ -73,6 +73,10 @@ class CycleProtocol:
         """Share of the closure at time ``t`` (s)."""
         return smooth_step(t / self.rise) - smooth_step((t - self.rise - self.hold) / self.fall)
 
+    def pressure(self, t: float, /) -> float:
+        """Transmitral pressure (mmHg) at time ``t`` (s)."""
+        return self.pressure_mmHg * self.phase(t)
+
     def steps(self, until: int | None = None) -> tuple[Step, ...]:
         """The time steps to the observed frame ``until`` (default: the last)."""
         wanted = self.times if until is None else self.times[: until + 1]

@@ -16,6 +16,8 @@ from mvest.typing import FloatArray
 
 RELEVANT_SHARE = 0.1
 """Smallest share of a parameter in a combination that is worth naming."""
+UNDETERMINED = ("not determined at all", "known to no better than its own size")
+"""Words for combinations without a standard deviation, and with one as large as their scales."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +93,37 @@ class Identifiability:
             widths = 1.0 / np.sqrt(self.eigenvalues)
         return tuple(
             f"{_combination(self.names, self.eigenvectors[:, i])}: "
-            + (f"known to ±{100 * width:.3g} %" if np.isfinite(width) else "not determined at all")
+            + (
+                f"known to ±{100 * width:.3g} %"
+                if width < 1.0
+                else UNDETERMINED[int(width < np.inf)]
+            )
             for i, width in enumerate(widths)
             if width > limit
         )
+
+    def measured(self, name: str, std: float) -> FloatArray:
+        """Smallest attainable standard deviations (p,) if one parameter is measured besides.
+
+        Parameters
+        ----------
+        name : str
+        std : float
+            Of the measurement, in the parameter's unit.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter, or the measurement has no positive standard deviation.
+        """
+        if name not in self.names or not std > 0.0:
+            raise InputError(f"measurement of {name!r} to {std}; known: {', '.join(self.names)}")
+        k = self.names.index(name)
+        more = np.zeros(len(self.names))
+        more[k] = self.scale[k] / std
+        rows = self.eigenvectors.T * np.sqrt(self.eigenvalues)[:, None]
+        s, V = _singular(np.vstack([rows, more]))
+        return np.sqrt(np.diagonal(_bound(self.scale, s, V)))
 
     def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[Confounded, ...]:
         """Groups of parameters that the data hardly tell apart, the largest group first.
@@ -180,10 +209,7 @@ def identifiability(
             raise InputError(
                 "the prior's covariance must be positive definite here; leave fixed parameters out"
             ) from error
-    _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < p)
-    s = np.concatenate([s, np.zeros(p - s.size)])
-    s[s <= s[0] * np.finfo(np.float64).eps * max(rows.shape)] = 0.0
-    s, V = s[::-1], Vt[::-1].T
+    s, V = _singular(rows)
 
     return Identifiability(
         names=names,
@@ -200,6 +226,15 @@ def cramer_rao_bound(
 ) -> FloatArray:
     """Smallest covariance (p, p) of an unbiased estimate; see `Identifiability.covariance`."""
     return identifiability(H, R, np.ones(np.shape(H)[-1]), prior=prior).covariance
+
+
+def _singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Singular values ``(p,)`` of ``rows (n, p)``, the smallest first, and right vectors (p, p)."""
+    p = rows.shape[1]
+    _, s, Vt = np.linalg.svd(rows, full_matrices=len(rows) < p)
+    s = np.concatenate([s, np.zeros(p - s.size)])
+    s[s <= s[0] * np.finfo(np.float64).eps * max(rows.shape)] = 0.0
+    return s[::-1], Vt[::-1].T
 
 
 def _bound(D: FloatArray, s: FloatArray, V: FloatArray) -> FloatArray:

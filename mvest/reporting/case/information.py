@@ -60,7 +60,8 @@ def columns_of(parameters: Sequence[UnknownRow], width: int) -> list[UnknownRow]
         chosen = [p for p in parameters if p.treatment in treatments]
         if len(chosen) == width:
             return chosen
-    return []
+    moduli = [p for p in parameters if p.is_modulus]
+    return moduli if len(moduli) == width else []
 
 
 def information(

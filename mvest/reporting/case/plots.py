@@ -226,7 +226,7 @@ def distances_figure(distances: Sequence[FrameDistances]) -> Figure:
 
 
 def narrow_figure(narrow: Sequence[Narrower]) -> Figure:
-    """By how much the standard deviation of a modulus would fall if something else were known."""
+    """By how much the standard deviation of a modulus would fall if more were measured."""
     if not narrow:
         raise InputError("the run did not ask what else would narrow the intervals")
     rows = sorted(narrow, key=lambda r: r.std_if_known / r.std_now, reverse=True)
@@ -240,7 +240,7 @@ def narrow_figure(narrow: Sequence[Narrower]) -> Figure:
     axes.axvline(100.0, color="0.4", linewidth=1, linestyle="--")
     axes.set_yticks(range(len(rows)), [r.what for r in rows])
     axes.set_xlim(0.0, max(112.0, *(1.08 * v for v in share)))
-    axes.set_xlabel("width of the interval if this were known, % of its width now")
+    axes.set_xlabel("width of the interval if this were measured, % of its width now")
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     return figure

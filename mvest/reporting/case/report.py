@@ -186,7 +186,7 @@ def _figures(
         (
             "narrow",
             lambda: narrow_figure(case.narrow),
-            "Standard deviation of the estimate if one more thing were known exactly.",
+            "Standard deviation of the estimate if one more thing were measured.",
         ),
     ]
 

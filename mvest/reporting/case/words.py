@@ -301,6 +301,50 @@ def error_rows(errors: Sequence[ErrorRow]) -> Rows:
     ]
 
 
+def iterate_rows(case: CaseFindings) -> Rows:
+    """One row for each unknown, one column for each step of the filter; last its objective."""
+    if not case.iterates:
+        return []
+    width = len(case.iterates[0])
+    columns = [
+        p.label + (f" [{p.unit}]" if p.unit else "") for p in columns_of(case.unknowns, width)
+    ]
+    labels = columns or [f"value {k + 1}" for k in range(width)]
+    steps = ["start", *map(str, range(1, len(case.iterates)))]
+    rows = [
+        {"unknown": label} | {s: number(m[k]) for s, m in zip(steps, case.iterates, strict=True)}
+        for k, label in enumerate(labels)
+    ]
+    objective = dict(zip(steps, map(number, case.objective), strict=False))
+    return (
+        [*rows, {"unknown": "misfit plus departure from the prior"} | objective]
+        if objective
+        else rows
+    )
+
+
+def iterate_words(case: CaseFindings) -> str:
+    """What the steps of the filter do not show, and why."""
+    if not case.iterates:
+        return f"Here the run kept no iterates; it ended before a step was taken: {case.reason}."
+    shown = columns_of(case.unknowns, len(case.iterates[0]))
+    if not shown:
+        return (
+            f"The run kept {len(case.iterates[0])} values a step and has {len(case.unknowns)} "
+            "unknowns; which value is whose it does not say."
+        )
+    names = {p.name for p in shown}
+    left = [p.label for p in case.unknowns if p.name not in names and p.treatment != "fixed"]
+    if not left:
+        return ""
+    return (
+        f"Without steps: {', '.join(left)}. They widen the intervals and keep their "
+        "values, so they have no steps."
+        if all(p.treatment == "considered" for p in case.unknowns if p.label in left)
+        else f"Without steps: {', '.join(left)}. The run kept the steps of the others alone."
+    )
+
+
 def whiteness_rows(tests: Sequence[WhitenessTest]) -> Rows:
     """The tests of the innovation."""
     return [
@@ -319,7 +363,7 @@ def narrow_words(narrow: Sequence[Narrower]) -> str:
     best = min(narrow, key=lambda r: r.std_if_known / r.std_now)
     share = 1 - best.std_if_known / best.std_now
     if share < 0.01:
-        return "Knowing any one of these exactly would narrow the interval by less than 1 %."
+        return "Measuring any one of these would narrow the interval by less than 1 %."
     return (
         f"Most would be gained here: {best.what}. The standard deviation would fall by "
         f"{percent(share)}, from {number(best.std_now)} to {number(best.std_if_known)}."

@@ -131,6 +131,28 @@ def test_discrepancies_are_ranked_without_sign() -> None:
     assert "contains the truth in 4 of 6 moduli" in said[3]
 
 
+def test_a_large_error_on_one_mesh_is_not_lost_in_the_mean_over_meshes() -> None:
+    errors = {"tet10": (16.4, 8.0, 5.0), "finer": (9.0, 2.0, -2.0), "law": (-1.0, 0.5, 0.1),
+              "ratio": (-12.0, -12.5, -12.1), "chords": (1.2, 1.3, 1.1)}  # fmt: skip
+    cells = [(36, 4, 1), (54, 6, 1), (72, 8, 1)]
+    jobs = [
+        job(
+            {"truth": name},
+            [run(1, TRUTH * [1.0, 1 + e / 100], [0.1, 0.1])],
+            hash=f"{name}{k}",
+            model={"element": "hex18", "cells": cells[k]},
+        )
+        for name, percent in errors.items()
+        for k, e in enumerate(percent)
+    ]
+    said = conclusions(sweep("discrepancy", jobs))
+    assert said[0].endswith("“tet10”: +16.4 % of the posterior modulus on 36 x 4 x 1 cells.")
+    assert said[1] == (
+        "Next come “ratio” (-12.5 %, posterior on 54 x 6 x 1 cells), “finer” (+9 %, posterior on "
+        "36 x 4 x 1 cells) and “chords” (+1.3 %, posterior on 54 x 6 x 1 cells)."
+    )
+
+
 def test_covariance_says_which_matters() -> None:
     jobs = []
     for varied, error, std in (("P0", 5.0, 0.1), ("R", 0.05, 1.0)):

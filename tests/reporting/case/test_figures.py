@@ -300,7 +300,8 @@ def test_columns_belong_to_the_parameters_that_fit(case) -> None:
     all_of_them = case[0].unknowns
     assert columns_of(all_of_them, 3) == list(all_of_them[:3])
     assert len(columns_of(all_of_them, 4)) == 4
-    assert columns_of(all_of_them, 2) == []
+    assert columns_of(all_of_them, 2) == [p for p in all_of_them if p.is_modulus]
+    assert columns_of(all_of_them, 1) == []
 
 
 def test_both_maps_of_a_modulus_have_one_scale(case, fields) -> None:
@@ -364,7 +365,7 @@ def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
 
 def test_iterations_that_fit_no_parameters_are_refused(case) -> None:
     with pytest.raises(InputError, match="fit no choice"):
-        iterations_figure(replace(case[0], iterates=((1.0, 2.0),)))
+        iterations_figure(replace(case[0], iterates=((1.0,),)))
     titles = [axes.get_title() for axes in iterations_figure(case[0]).axes]
     assert len(titles) == 3
 

@@ -291,6 +291,26 @@ def test_a_donor_tricuspid_valve_is_named_as_one(case) -> None:
     assert words.badges(findings) == ["SIMULATED", "NOT FOR DIAGNOSIS"]
 
 
+def test_the_steps_of_a_failed_run_are_of_all_unknowns_or_say_of_which(case) -> None:
+    findings = case[0]
+    every = words.iterate_rows(findings)
+    shown = [p.label for p in findings.unknowns if p.treatment == "estimated"]
+    assert [row["unknown"].partition(" [")[0] for row in every[:-1]] == shown
+    assert every[0]["start"] == "4"
+    assert every[0]["3"] == "5.8"
+    # The objective of a step at which the model failed is not known.
+    failed = replace(findings, converged=False, objective=(920.0, 340.0, 301.0, None))
+    assert words.iterate_rows(failed)[-1]["3"] == "–"
+    # Two columns of three estimated unknowns: those of the moduli, and what of the third.
+    moduli = replace(findings, iterates=((4.0, 3.0), (5.2, -2.4)))
+    assert len(words.iterate_rows(moduli)) == 3
+    assert "Without steps: " in words.iterate_words(moduli)
+    assert findings.unknowns[2].label in words.iterate_words(moduli)
+    odd = replace(findings, iterates=((4.0,),))
+    assert words.iterate_rows(odd)[0]["unknown"] == "value 1"
+    assert "which value is whose it does not say" in words.iterate_words(odd)
+
+
 def test_a_run_that_did_not_converge_says_so_at_the_top(case) -> None:
     # Its last iterate still stands in the answer.
     assert "RUN FAILED" in words.badges(replace(case[0], converged=False))

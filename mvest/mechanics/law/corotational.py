@@ -1,0 +1,157 @@
+r"""The usual corotational tetrahedron, which the paper's simulation has: linear, in a turned frame.
+
+The force of an element at positions x is that of linear elasticity in a frame that turns with it,
+
+.. math:: f = R K (R^T x - X), \qquad K = V B^T C B,
+
+with the element's own R: of the matrix of its edges from its first node, :math:`A = (x_1 - x_0, x_2
+- x_0, x_3 - x_0)`, the polar factor at x times the inverse of that at X. (It is the "polar" form of
+SOFA's tetrahedra; R is not the polar factor of the deformation gradient.) The tangent is taken at
+fixed R: :math:`R K R^T`. Neither is exact for a law with an energy; :mod:`mvest.mechanics.law.biot`
+is what replaces it here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvest.errors import InputError
+from mvest.mechanics.law.moduli import LeafletModuli
+from mvest.mechanics.parameters import Parameter, known_names
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.mesh.solid_mesh import SolidMesh
+
+__all__ = ["CorotationalLaw", "EdgeRotations"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorotationalLaw:
+    """Stress ``C : (e + rate (e - e_n))`` of the linear strain e in the frame of the element.
+
+    What :class:`mvest.mechanics.solid.Law` calls Green-Lagrange strain is e here, and the second
+    Piola-Kirchhoff stress is the stress in that frame.
+
+    Attributes
+    ----------
+    stiffness : ndarray
+        ``(n_regions, 6, 6)`` MPa.
+    moduli : tuple of LeafletModuli
+        What the stiffness was made of, one per region.
+    """
+
+    stiffness: FloatArray
+    moduli: tuple[LeafletModuli, ...]
+
+    @classmethod
+    def of_moduli(cls, moduli: Sequence[LeafletModuli]) -> CorotationalLaw:
+        """The law with the moduli of each region; MaterialError if some are inadmissible."""
+        return cls(np.array([m.material.stiffness for m in moduli]), tuple(moduli))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The parameters that the law knows."""
+        return ("E_f", "ratio", "G")
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """The strain itself."""
+        return green
+
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
+        tangent = np.repeat((1 + rate) * self.stiffness[region, None], green.shape[1], axis=1)
+        return self._stress(self.stiffness[region], green, previous, rate), tangent
+
+    @staticmethod
+    def _stress(
+        stiffness: FloatArray, strain: FloatArray, previous: FloatArray, rate: float
+    ) -> FloatArray:
+        return np.einsum("eij,eqj->eqi", stiffness, (1 + rate) * strain - rate * previous)
+
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """Derivative of the stress by a parameter of region ``which``; InputError if of no use."""
+        if parameter.kind not in self.kinds:
+            raise InputError(
+                f"parameter {parameter.name!r}: the law of the leaflets knows "
+                f"{known_names(self.kinds)}"
+            )
+        by = np.zeros_like(self.stiffness)
+        by[which] = self.moduli[which].stiffness_by(parameter.kind)
+        return self._stress(by[region], green, previous, rate)
+
+    def history_stress(
+        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Change of the stress for a change of the previous strain: ``-rate C d``."""
+        return -rate * np.einsum("eij,eqj->eqi", self.stiffness[region], d_previous)
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """The change of the strain itself."""
+        return d_green
+
+
+class EdgeRotations:
+    """Frames of linear tetrahedra that turn with their edges.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    frames : ndarray
+        ``(e, 1, 3, 3)`` fibre frames, columns as in :mod:`mvest.mechanics.solid`.
+
+    Raises
+    ------
+    InputError
+        If the elements are not linear tetrahedra.
+    """
+
+    def __init__(self, mesh: SolidMesh, frames: FloatArray) -> None:
+        if mesh.element_type != "tet4":
+            raise InputError(
+                f"the corotational law is that of linear tetrahedra (tet4), not {mesh.element_type}"
+            )
+        self._elements = mesh.elements
+        self._start = _polar(self._edges(mesh.nodes))
+        self._frames = frames
+
+    def _edges(self, x: FloatArray) -> FloatArray:
+        corners = x[self._elements]
+        return np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+
+    def __call__(self, x: FloatArray, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Linear strain ``(e, 1, 6)`` in the turned frames, and these ``(e, 1, 3, 3)``.
+
+        Parameters
+        ----------
+        x : ndarray
+            ``(n, 3)`` mm.
+        deformation : ndarray
+            ``(e, 1, 3, 3)`` F in the fibre frame.
+        """
+        rotation = _polar(self._edges(x)) @ np.swapaxes(self._start, 1, 2)
+        frames = rotation[:, None] @ self._frames
+        h = np.swapaxes(frames, 2, 3) @ deformation - np.eye(3)
+        normal = [h[..., i, i] for i in range(3)]
+        shear = [h[..., i, j] + h[..., j, i] for i, j in ((1, 2), (0, 2), (0, 1))]
+        return np.stack(normal + shear, axis=-1), np.ascontiguousarray(frames)
+
+
+def _polar(a: FloatArray) -> FloatArray:
+    """The rotation ``(e, 3, 3)`` that is nearest to each matrix, also where one is inverted."""
+    u, _, v = np.linalg.svd(a)
+    u[..., 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
+    return u @ v
