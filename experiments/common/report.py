@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
-
-import pandas as pd
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from experiments.common.record import Record
 from mvest.files import write_atomically
-from mvest.reporting.figures import save_figure_with
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 __all__ = [
     "answer_of_main",
@@ -86,6 +86,13 @@ def cautions(records: Sequence[Record[Any]]) -> list[str]:
     ]
 
 
+def _saved(base: Path, figure: Figure, line: str) -> list[Path]:
+    # Imports matplotlib, which a job without figures does not need.
+    from mvest.reporting.figures import save_figure_with
+
+    return save_figure_with(base, figure, line)
+
+
 def write_report(
     folder: Path,
     record: Record[F],
@@ -105,7 +112,7 @@ def write_report(
     return [
         write_atomically(base.with_suffix(".csv"), lambda path: table.to_csv(path, index=False)),
         write_atomically(base.with_suffix(".md"), text),
-        *([] if figure is None else save_figure_with(base, figure, record.line)),
+        *([] if figure is None else _saved(base, figure, record.line)),
     ]
 
 
@@ -131,7 +138,7 @@ def write_each(
                 other = draw(record)
                 if other is not None:
                     base = folder / f"{record.experiment}_{name}"
-                    written += save_figure_with(base, other, record.line)
+                    written += _saved(base, other, record.line)
         return written
 
     return write
@@ -160,7 +167,7 @@ def write_drawn(
                 write_atomically(base.with_suffix(".md"), page(record, words(record))),
             ]
             if name in arrays:
-                written += save_figure_with(base, figure(record, arrays[name]), record.line)
+                written += _saved(base, figure(record, arrays[name]), record.line)
         return written
 
     return write
