@@ -16,7 +16,8 @@ from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
-from mvest.personalise.chain import expect_case
+from mvest.personalise.chain import design_case, expect_case
+from mvest.personalise.design import design_text
 from mvest.problem.expectation import Expectation, expect, expect_of_model
 from mvest.problem.synthetic import simulate_observation
 from mvest.provenance import config_hash
@@ -104,11 +105,19 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     case = read_configured(config["case"])
     settings = settings_of(config, build(PersonalSettings, config["personal"]))
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        expected = expect_case(case, settings, store=meshes_of(config), on_step=bar.step)
+        store = meshes_of(config)
+        expected = expect_case(case, settings, store=store, on_step=bar.step)
+        designs = design_case(case, settings, store=store, on_step=bar.step)
     uncertainty = case.uncertainty
     length = uncertainty.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"
-    return _words(case.name, expected, f"{uncertainty.typical_mm:.3g} mm of noise stated, {errors}")
+    noise = f"{uncertainty.typical_mm:.3g} mm of noise stated, {errors}"
+    further = (
+        f"{case.name}: what further closed frames would tell is not known ({designs})"
+        if isinstance(designs, str)
+        else design_text(case.name, designs)
+    )
+    return f"{_words(case.name, expected, noise)}\n{further}"
 
 
 def expect_cycle(config: Values, _folder: Path | None = None) -> str:

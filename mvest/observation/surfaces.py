@@ -269,7 +269,12 @@ class SurfaceObservation:
     @property
     def y(self) -> FloatArray:
         """Zeros: the seen points have no distance to the surface that was seen."""
-        return np.zeros(sum(self.size_of(seen) for seen in self.seen))
+        return np.zeros(sum(self.sizes))
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many numbers of ``y`` are of each frame."""
+        return tuple(self.size_of(seen) for seen in self.seen)
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
         """The distances of what was seen to what a model predicts.

@@ -101,6 +101,11 @@ class Observation:
         """Stacked coordinates ``(3 k,)`` mm of the k vertices that are seen, frame by frame."""
         return self.positions[self.seen].ravel()
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many numbers of ``y`` are of each frame."""
+        return tuple((3 * self.seen.sum(axis=1)).tolist())
+
     def of(self, model: ObservationModel, /) -> ObservationModel:
         """What a model predicts of this observation; see :func:`observed_frames`."""
         return observed_frames(model, self.frames, self.seen, self.predicted)
@@ -115,10 +120,9 @@ class Observation:
     @property
     def R(self) -> NoiseCovariance:
         """Covariance in mm² of ``y``: its variances ``(3 k,)``, or factorised if correlated."""
-        counts = 3 * self.seen.sum(axis=1)
         correlation = self.correlation
         if correlation is None:
-            variance = np.repeat(self.variance, counts)
+            variance = np.repeat(self.variance, self.sizes)
             if self.scale is None:
                 return variance
             return np.asarray(

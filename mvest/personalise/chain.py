@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.closure.frames import is_frame_pressure
+from mvest.closure.frames import SCALE, is_frame_pressure
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.evidence import LearnedNoise
@@ -19,8 +19,10 @@ from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.information.design import Design
 from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
 from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
+from mvest.estimation.prediction import Predicted, predict
 from mvest.estimation.sampled import SampledErrors, SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.update import kalman_update
@@ -36,6 +38,7 @@ from mvest.observation.surfaces import (
 )
 from mvest.observation.vertices import Observation
 from mvest.personalise.considered_geometry import geometry_columns
+from mvest.personalise.design import SHARES, FrameDesigns, StatedErrors
 from mvest.personalise.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
@@ -44,14 +47,19 @@ from mvest.personalise.geometry_errors import (
 )
 from mvest.personalise.model import build_model, frames_model, held_state, with_pressures
 from mvest.personalise.result import FrameDistance, Personalised
-from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
+from mvest.personalise.settings import (
+    PaperSettings,
+    PersonaliseSettings,
+    PressureErrors,
+    Treatment,
+)
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.expectation import Expectation, expect
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["expect_case", "personalise_case"]
+__all__ = ["design_case", "expect_case", "personalise_case"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
@@ -175,6 +183,50 @@ BETTER = 5.0
 """How many times as well as beforehand a nuisance may be measured."""
 
 
+def design_case(
+    case: ValveCase,
+    settings: PersonaliseSettings,
+    *,
+    store: Path | None = None,
+    on_step: OnStep | None = None,
+) -> FrameDesigns | str:
+    """What several closed frames of a case would tell, or why that is not known.
+
+    The frames are held and seen as the closed one, under shares of its pressure (`SHARES`): one
+    closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
+    out.
+    """
+    closed = case.frame(Role.CLOSED)
+    pressures = tuple(share * closed.pressure_mmHg for share in SHARES)
+    frames = [
+        replace(
+            closed,
+            name=str(k),
+            time=closed.time + k,
+            role=Role.FITTED if k else Role.CLOSED,
+            pressure_mmHg=pressure,
+        )
+        for k, pressure in enumerate(pressures)
+    ]
+    case = replace(case, frames=(case.frame(Role.REFERENCE), *frames), error_samples=None)
+    stated = settings.pressures or PressureErrors(0.0, 0.0)
+    # As unknowns they are differentiated by; how large they are is for the designs to say.
+    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
+    chain = _Chain(case, replace(settings, pressures=differentiated), store, on_step)
+    start = chain.shared.start
+    generic = chain.shared(start)
+    if not generic.converged:
+        return generic.reason
+    chain.consider_geometry(start, generic.y)
+    return FrameDesigns(
+        pressures,
+        chain.designs(start, generic),
+        chain.knowledge(),
+        StatedErrors(chain.knowledge().get(SCALE, 0.0), stated.offset_mmHg, stated.each_mmHg),
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frames:
     generic: Mapping[str, FloatArray]
@@ -254,6 +306,38 @@ class _Chain:
         self.considered = columns
         if self.errors is not None:
             self.errors = replace(self.errors, base=self.noise())
+
+    def designs(self, m: FloatArray, predicted: Predicted) -> tuple[Design, ...]:
+        """What each fitted frame says of all unknowns and of what is considered, by its number."""
+        observation = self.plain_observation()
+        H = predict(observation.of(lambda _: predicted), m, derivatives=True).jacobian
+        H = np.concatenate([H, *(own.columns for own in self.considered)], axis=1)
+        values = np.array([u.mean if u.is_positive else 1.0 for u in self.unknowns])
+        names = (*self.names, *self.modes)
+        values = np.concatenate([values, np.ones(len(self.modes))])
+        noise = self.noise(geometry=0.0)
+        # Errors of different frames are independent: without the others' rows a frame is by itself.
+        of_frame = np.repeat([int(frame.name) for frame in self.fitted], observation.sizes)
+        return tuple(
+            Design.of(np.where(of_frame[:, None] == k, H, 0.0), noise, values, names)
+            for k in range(len(self.fitted))
+        )
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the columns of what is considered of the geometry."""
+        return tuple(
+            f"geometry.{k}" for k in range(sum(c.columns.shape[1] for c in self.considered))
+        )
+
+    def knowledge(self) -> dict[str, float]:
+        """Prior standard deviations, relative of what is positive, but of pressures' errors."""
+        own = {
+            u.name: u.std / (u.mean if u.is_positive else 1.0)
+            for u in self.unknowns
+            if not is_frame_pressure(u.name)
+        }
+        return own | dict.fromkeys(self.modes, 1.0)
 
     def renewed(self, result: StudyResult) -> StudyResult:
         """The estimation once more, with the geometry's errors as they are at its estimate."""

@@ -55,7 +55,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         }
     ratio = after.std / prior.std
     by_frame = {one.frame: one for one in fit.distances}
-    fitted = by_frame.get(closed.name)
+    shown = [one for one in fit.distances if one.seen] if closed.name in by_frame else []
     innovation = filtered.innovation
     return Indications(
         estimated=True,
@@ -78,8 +78,9 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         alike=None
         if innovation is None or result.observation is None
         else _alike(result.observation, innovation.standardised),
-        residual_mm=None if fitted is None else float(np.nanmean(fitted.personalised)),
-        generic_mm=None if fitted is None else float(np.nanmean(fitted.registered)),
+        # Of all that were fitted, which have one displacement in common.
+        residual_mm=_mean([one.personalised for one in shown]),
+        generic_mm=_mean([one.registered for one in shown]),
         held_out=tuple(
             Held(
                 one.frame,
@@ -105,6 +106,11 @@ def _approximation(check: ApproximationCheck | None) -> str | None:
     if check is None:
         return None
     return "" if check.value <= APPROXIMATION * check.limit else check.sentence
+
+
+def _mean(distances: list[FloatArray]) -> float | None:
+    """Mean distance over frames, None without any."""
+    return float(np.mean([np.nanmean(one) for one in distances])) if distances else None
 
 
 def _alike(observation: Observed, standardised: FloatArray) -> float | None:

@@ -1,0 +1,1 @@
+"""How many closed frames, and how well known pressures, it takes to know the moduli."""
