@@ -154,6 +154,8 @@ class MadeUpClosure:
     def predict_held(self, m: np.ndarray, states: Sequence[HeldState]) -> list[Prediction]:
         """The closed frame by the formula, and those under other loads, with derivatives."""
         whole = self(m)
+        if not whole.converged:
+            return [whole]
         half = len(whole.y) // 2
         parts = [replace(whole, y=whole.y[half:], jacobian=whole.jacobian[half:])]
         for state in states:

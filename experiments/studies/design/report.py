@@ -98,7 +98,9 @@ def design_words(records: Records) -> str:
             "",
             f"Geometry {geometry}:",
             "",
-            "| errors of the pressures | " + " | ".join(f"{n} frames" for n in counts) + " |",
+            "| errors of the pressures | "
+            + " | ".join(f"{n} frame{'s' * (n > 1)}" for n in counts)
+            + " |",
             "|---" * (1 + len(counts)) + "|",
         ]
         own = table[table["geometry"] == geometry]
