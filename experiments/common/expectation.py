@@ -16,7 +16,7 @@ from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
-from mvest.personalise.chain import design_case, expect_case
+from mvest.personalise.chain import foresee_case
 from mvest.personalise.design import design_text
 from mvest.problem.expectation import Expectation, expect, expect_of_model
 from mvest.problem.synthetic import simulate_observation
@@ -106,8 +106,7 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     settings = settings_of(config, build(PersonalSettings, config["personal"]))
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
         store = meshes_of(config)
-        expected = expect_case(case, settings, store=store, on_step=bar.step)
-        designs = design_case(case, settings, store=store, on_step=bar.step)
+        expected, designs = foresee_case(case, settings, store=store, on_step=bar.step)
     uncertainty = case.uncertainty
     length = uncertainty.correlation_length_mm
     errors = f"alike over {length:g} mm" if length else "independent"

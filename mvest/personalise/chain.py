@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.frames import SCALE, is_frame_pressure
+from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.evidence import LearnedNoise
@@ -59,7 +60,7 @@ from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["design_case", "expect_case", "personalise_case"]
+__all__ = ["design_case", "expect_case", "foresee_case", "personalise_case"]
 
 BORDER = 3.0
 """Standard deviations from the border of the leaflets within which points are not compared."""
@@ -67,6 +68,9 @@ BORDER = 3.0
 MAX_VERTICES = 2000
 """Vertices of a frame that are compared: more, nearer to each other than errors are alike, say
 nothing new, and their correlation is factorised."""
+
+BETTER = 5.0
+"""How many times as well as beforehand a nuisance may be measured."""
 
 OnStep = Callable[[float, int], None]
 
@@ -168,19 +172,30 @@ def expect_case(
     store: Path | None = None,
     on_step: OnStep | None = None,
 ) -> Expectation:
-    """What the closed frame of a case will tell, found out with one closure; see `personalise`.
+    """What the frames of a case will tell, found out with one closure; see `personalise`.
 
     Errors that samples of the frames tell of are left out: each sample would be a closure.
     """
-    chain = _Chain(case, settings, store, on_step)
+    return _expected(_Chain(case, settings, store, on_step))
+
+
+def _expected(chain: _Chain) -> Expectation:
     generic = chain.shared(chain.shared.start)
     if generic.converged:
         chain.consider_geometry(chain.shared.start, generic.y)
     return expect(chain.problem(chain.filter), chain.observation())
 
 
-BETTER = 5.0
-"""How many times as well as beforehand a nuisance may be measured."""
+def foresee_case(
+    case: ValveCase,
+    settings: PersonaliseSettings,
+    *,
+    store: Path | None = None,
+    on_step: OnStep | None = None,
+) -> tuple[Expectation, FrameDesigns | str]:
+    """`expect_case` and `design_case` together, with one closure."""
+    chain = _Chain(case, settings, store, on_step)
+    return _expected(chain), _designed(case, settings, chain.model)
 
 
 def design_case(
@@ -196,6 +211,14 @@ def design_case(
     closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
     out.
     """
+    model = build_model(case, settings, store)
+    model.on_step = on_step
+    return _designed(case, settings, model)
+
+
+def _designed(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel
+) -> FrameDesigns | str:
     closed = case.frame(Role.CLOSED)
     pressures = tuple(share * closed.pressure_mmHg for share in SHARES)
     frames = [
@@ -213,9 +236,9 @@ def design_case(
     # As unknowns they are differentiated by; how large they are is for the designs to say.
     free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
     differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
-    chain = _Chain(case, replace(settings, pressures=differentiated), store, on_step)
+    chain = _Chain(case, replace(settings, pressures=differentiated), None, None, model=model)
     start = chain.shared.start
-    generic = chain.shared(start)
+    generic = chain.registered(start)
     if not generic.converged:
         return generic.reason
     chain.consider_geometry(start, generic.y)
@@ -245,6 +268,7 @@ class _Chain:
         store: Path | None,
         on_step: OnStep | None,
         on_iterate: OnIterate | None = None,
+        model: ClosureModel | None = None,
     ) -> None:
         self.case, self.settings = case, with_pressures(case, settings)
         settings = self.settings
@@ -254,8 +278,10 @@ class _Chain:
                 f"case {case.name}: error samples and several fitted frames; expected one closed "
                 "frame, or no samples"
             )
-        self.model = build_model(case, settings, store)
-        self.model.on_step = on_step
+        if model is None:
+            model = build_model(case, settings, store)
+            model.on_step = on_step
+        self.model = model
         self.frames = frames_model(case, settings, self.model)
         self.on_iterate = on_iterate
         free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]

@@ -85,7 +85,7 @@ def design_answer(records: Records) -> str:
 def design_words(records: Records) -> str:
     """Markdown of the tables and the words around them."""
     table = design_table(records)
-    counts = sorted(table["frames"].unique())
+    counts = sorted(map(int, table["frames"].unique()))
     lines = [
         f"**{design_answer(records)}**",
         "",
@@ -166,7 +166,7 @@ def design_figure(records: Records) -> Figure:
     table = design_table(records)
     geometries = list(table["geometry"].unique())
     figure, axes = panels(len(geometries), 3, 2.5 * len(geometries) + 1.1, sharex=True, sharey=True)
-    counts = sorted(table["frames"].unique())
+    counts = sorted(map(int, table["frames"].unique()))
     for row, geometry in enumerate(geometries):
         for column, (kind, words) in enumerate(KIND_WORDS.items()):
             one = axes[row, column]

@@ -331,12 +331,15 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
     assert "In order; drawn in" in out
     written = {path.name for path in (tmp_path / "outputs").rglob("*") if path.is_file()}
     assert {name for name in written if not name.startswith(".")} == {"case.png", "case.pdf"}
-    # One closure, at the prior's means; the values that were seen play no part.
+    # One valve is closed, at the prior's means; the values that were seen play no part.
     (model,) = built
-    (at,) = model.calls
-    assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
+    for at in model.calls:
+        assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
     assert "864 numbers of closed; 0.3 mm of noise stated, alike over 8 mm" in out
     assert "No estimation was run." in out
+    # The same valve goes on to further pressures, for what several frames would tell.
+    assert [s.pressure_mmHg for s in model.states] == pytest.approx([87.5, 75.0, 62.5, 50.0])
+    assert "closed frames like this one under 100, 87.5, 75, 62.5, 50 mmHg" in out
     # The formula's belly is pressure over stiffness, and its other parts tell the pressure.
     rows = {line.split()[0]: line.split() for line in out.splitlines() if line.strip()}
     for name in model.names:
