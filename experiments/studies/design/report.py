@@ -187,7 +187,9 @@ def design_figure(records: Records) -> Figure:
             if row == len(geometries) - 1:
                 one.set_xlabel("closed frames")
         axes[row, 0].set_ylabel(f"left of the guess's error (%)\ngeometry {geometry}")
-    axes[0, -1].legend(fontsize=SMALL - 1, frameon=False, title="SD", title_fontsize=SMALL - 1)
+    axes[-1, -1].legend(
+        fontsize=SMALL - 1, frameon=False, title="SD", title_fontsize=SMALL - 1, loc="best", ncols=2
+    )
     headline(
         figure,
         "More frames cure an offset and errors of each pressure, not a factor on all",
