@@ -66,7 +66,8 @@ def test_derivatives_agree_with_differences(frames, k):
 
     exact = prediction.jacobian[:, k]
     assert np.linalg.norm(exact) > 1e-3
-    _, fine, best = step_study(exact, run, M, k, 8e-4)
+    # Errors are a hundredth of the pressure: steps relative to them would be lost in round-off.
+    _, fine, best = step_study(exact, run, M, k, 8e-4 if k < len(NAMES) else 1.6e-2)
     assert fine < 1e-5
     assert best < 1e-7
 
