@@ -16,22 +16,22 @@ import numpy as np
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics.reference import RestVariation, vary_equilibrium
+from mvest.mechanics.solver import EXACT
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
     held_loading,
+    patch_change,
     patch_members,
 )
-from mvest.typing import FloatArray
-from mvest.valve.anatomy.band import leaflet_normals
-from mvest.valve.anatomy.valve import lumped_areas
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.band import leaflet_normals, leaflet_normals_change
+from mvest.valve.anatomy.valve import lumped_areas_change
 from mvest.valve.geometry.proximity import ClosestPoints, closest_points
 from mvest.valve.geometry.triangles import unit_rows
+from mvest.valve.mesh.embedding import Embedding, embed
 
 __all__ = ["RestGeometry"]
-
-SMALL = 1e-3
-"""mm, by which vertices are moved to differentiate normals and areas, which are smooth."""
 
 
 class RestGeometry:
@@ -83,6 +83,18 @@ class RestGeometry:
         points = self.model.contact_valve.surface.vertices
         return closest_points(points, self.surface.vertices, self.surface.triangles)
 
+    @cached_property
+    def _sampled(self) -> Embedding:
+        """The samples of contact in the mesh."""
+        return embed(self.model.mesh, self.model.contact_valve.surface.vertices)
+
+    @cached_property
+    def _patches(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        model = self.model
+        return patch_members(
+            model.contact_valve, model.settings.patch_radius, model.valve.chordae.insertion
+        )
+
     def _at(self, points: ClosestPoints, values: FloatArray) -> FloatArray:
         return points.interpolate(values, self.surface.triangles)
 
@@ -92,25 +104,34 @@ class RestGeometry:
     def shape(self, moves: FloatArray) -> RestVariation:
         """Of the open shape, by displacements ``(q, n, 3)`` mm of the surface's vertices.
 
-        The annulus and the papillary tips of the closed valve stay where they are.
+        The annulus and the papillary tips of the closed valve stay where they are; the chordae go
+        with the leaflets.
         """
-        surface, contact = self.surface, self.model.contact_valve.surface
-        nodes, areas = [], []
-        for move in moves:
-            tilt = (
-                leaflet_normals(surface, surface.vertices + SMALL * move)
-                - leaflet_normals(surface, surface.vertices - SMALL * move)
-            ) / (2 * SMALL)
-            turn = self._at(self._closest, tilt)
-            turn /= np.linalg.norm(self._at(self._closest, self._normals), axis=1)[:, None]
-            turn -= np.sum(turn * self._normal, axis=1)[:, None] * self._normal
-            nodes.append(self._at(self._nodes, move) + self._height[:, None] * turn)
-            there = SMALL * self._at(self._samples, move)
-            ahead, behind = (
-                lumped_areas(contact.vertices + sign * there, contact.triangles) for sign in (1, -1)
-            )
-            areas.append((ahead - behind) / (2 * SMALL))
-        return RestVariation(np.array(nodes), areas=np.array(areas))
+        contact, by_vertex = self.model.contact_valve.surface, np.moveaxis(moves, 0, -1)
+        members, weights, slope = self._patches
+        turn = self._at(self._closest, leaflet_normals_change(self.surface, by_vertex))
+        turn /= np.linalg.norm(self._at(self._closest, self._normals), axis=1)[:, None, None]
+        turn -= self._normal[:, :, None] * np.einsum("ni,niq->nq", self._normal, turn)[:, None]
+        nodes = self._at(self._nodes, by_vertex) + self._height[:, None, None] * turn
+        samples = self._sampled(nodes)
+        areas = lumped_areas_change(contact.vertices, contact.triangles, samples).T
+        ends = self._ends(by_vertex)[:, None] - samples[members]
+        wider = (areas / contact.areas)[:, members]
+        return RestVariation(
+            np.ascontiguousarray(np.moveaxis(nodes, -1, 0)),
+            areas=areas,
+            patches=patch_change(weights, slope, np.moveaxis(ends, -1, 0), wider),
+            members=members,
+        )
+
+    def along_ends(self) -> FloatArray:
+        """Two directions ``(c, 2, 3)`` along the leaflet where each chord ends."""
+        return np.linalg.svd(unit_rows(self._ends(self._normals))[:, None])[2][:, 1:]
+
+    def _ends(self, values: FloatArray) -> FloatArray:
+        """Values at the chordae's ends, of those ``(n, ...)`` at the surface's vertices."""
+        own, chordae = self.surface, self.model.valve.chordae
+        return self._at(closest_points(chordae.insertion, own.vertices, own.triangles), values)
 
     def thickness(self, factors: FloatArray) -> RestVariation:
         """Of the thickness, by relative changes ``(q, n)`` at the surface's vertices."""
@@ -144,15 +165,17 @@ class RestGeometry:
 
     def insertions(self, moves: FloatArray) -> RestVariation:
         """Of where the chordae end, by displacements ``(q, c, 3)`` mm at rest."""
-        model = self.model
-        members, _, slope = patch_members(
-            model.contact_valve, model.settings.patch_radius, model.valve.chordae.insertion
-        )
-        patches = np.einsum("csi,qci->qcs", slope, moves)
+        members, weights, slope = self._patches
+        ends = np.broadcast_to(moves[:, :, None], (len(moves), *slope.shape))
+        patches = patch_change(weights, slope, ends)
         return RestVariation(self._still(len(moves)), patches=patches, members=members)
 
     def change(
-        self, m: FloatArray, variation: RestVariation, states: Sequence[HeldState] = ()
+        self,
+        m: FloatArray,
+        variation: RestVariation,
+        states: Sequence[HeldState] = (),
+        tolerance: float = EXACT,
     ) -> FloatArray | str:
         """Derivatives ``(f, n, 3, q)`` of the observed open and closed valve, or why none.
 
@@ -165,6 +188,8 @@ class RestGeometry:
         variation : RestVariation
         states : sequence of HeldState
             Under other loads, gone to from the closed valve.
+        tolerance : float
+            Of each derivative, relative.
         """
         model = self.model
         if model.closed is None or not np.array_equal(model.closed.at, m):
@@ -181,7 +206,7 @@ class RestGeometry:
             held = held_loading(system, model.contact_valve, state)
             ends.append((end.frames[-1], held(0.0)))
         moves = [
-            vary_equilibrium(system, model.solver, positions, loads, variation)
+            vary_equilibrium(system, model.solver, positions, loads, variation, tolerance)
             for positions, loads in ends
         ]
         frames = (variation.nodes, *moves[1:], moves[0])

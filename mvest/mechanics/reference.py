@@ -25,7 +25,7 @@ import numpy as np
 from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.solid import Solid
-from mvest.mechanics.solver import LinearSolver
+from mvest.mechanics.solver import EXACT, LinearSolver
 from mvest.mechanics.system import Loads, System
 from mvest.typing import FloatArray, IntArray
 
@@ -103,6 +103,7 @@ def vary_equilibrium(
     x: FloatArray,
     loads: Loads,
     variation: RestVariation,
+    tolerance: float = EXACT,
 ) -> FloatArray:
     """Derivatives ``(q, n, 3)`` mm of an equilibrium by what varies at rest.
 
@@ -115,6 +116,8 @@ def vary_equilibrium(
         Nodal positions in equilibrium.
     loads : Loads
     variation : RestVariation
+    tolerance : float
+        Of each derivative, relative.
     """
     solid = system.solid
     pairs = system.search_contact(x)
@@ -126,7 +129,8 @@ def vary_equilibrium(
         r[k] += _outside_change(system, x, loads, pairs, variation, k)
     r[:, system.held] = 0.0
     right = -r.reshape(len(variation), -1).T
-    return np.ascontiguousarray(solver.solve(np.ascontiguousarray(right)).T).reshape(r.shape)
+    dx = solver.solve(np.ascontiguousarray(right), tolerance)
+    return np.ascontiguousarray(dx.T).reshape(r.shape)
 
 
 def _solid_change(solid: Solid, x: FloatArray, variation: RestVariation) -> FloatArray:

@@ -307,9 +307,9 @@ def _fibre_gradients(mesh: SolidMesh, reference: Element) -> tuple[FloatArray, F
     """Gradients ``(e, q, k, 3)`` along the fibre frame and quadrature volumes ``(e, q)``."""
     x_e = mesh.nodes[mesh.elements]
     d = reference.gradient(reference.points)
-    jacobian = np.einsum("eai,qaj->eqij", x_e, d)
+    jacobian = np.matmul(x_e.transpose(0, 2, 1)[:, None], d)
     frame = _fibre_frames(mesh, reference, jacobian)
-    gradients = np.einsum("qaj,eqji,eqim->eqam", d, np.linalg.inv(jacobian), frame)
+    gradients = d @ (np.linalg.inv(jacobian) @ frame)
     return np.ascontiguousarray(gradients), np.linalg.det(jacobian) * reference.weights
 
 

@@ -43,6 +43,7 @@ __all__ = [
     "factors_of",
     "held_loading",
     "material_law",
+    "patch_change",
     "patch_members",
     "retune",
     "variation_of",
@@ -299,8 +300,9 @@ def patch_members(
         Vertices; padding has the weight zero.
     weights : (c, s)
         Rows sum to one.
-    by_insertion : (c, s, 3) 1/mm
-        Derivatives of the weights by the place of the insertion.
+    slope : (c, s, 3) 1/mm
+        Derivatives of the weights by the place of the insertion, before rows are made to sum to
+        one again; see `patch_change`.
     """
     vertices, areas = valve.surface.vertices, valve.surface.areas
     rows = []
@@ -313,16 +315,32 @@ def patch_members(
         weight = areas[inside] * level**2
         slope = (areas[inside] * level * 4 / reach**2)[:, None] * away[inside]
         total = weight.sum()
-        weight /= total
-        rows.append((inside, weight, (slope - weight[:, None] * slope.sum(axis=0)) / total))
+        rows.append((inside, weight / total, slope / total))
     width = max((len(row[0]) for row in rows), default=1)
     members = np.zeros((len(rows), width), dtype=np.int64)
-    weights, by_insertion = np.zeros((len(rows), width)), np.zeros((len(rows), width, 3))
+    weights, slopes = np.zeros((len(rows), width)), np.zeros((len(rows), width, 3))
     for k, (inside, weight, slope) in enumerate(rows):
         members[k, : len(inside)] = inside
         weights[k, : len(inside)] = weight
-        by_insertion[k, : len(inside)] = slope
-    return members, weights, by_insertion
+        slopes[k, : len(inside)] = slope
+    return members, weights, slopes
+
+
+def patch_change(
+    weights: FloatArray, slope: FloatArray, ends: FloatArray, log_areas: FloatArray | float = 0.0
+) -> FloatArray:
+    """Change ``(q, c, s)`` of the weights of `patch_members`.
+
+    Parameters
+    ----------
+    weights, slope : (c, s) and (c, s, 3)
+    ends : (q, c, s, 3) mm
+        Displacement of the insertion against that of each member.
+    log_areas : (q, c, s)
+        Relative change of the areas of the members.
+    """
+    change = np.einsum("csi,qcsi->qcs", slope, ends) + weights * log_areas
+    return np.asarray(change - weights * change.sum(axis=2, keepdims=True))
 
 
 def _support(mesh: SolidMesh, valve: Valve, settings: MechanicsSettings) -> Hinge:

@@ -72,6 +72,9 @@ nothing new, and their correlation is factorised."""
 BETTER = 5.0
 """How many times as well as beforehand a nuisance may be measured."""
 
+ROUGH = 0.05
+"""Relative tolerance of an estimate about which the geometry is linearised."""
+
 OnStep = Callable[[float, int], None]
 
 
@@ -105,12 +108,9 @@ def personalise_case(
     start = chain.shared.start
     generic = chain.shared(start)
     seconds = {"generic": time.perf_counter() - started}
-    doubtful = case.error_samples is not None or settings.considered_geometry is not None
-    if generic.converged and doubtful:
+    if generic.converged and case.error_samples is not None:
         began = time.perf_counter()
-        chain.consider_geometry(start, generic.y)
-        if case.error_samples is not None:
-            chain.sample_geometry(generic.y)
+        chain.sample_geometry(generic.y)
         seconds["geometry"] = time.perf_counter() - began
 
     def timed(part: str, began: float) -> None:
@@ -120,7 +120,7 @@ def personalise_case(
     began = time.perf_counter()
     before = chain.closed_frames(start, generic.y) if generic.converged else {}
     timed("held_out", began)
-    result = chain.renewed(chain.estimate(chain.filter, chain.observation()))
+    result = chain.estimate_all()
     seconds["estimate"] = result.seconds
     frames = _Frames({}, {}, {}, ())
     narrower: Mapping[str, FloatArray] = {}
@@ -298,15 +298,21 @@ class _Chain:
         self.transform = Log(tuple(u.is_positive for u in self.unknowns))
         start = self.transform.inverse(self.transform.forward(self.prior.mean))
         self.shared = SharedStart(self.registered, start)
-        inner = IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations)
-        considered = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
-        self.filter: Filter = SchmidtFilter(inner, considered) if considered else inner
+        self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
+        self.filter = self._filter(settings.tolerance)
         self.store = store
-        self.estimated = np.array([name not in considered for name in self.names])
+        self.estimated = np.array([name not in self._held for name in self.names])
         self.geometry: GeometryErrors | None = None
         self.errors: SampledErrors | None = None
         self.considered: tuple[ErrorColumns, ...] = ()
         self._family: NoiseFamily | None = None
+
+    def _filter(self, tolerance: float, start: tuple[float, ...] | None = None) -> Filter:
+        """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates."""
+        inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
+        if self._held:
+            return SchmidtFilter(inner, self._held)
+        return replace(inner, start=start)
 
     def consider_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
         """Find out what the geometry, as far as it is not known, does to the observation at ``m``.
@@ -324,6 +330,7 @@ class _Chain:
             self.settings.considered_geometry,
             self.registered,
             self.plain_observation(),
+            self.noise(geometry=0.0),
             m,
             predicted,
         )
@@ -365,21 +372,24 @@ class _Chain:
         }
         return own | dict.fromkeys(self.modes, 1.0)
 
-    def renewed(self, result: StudyResult) -> StudyResult:
-        """The estimation once more, with the geometry's errors as they are at its estimate."""
-        if not self.considered or result.estimate is None:
-            return result
-        prediction = self.registered(result.estimate)
+    def estimate_all(self) -> StudyResult:
+        """All unknowns, the geometry considered where it is doubtful.
+
+        What its errors do depends on the moduli: with a modulus half as large the derivatives are
+        off by a quarter. So all unknowns are estimated without them first, roughly.
+        """
+        if self.settings.considered_geometry is None:
+            return self.estimate(self.filter, self.observation())
+        rough = self.estimate(self._filter(max(ROUGH, self.settings.tolerance)), self.observation())
+        at = self.shared.start if rough.estimate is None else rough.estimate
+        prediction = self.shared(at)
         if not prediction.converged:
-            return result
-        self.consider_geometry(result.estimate, prediction.y)
-        filter_ = self.filter
-        if isinstance(filter_, IteratedFilter):
-            filter_ = replace(filter_, start=tuple(result.estimate.tolist()))
-        again = self.estimate(filter_, self.observation())
-        if again.estimate is None:
-            return result
-        return replace(again, seconds=result.seconds + again.seconds)
+            return rough
+        self.consider_geometry(at, prediction.y)
+        result = self.estimate(
+            self._filter(self.settings.tolerance, tuple(at.tolist())), self.observation()
+        )
+        return replace(result, seconds=rough.seconds + result.seconds)
 
     def noise(
         self, learned: LearnedNoise | None = None, *, geometry: float = 1.0, stated: bool = False
@@ -706,17 +716,21 @@ class _Chain:
             doubt[np.ix_(self.estimated, self.estimated)] = learned.covariance
         groups = self._measurable()
 
+        def widened(covariance: FloatArray, scale: float) -> FloatArray:
+            own, more = np.diag(covariance), np.diag(doubt) / scale**2
+            # The doubt of now: of less it may take more away than there is.
+            return np.sqrt(np.where(own + more > 0.0, own + more, own))[moduli]
+
         def linear(P: FloatArray, scale: float = 1.0, geometry: float = 1.0) -> FloatArray:
             # Errors of the geometry stay what they are where the frame is seen better.
             plain = self.noise(learned, geometry=scale * geometry, stated=True)
             update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
-            return np.sqrt(np.diag(update.posterior.covariance + doubt / scale**2))[moduli]
+            return widened(update.posterior.covariance, scale)
 
         def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
             if errors is None:
                 return linear(P, scale)
-            covariance = errors.posterior(H * scale, P).covariance + doubt / scale**2
-            return np.sqrt(np.diag(covariance))[moduli]
+            return widened(errors.posterior(H * scale, P).covariance, scale)
 
         stds = {"now": std(prior.covariance)}
         for words, members in groups.items():

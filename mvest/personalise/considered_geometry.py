@@ -20,6 +20,7 @@ from mvest.cases.displaced import displaced_case
 from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
+from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.noise_family import ErrorColumns, smooth_basis
 from mvest.estimation.prediction import Prediction, predict
 from mvest.mechanics.reference import RestVariation
@@ -30,10 +31,13 @@ from mvest.valve.anatomy.valve import LeafletSurface
 
 __all__ = ["ConsideredGeometry", "geometry_columns"]
 
-KEPT = 0.999
-"""Share of the variance of a kind's columns that is kept: what the rest adds is nothing."""
+SEEN = 0.3
+"""Standard deviations of the stated noise below which a combination of columns is left out."""
 
 _SCALES = ("shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "thickness", "fibre_degrees")
+
+TOLERANCE = 1e-4
+"""Of derivatives, relative, far below what is known of the size of errors."""
 
 TIP_STEP = 0.01
 """mm, by which tips are moved to differentiate rest lengths that follow from them."""
@@ -78,7 +82,7 @@ class ConsideredGeometry:
     thickness: float = 0.1
     fibre_degrees: float = 10.0
     factor: float = 2.0
-    share: float = 0.95
+    share: float = 0.9
 
     def __post_init__(self) -> None:
         for name in _SCALES:
@@ -100,6 +104,7 @@ def geometry_columns(
     considered: ConsideredGeometry,
     registered: RegisteredModel,
     observation: Observed,
+    noise: ObservationNoise,
     m: FloatArray,
     predicted: FloatArray,
 ) -> tuple[ErrorColumns, ...] | str:
@@ -115,6 +120,8 @@ def geometry_columns(
         Of the case; its last closed state is gone on from.
     observation : Observed
         Of the case.
+    noise : ObservationNoise
+        Of the observation as it is stated, without what the geometry adds.
     m : (p,)
         Parameters at which the model is linearised.
     predicted : array
@@ -128,8 +135,8 @@ def geometry_columns(
     kinds = _variations(case, considered, geometry)
     if not kinds:
         return ()
-    joined = RestVariation.joined([variation for _, variation, _ in kinds])
-    change = geometry.change(registered.mechanical(m), joined, states)
+    joined = RestVariation.joined([own for _, own, _ in kinds])
+    change = geometry.change(registered.mechanical(m), joined, states, TOLERANCE)
     if isinstance(change, str):
         return change
     turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
@@ -138,10 +145,10 @@ def geometry_columns(
     linear = observation.of(lambda _: Prediction(predicted, jacobian))
     rows = predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
     columns, start = [], 0
-    for name, variation, factor in kinds:
-        own = rows[:, start : start + len(variation)]
-        columns.append(ErrorColumns(name, _of_low_rank(own), factor))
-        start += len(variation)
+    for name, own, factor in kinds:
+        members = rows[:, start : start + len(own)]
+        columns.append(ErrorColumns(name, _of_low_rank(members, noise), factor))
+        start += len(own)
     return tuple(columns)
 
 
@@ -165,7 +172,9 @@ def _variations(
             moves = considered.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
             kinds.append(("papillary tips", geometry.tips(moves, _lengths(case, moves)), 1.0))
     if considered.insertions_mm:
-        moves = considered.insertions_mm * _each_way(np.eye(len(case.valve.chordae)))
+        ends = np.eye(len(case.valve.chordae))[:, None, :, None]
+        moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
+        moves = moves.reshape(-1, *moves.shape[2:])
         kinds.append(("insertions", geometry.insertions(moves), 1.0))
     if considered.thickness:
         factors = considered.thickness * _leaflets(surface)
@@ -217,11 +226,7 @@ def _lengths(case: ValveCase, moves: FloatArray) -> FloatArray | None:
     return np.asarray((ahead - behind) / (2 * TIP_STEP * case.chordae.rest_length))
 
 
-def _of_low_rank(columns: FloatArray) -> FloatArray:
-    """Fewer columns with nearly the same C Cᵀ."""
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    power = np.cumsum(s**2)
-    if not power[-1] > 0.0:
-        return columns[:, :0]
-    kept = int(np.searchsorted(power, KEPT * power[-1])) + 1
-    return np.asarray(U[:, :kept] * s[:kept])
+def _of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
+    """Fewer columns with nearly the same C Cᵀ, as far as that can be told from noise."""
+    _, s, Vt = np.linalg.svd(noise.whiten(columns), full_matrices=False)
+    return np.asarray(columns @ Vt[s > SEEN].T)

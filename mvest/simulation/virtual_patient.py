@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.closure.frames import ERROR, OFFSET, FramesModel, is_frame_pressure
@@ -120,7 +121,8 @@ class PatientSimulation:
     rough_std_mm : float
         Of further errors in these frames that are independent, and that the case does not state.
     rest_std_mm : float
-        Error of the open shape from which an estimator takes its model; 0: it is seen exactly.
+        Error of the open shape from which an estimator takes its model, the ends of the chordae on
+        it included; 0: it is seen exactly.
     fitted_pressure_mmHg : tuple of float
         In further frames that an estimator is to fit with the closed one.
     fitted_relaxation : tuple of float
@@ -373,7 +375,8 @@ def _case(
     rng: np.random.Generator,
 ) -> ValveCase:
     other = rng.spawn(1)[0]
-    surface, world, length = seen.surface, simulation.world, simulation.correlation_length_mm
+    surface, chordae = seen.surface, seen.chordae
+    world, length = simulation.world, simulation.correlation_length_mm
     moved = np.stack(list(true.values()))
     seen_later = world.noise(simulation.std_mm, surface.vertices, length)(moved, moved, rng)
     if simulation.rough_std_mm:
@@ -382,6 +385,10 @@ def _case(
         rest_error = world.noise(simulation.rest_std_mm, surface.vertices, length)
         exact = surface.vertices[None]
         surface = replace(surface, vertices=rest_error(exact, exact, rng)[0])
+        # Where a chord ends is seen on the leaflet, and in error as it is.
+        nearest = cKDTree(exact[0]).query(chordae.insertion)[1]
+        moved_ends = (surface.vertices - exact[0])[nearest]
+        chordae = replace(chordae, insertion=chordae.insertion + moved_ends)
     motion = seen.motion
     at_annulus, at_tips = world.boundary(motion.annulus[-1], motion.papillary_tips[-1], other)
     closed = HeldState(
@@ -430,6 +437,6 @@ def _case(
         annulus=seen.annulus,
         free_edge=seen.free_edge,
         frames=(frame(REFERENCE, 0.0, Role.REFERENCE, rest, surface.vertices), *later),
-        chordae=seen.chordae,
+        chordae=chordae,
         uncertainty=Uncertainty(simulation.std_mm, simulation.correlation_length_mm),
     )

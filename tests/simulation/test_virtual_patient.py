@@ -21,6 +21,7 @@ from mvest.simulation.virtual_patient import (
     simulate_patient,
 )
 from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.proximity import closest_points
 
 TISSUE = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
 CLOSING = ClosureProtocol(pressure_mmHg=100.0, ramp=0.2, dt=0.04, growth=2.0, end=0.4)
@@ -210,6 +211,28 @@ def test_rough_errors_come_on_top_and_are_not_stated(patient):
     # 1728 numbers: an SD of 1.7 %.
     assert np.std(more) == pytest.approx(0.3, rel=0.07)
     assert abs(np.mean(np.array(more)[:, 1:] * np.array(more)[:, :-1])) < 0.01
+
+
+def test_chordae_end_on_the_leaflet_as_it_was_seen(patient):
+    hidden = {k: v for k, v in patient.hidden.positions.items() if k != "open"}
+    seen = TEMPLATE.valve(32, 9)
+    off = replace(SMALL, rest_std_mm=0.5)
+    case = virtual_patient._case(
+        "small", "d", seen, hidden, off, MECHANICS, np.random.default_rng(3)
+    )
+    assert np.std(case.surface.vertices - seen.surface.vertices) == pytest.approx(0.5, rel=0.4)
+
+    def gap(ends):
+        surface = case.surface
+        return closest_points(ends, surface.vertices, surface.triangles).distance.mean()
+
+    # Left where they are they would hang in the air by an error's normal component.
+    assert gap(case.chordae.insertion) < 0.15 < gap(seen.chordae.insertion)
+    np.testing.assert_array_equal(case.chordae.rest_length, seen.chordae.rest_length)
+    exact = virtual_patient._case(
+        "small", "d", seen, hidden, SMALL, MECHANICS, np.random.default_rng(3)
+    )
+    np.testing.assert_array_equal(exact.chordae.insertion, seen.chordae.insertion)
 
 
 def test_a_patient_is_the_same_again(patient):

@@ -15,10 +15,10 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, Motion, Valve, band_grid
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
-from mvest.valve.geometry.thickening import smooth_vertex_normals
+from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
 from mvest.valve.geometry.triangles import directed_edges
 
-__all__ = ["Band", "leaflet_normals"]
+__all__ = ["Band", "leaflet_normals", "leaflet_normals_change"]
 
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of either is read."""
@@ -242,18 +242,19 @@ def _mean(
     return np.asarray(np.einsum("...c,...ci->...i", weights, corners))
 
 
-def leaflet_normals(surface: LeafletSurface, vertices: FloatArray | None = None) -> FloatArray:
-    """Smooth unit normals ``(n, 3)`` along which leaflets are thick, to the ventricle.
+def leaflet_normals(surface: LeafletSurface) -> FloatArray:
+    """Smooth unit normals ``(n, 3)`` along which leaflets are thick, to the ventricle."""
+    return smooth_vertex_normals(surface.vertices, surface.triangles, _rounds(surface))
 
-    Parameters
-    ----------
-    surface : LeafletSurface
-    vertices : (n, 3) mm, optional
-        Where its vertices are instead; over as many neighbours is averaged as where they were.
-    """
+
+def leaflet_normals_change(surface: LeafletSurface, moves: FloatArray) -> FloatArray:
+    """Their change ``(n, 3, q)`` 1/mm by displacements ``(n, 3, q)`` of the surface's vertices."""
+    return smooth_normals_change(surface.vertices, surface.triangles, _rounds(surface), moves)[1]
+
+
+def _rounds(surface: LeafletSurface) -> int:
+    """Over as many neighbours is averaged."""
     corner = surface.vertices[surface.triangles]
     edge = float(np.median(np.linalg.norm(corner[:, 1] - corner[:, 0], axis=1)))
     # The spread of a random walk grows with the root of its steps.
-    rounds = max(1, round((NORMAL_SMOOTHING_MM / edge) ** 2))
-    at = surface.vertices if vertices is None else vertices
-    return smooth_vertex_normals(at, surface.triangles, rounds)
+    return max(1, round((NORMAL_SMOOTHING_MM / edge) ** 2))

@@ -14,7 +14,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.triangles import area_vectors, areas
+from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, areas
 
 __all__ = [
     "BandGrid",
@@ -26,6 +26,7 @@ __all__ = [
     "checked_floats",
     "checked_indices",
     "lumped_areas",
+    "lumped_areas_change",
     "vertex_normals",
 ]
 
@@ -128,6 +129,17 @@ def lumped_areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     share = np.repeat(areas(vertices, triangles) / 3, 3)
     total = np.bincount(triangles.ravel(), share, minlength=len(vertices))
     return np.asarray(total, dtype=np.float64)
+
+
+def lumped_areas_change(vertices: FloatArray, triangles: IntArray, moves: FloatArray) -> FloatArray:
+    """Change ``(n, q)`` mm² of `lumped_areas` by displacements ``(n, 3, q)`` of the vertices."""
+    face = area_vectors(vertices, triangles)
+    unit = face / np.linalg.norm(face, axis=1, keepdims=True)
+    change = np.einsum("mi,miq->mq", unit, area_vectors_change(vertices, triangles, moves)) / 3
+    out = np.zeros((len(vertices), moves.shape[2]))
+    for own in triangles.T:
+        np.add.at(out, own, change)
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

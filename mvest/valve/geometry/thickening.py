@@ -16,9 +16,15 @@ from mvest.valve.geometry.surface_checks import (
     enclosed_volume,
     listed,
 )
-from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, surface_edges
 
-__all__ = ["FACE_KINDS", "ClosedSurface", "smooth_vertex_normals", "thicken"]
+__all__ = [
+    "FACE_KINDS",
+    "ClosedSurface",
+    "smooth_normals_change",
+    "smooth_vertex_normals",
+    "thicken",
+]
 
 FACE_KINDS = ("ventricular", "atrial", "rim")
 """What a triangle of a thickened leaflet bounds."""
@@ -38,6 +44,20 @@ def smooth_vertex_normals(
     GeometryError
         A vertex without triangles, or where opposite normals cancel.
     """
+    return smooth_normals_change(vertices, triangles, iterations, np.zeros((*vertices.shape, 0)))[0]
+
+
+def smooth_normals_change(
+    vertices: FloatArray, triangles: IntArray, iterations: int, moves: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Smooth unit normals ``(n, 3)``, and their change ``(n, 3, q)`` with the vertices.
+
+    Parameters
+    ----------
+    vertices, triangles, iterations
+        See `smooth_vertex_normals`.
+    moves : (n, 3, q) mm
+    """
     if iterations < 0:
         raise GeometryError(f"normal smoothing: {iterations} iterations; expected 0 or more")
     n = len(vertices)
@@ -48,7 +68,9 @@ def smooth_vertex_normals(
     rows, columns = np.concatenate([edges, edges[:, ::-1]]).T
     adjacency = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     degree = np.asarray(adjacency.sum(axis=1)).ravel()
-    normals = vertex_normals(np.asarray(vertices, dtype=np.float64), np.asarray(triangles))
+    at, faces = np.asarray(vertices, dtype=np.float64), np.asarray(triangles)
+    normals = vertex_normals(at, faces)
+    change = _normals_change(at, faces, normals, moves)
     for _ in range(iterations):
         mean = 0.5 * (normals + (adjacency @ normals) / degree[:, None])
         length = np.linalg.norm(mean, axis=1)
@@ -56,7 +78,29 @@ def smooth_vertex_normals(
         if len(bad):
             raise GeometryError(f"normals: those round vertices {listed(bad)} cancel each other")
         normals = mean / length[:, None]
-    return normals
+        by_neighbours = (adjacency @ change.reshape(n, -1)).reshape(change.shape)
+        change = 0.5 * (change + by_neighbours / degree[:, None, None])
+        change = _across(normals, change) / length[:, None, None]
+    return normals, change
+
+
+def _normals_change(
+    vertices: FloatArray, triangles: IntArray, normals: FloatArray, moves: FloatArray
+) -> FloatArray:
+    """Change ``(n, 3, q)`` of area-weighted unit normals."""
+    along = area_vectors(vertices, triangles)
+    change = area_vectors_change(vertices, triangles, moves)
+    out, length = np.zeros(moves.shape), np.zeros(len(vertices))
+    for own in triangles.T:
+        np.add.at(out, own, change)
+        np.add.at(length, own, np.sum(along * normals[own], axis=1))
+    return _across(normals, out) / length[:, None, None]
+
+
+def _across(normals: FloatArray, change: FloatArray) -> FloatArray:
+    """The part of ``(n, 3, q)`` across unit normals ``(n, 3)``."""
+    along = np.einsum("ni,niq->nq", normals, change)
+    return np.asarray(change - normals[:, :, None] * along[:, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

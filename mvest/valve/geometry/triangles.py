@@ -6,7 +6,15 @@ import numpy as np
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["area_vectors", "areas", "directed_edges", "surface_edges", "unit_normals", "unit_rows"]
+__all__ = [
+    "area_vectors",
+    "area_vectors_change",
+    "areas",
+    "directed_edges",
+    "surface_edges",
+    "unit_normals",
+    "unit_rows",
+]
 
 
 def area_vectors(vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -18,6 +26,15 @@ def area_vectors(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 def areas(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Areas ``(m,)`` mm² of triangles."""
     return np.asarray(np.linalg.norm(area_vectors(vertices, triangles), axis=1))
+
+
+def area_vectors_change(vertices: FloatArray, triangles: IntArray, moves: FloatArray) -> FloatArray:
+    """Change ``(m, 3, q)`` mm² of `area_vectors` by displacements ``(n, 3, q)`` of vertices."""
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    da, db, dc = np.moveaxis(moves[triangles], 1, 0)
+    change = np.cross(db - da, (c - a)[..., None], axis=1)
+    change += np.cross((b - a)[..., None], dc - da, axis=1)
+    return np.asarray(0.5 * change)
 
 
 def directed_edges(triangles: IntArray) -> IntArray:

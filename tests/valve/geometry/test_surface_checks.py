@@ -2,9 +2,14 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError
-from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.anatomy.valve import LeafletSurface, lumped_areas, lumped_areas_change
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
-from mvest.valve.geometry.thickening import FACE_KINDS, smooth_vertex_normals, thicken
+from mvest.valve.geometry.thickening import (
+    FACE_KINDS,
+    smooth_normals_change,
+    smooth_vertex_normals,
+    thicken,
+)
 
 
 def leaflet(shapes, vertices, triangles, thickness=1.2):
@@ -143,3 +148,24 @@ def test_too_thick_a_leaflet_is_one_clear_error(shapes):
     vertices, triangles = shapes.cone(3.0, 1.0, 4.0, n=24, layers=4)
     with pytest.raises(GeometryError, match=r"self-intersection|inconsistent|inward|degenerate"):
         thicken(leaflet(shapes, vertices, triangles, 9.0))
+
+
+def test_normals_and_areas_change_with_the_vertices_as_differences_do(shapes):
+    vertices, triangles = shapes.cone(15, 4, 12)
+    moves = np.random.default_rng(0).normal(size=(*vertices.shape, 2))
+
+    def difference(of):
+        h = 1e-5
+        sides = [[of(vertices + s * h * moves[..., k]) for k in range(2)] for s in (1, -1)]
+        return np.stack([(a - b) / (2 * h) for a, b in zip(*sides, strict=True)], axis=-1)
+
+    for rounds in (0, 5):
+        normals, change = smooth_normals_change(vertices, triangles, rounds, moves)
+        np.testing.assert_array_equal(normals, smooth_vertex_normals(vertices, triangles, rounds))
+        exact = difference(lambda at, r=rounds: smooth_vertex_normals(at, triangles, r))
+        np.testing.assert_allclose(change, exact, atol=1e-6)
+    np.testing.assert_allclose(
+        lumped_areas_change(vertices, triangles, moves),
+        difference(lambda at: lumped_areas(at, triangles)),
+        atol=1e-6,
+    )
