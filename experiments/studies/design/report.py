@@ -30,7 +30,7 @@ def design_table(records: Records) -> pd.DataFrame:
     return pd.DataFrame(
         [
             {
-                "patient": name,
+                "patient": record.row,
                 "geometry": "considered" if row.geometry else "exact",
                 "errors": row.kind,
                 "error_mmHg": row.mmhg,
@@ -39,7 +39,7 @@ def design_table(records: Records) -> pd.DataFrame:
                 "modulus": modulus,
                 "left": share,
             }
-            for name, record in records.items()
+            for record in records.values()
             for row in record.findings.left
             for modulus, share in zip(record.findings.moduli, row.shares, strict=True)
         ]
@@ -47,7 +47,7 @@ def design_table(records: Records) -> pd.DataFrame:
 
 
 def _tried(records: Records) -> list[tuple[str, Tried]]:
-    return [(name, row) for name, record in records.items() for row in record.findings.tried]
+    return [(record.row, row) for record in records.values() for row in record.findings.tried]
 
 
 def _median(table: pd.DataFrame, count: int, chosen: Mapping[str, object]) -> float:
@@ -78,6 +78,16 @@ def design_answer(records: Records) -> str:
         said += (
             f". With a geometry that is itself in doubt, {from_to('stated', 'considered')} % with "
             "pressures as stated"
+        )
+    tried = [
+        f"{100 * error:.0f} ({100 * predicted:.0f}) with {corner}"
+        for corner, (predicted, _, error, _) in _deviations(records).items()
+        if predicted is not None and error is not None
+    ]
+    if tried:
+        said += (
+            ". Tried, the root mean square error in percent of the prior's deviation, and what was "
+            f"predicted: {', '.join(tried)}"
         )
     return said + "."
 
@@ -145,16 +155,22 @@ def _tried_words(records: Records) -> list[str]:
         "| design | predicted SD | reported SD | root mean square error | that of the guess |",
         "|---|---|---|---|---|",
     ]
-    for corner in dict.fromkeys(row.corner for _, row in tried):
-        own = [row for _, row in tried if row.corner == corner and row.error is not None]
+    for corner, rms in _deviations(records).items():
+        lines.append(f"| {corner} | {' | '.join(map(_cell, rms))} |")
+    return lines
+
+
+def _deviations(records: Records) -> dict[str, list[float | None]]:
+    """Root mean squares over what was tried: predicted, reported, achieved, and of the guess."""
+    tried, found = [row for _, row in _tried(records)], {}
+    for corner in dict.fromkeys(row.corner for row in tried):
+        own = [row for row in tried if row.corner == corner and row.error is not None]
         columns = [
             [value for row in own if (value := getattr(row, name)) is not None]
             for name in ("predicted", "reported", "error", "generic")
         ]
-        # All of them are deviations.
-        rms = [float(np.sqrt(np.mean(np.square(c)))) if c else None for c in columns]
-        lines.append(f"| {corner} | {' | '.join(map(_cell, rms))} |")
-    return lines
+        found[corner] = [float(np.sqrt(np.mean(np.square(c)))) if c else None for c in columns]
+    return found
 
 
 def _cell(share: float | None) -> str:

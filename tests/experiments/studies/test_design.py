@@ -125,8 +125,8 @@ def test_the_report_has_medians_over_patients_and_every_trial(tmp_path):
     assert "10 to 10 % with exact pressures" in said
     assert "30 to 30 % where a factor" in said
     words = design_words(records)
-    assert "| one frame | a | anterior | 25 | 30 | -20 | 90 |" in words
-    assert "| none | a | anterior | 20 | no estimate | no estimate | 90 |" in words
+    assert "| one frame | r | anterior | 25 | 30 | -20 | 90 |" in words
+    assert "| none | r | anterior | 20 | no estimate | no estimate | 90 |" in words
     # Root mean squares: sqrt((0.2² + 0.4²) / 2) = 0.316, sqrt((0.9² + 0.1²) / 2) = 0.640.
     assert "| one frame | 25 | 30 | 32 | 64 |" in words
     written = write_design(tmp_path, records, {})
