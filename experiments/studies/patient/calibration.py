@@ -197,14 +197,12 @@ def _notes(worlds: Worlds) -> list[str]:
 
 def _judged(worlds: Worlds) -> list[str]:
     """Where verdicts do what is asked of them and where they do not."""
-    low, high, wrong = [], [], []
+    low, wrong = [], []
     for name, runs in worlds.items():
         trusted = [run for run in runs if _trust(run) == TRUSTWORTHY]
         inside, n = _inside(trusted)
         if n and inside < 0.9 * n:
             low.append(f"{name} ({inside} of {n})")
-        if n and inside > 0.98 * n:
-            high.append(f"{name} ({inside} of {n})")
         believed, off = (sum(map(_is_wrong, _all_moduli(some))) for some in (trusted, runs))
         if believed > 0.05 * off:
             wrong.append(f"{name} ({believed} of {off})")
@@ -212,7 +210,6 @@ def _judged(worlds: Worlds) -> list[str]:
         f"{what}: {'; '.join(names) or 'none'}."
         for what, names in (
             ("Worlds in which less than 90 % of the intervals called trustworthy hold", low),
-            ("In which more than 98 % do, so that they are wider than need be", high),
             (f"In which more than 5 % of those more than {WRONG:g} SD off are trustworthy", wrong),
         )
     ]

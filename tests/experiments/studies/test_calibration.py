@@ -90,7 +90,6 @@ def test_what_is_said_of_a_world(tmp_path, runs):
     assert rows["prior alone"]["E_f anterior inside"].startswith("3 of 3")
     assert "**Not complete: 35 of 40 runs are missing.**" in text
     assert "called trustworthy hold: reference (3 of 4); open shape off (1 of 2)." in text
-    assert "wider than need be: none." in text
     assert "more than 3 SD off are trustworthy: open shape off (1 of 3)." in text
     assert "What spoke against estimates: distance (2)." in text
 
