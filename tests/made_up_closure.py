@@ -125,6 +125,7 @@ class MadeUpClosure:
     valve = VALVE
     contact_valve = VALVE
     mesh = MESH
+    settings = MECHANICS
     closed = None
 
     def restart(self, closed: Any) -> None:

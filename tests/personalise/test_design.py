@@ -97,7 +97,7 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
         def __init__(self, model):
             pass
 
-        def change(self, m, variation, states=()):
+        def change(self, m, variation, states, tolerance):
             assert len(states) == 4
             return moved.copy()
 
