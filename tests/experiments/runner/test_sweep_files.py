@@ -225,10 +225,10 @@ def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> No
     assert {line.partition("=")[2] for job in planned[: len(worlds)] for line in job
             if line.startswith("world=")} == set(worlds)  # fmt: skip
     assert all("seed=2001" in job for job in planned[: len(worlds)])
-    alone = composed("sweep=calibration", "world=reference")[1]
+    alone = composed("sweep=calibration", "world=reference", "row=r")[1]
     made, labels = [], set()
     for world in worlds:
-        config = composed("sweep=calibration", f"world={world}")[1]
+        config = composed("sweep=calibration", f"world={world}", "row=r")[1]
         require_in_range(config)
         made.append(build(PatientSettings, config["patient"]))
         labels.add(made[-1].world)
