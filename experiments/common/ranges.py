@@ -84,8 +84,8 @@ RANGES = (
     Range(1, 16, "", "cells through the thickness of a leaflet", "layers"),
     Range(
         1, 1000, "", "numbers of cells, points or voxels along an axis",
-        "refinements check_mesh stress_meshes finer_contact check_contact sheet.cells "
-        "sheet.observed acquisition.shape",
+        "refinements extrapolated_from check_mesh stress_meshes finer_contact check_contact "
+        "sheet.cells sheet.observed acquisition.shape",
     ),
     Range(0.1, 20, "mm", "edges of the cells of a leaflet", "edge_length"),
     # The heart.

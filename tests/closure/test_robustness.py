@@ -136,7 +136,7 @@ def test_a_wrong_derivative_fails():
     report = run_gate(built(wrong=1.1), AT)
     assert not report.passed
     assert all(row.passed for row in report.rows)
-    assert "of the way" in report.paths[0].reason
+    assert "of the whole way" in report.paths[0].reason
 
 
 def move(vertices, distance):

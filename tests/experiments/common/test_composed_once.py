@@ -27,7 +27,7 @@ def test_it_is_what_hydra_composes(monkeypatch):
     asked = (
         ("experiment=debug", "seed=1"),
         ("experiment=debug", "seed=2", "filter.initial=[1,2]"),
-        ("experiment=debug", "filter=iterated_log", "seed=2"),
+        ("experiment=debug", "filter=paper", "seed=2"),
         ("experiment=debug", "seed=1"),
     )
     merged = []

@@ -89,7 +89,7 @@ def test_debug_runs_end_to_end(tmp_path) -> None:
 
 
 ERRORS = [
-    ("experiment=nope", "Could not find 'experiment/nope'; known: chord, closure, cycle, debug"),
+    ("experiment=nope", "Could not find 'experiment/nope'; known: calibration, chord, closure"),
     ("mesh=huge", "Could not find 'mesh/huge'; known: coarse"),
     ("mesh/nope=a", "Key 'mesh/nope'"),
     ("filter.inital=[1,2]", "Key 'inital' not in 'FilterConfig'; did you mean initial?"),

@@ -223,11 +223,13 @@ def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(made):
 def test_what_would_narrow_is_said_of_each_modulus(made):
     outcome, fit = made
     narrow = outcome.findings.case.narrow
-    rows = [row for row in narrow if row.what.endswith("pressure known")]
+    # The prior's 10 % of 100 mmHg, five times as well.
+    measured = "pressure measured to ±2 mmHg"
+    rows = [row for row in narrow if row.what.endswith(measured)]
     assert [row.parameter for row in rows] == ["E_f.anterior", "E_f.posterior"]
-    assert rows[0].what == "E_f anterior, pressure known"
+    assert rows[0].what == f"E_f anterior, {measured}"
     for k, row in enumerate(rows):
-        assert row.std_if_known == fit.narrower["pressure known"][k]
+        assert row.std_if_known == fit.narrower[measured][k]
         assert row.std_now == fit.narrower["now"][k] > row.std_if_known
     assert not [row for row in narrow if row.what.endswith("now")]
 

@@ -341,7 +341,8 @@ def test_a_check_speaks_of_the_patients_case_and_reveals_nothing(tmp_path, simul
     assert len(simulated) == 1
     assert "numbers of closed" in said
     assert "No estimation was run." in said
-    rows = {line.split()[0]: line.split()[2] for line in said.splitlines() if "E_f." in line}
+    lines = [line.split() for line in said.splitlines() if line.strip().startswith("E_f.")]
+    rows = {words[0]: words[2] for words in lines}
     # The assumed values are the prior's, not the patient's.
     assert rows
     assert all(float(rows[name]) != pytest.approx(TRUE[name], rel=1e-3) for name in rows)
