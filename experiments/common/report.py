@@ -81,7 +81,7 @@ def cautions(records: Sequence[Record[Any]]) -> list[str]:
         if record.caution:
             rows.setdefault(record.caution, []).append(record.row)
     return [
-        text if len(named) == len(records) else f"{', '.join(named)}: {text}"
+        text if len(named) == len(records) else f"{'; '.join(named)}: {text}"
         for text, named in rows.items()
     ]
 
