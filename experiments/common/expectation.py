@@ -103,6 +103,8 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     from experiments.common.cases.settings import PersonalSettings
 
     case = read_configured(config["case"])
+    if case.closed is None:
+        return f"{case.name}: an open frame alone, from which nothing can be estimated"
     settings = settings_of(config, build(PersonalSettings, config["personal"]))
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
         store = meshes_of(config)

@@ -196,7 +196,8 @@ class ValveCase:
     annulus, free_edge : ndarray
         ``(k,)`` and ``(j,)`` vertices of ``surface`` in loop order.
     frames : tuple of Frame
-        In the order of time, one of them the reference and one the closed frame.
+        In the order of time, one of them the reference and one the closed frame; or the reference
+        alone: an anatomy whose closure nobody saw.
     chordae : Chordae
     uncertainty : Uncertainty
     error_samples : ErrorSamples or None
@@ -227,7 +228,7 @@ class ValveCase:
     chordae_follow: bool = False
 
     def __post_init__(self) -> None:
-        for role in (Role.REFERENCE, Role.CLOSED):
+        for role in (Role.REFERENCE, Role.CLOSED)[: len(self.frames)]:
             members = [frame.name for frame in self.frames if frame.role is role]
             if len(members) != 1:
                 raise InputError(
@@ -249,7 +250,7 @@ class ValveCase:
                 raise InputError(
                     f"case {self.name}: observation std_mm of {len(std)} vertices, expected {n}"
                 )
-            if not self.frame(Role.CLOSED).corresponds:
+            if self.closed is not None and not self.closed.corresponds:
                 raise InputError(
                     f"case {self.name}: observation std_mm of each vertex, but the vertices of the "
                     "closed frame do not correspond; expected one number"
@@ -298,8 +299,24 @@ class ValveCase:
         )
 
     def frame(self, role: Role) -> Frame:
-        """The only frame of a role (reference or closed)."""
+        """The only frame of a role (reference or closed).
+
+        Raises
+        ------
+        InputError
+            The case is its reference frame alone.
+        """
+        if role is Role.CLOSED and self.closed is None:
+            raise InputError(
+                f"case {self.name}: no closed frame, so there is nothing to estimate from; add one "
+                "(role: closed), or simulate with this anatomy (valve=folder valve.folder=FOLDER)"
+            )
         return next(frame for frame in self.frames if frame.role is role)
+
+    @property
+    def closed(self) -> Frame | None:
+        """The closed frame; None of an anatomy alone."""
+        return next((frame for frame in self.frames if frame.role is Role.CLOSED), None)
 
     @property
     def fitted(self) -> tuple[Frame, ...]:
@@ -313,8 +330,12 @@ class ValveCase:
 
     @property
     def valve(self) -> Valve:
-        """The valve at rest, with its boundary's way to the closed frame."""
-        reference, closed = self.frame(Role.REFERENCE), self.frame(Role.CLOSED)
+        """The valve at rest, with its boundary's way to the closed frame.
+
+        Where there is none the boundary stays where it is.
+        """
+        reference = self.frame(Role.REFERENCE)
+        closed = self.closed or reference
         return Valve(
             self.surface,
             self.annulus,

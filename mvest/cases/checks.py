@@ -85,7 +85,7 @@ def check_frames(file: Path, document: CaseFile) -> None:
                 f"{b.time:g} {unit} of {b.name!r} is not after {a.time:g} {unit} of {a.name!r}; "
                 "put the frames in the order of time",
             )
-    for role in ("reference", "closed"):
+    for role in ("reference", "closed")[: len(frames)]:
         members = [frame.name for frame in frames if frame.role == role]
         if len(members) != 1:
             listed = ", ".join(members) or "none"

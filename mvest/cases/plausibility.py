@@ -172,7 +172,9 @@ def _outside(field: str, what: str, value: float, name: str, hint: str = "") -> 
 
 
 def _of_pressure(case: ValveCase) -> Iterator[Doubt]:
-    closed = case.frame(Role.CLOSED)
+    closed = case.closed
+    if closed is None:
+        return
     for frame in (closed, *case.fitted):
         pressure = frame.pressure_mmHg
         # kPa taken for mmHg: 120 mmHg are 16 kPa.
@@ -277,19 +279,22 @@ def _arc(vertices: FloatArray, loop: IntArray, own: np.typing.NDArray[np.bool_])
 
 
 def _of_orifice(case: ValveCase) -> Iterator[Doubt]:
-    reference, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
-    free = [free_orifice(case, frame) for frame in (reference, closed)]
-    if free[0] is None or free[1] is None:
+    reference, closed = case.frame(Role.REFERENCE), case.closed
+    open_ = free_orifice(case, reference)
+    if open_ is None:
         return
-    if free[1] > free[0]:
+    left = None if closed is None else free_orifice(case, closed)
+    if closed is not None and left is None:
+        return
+    if closed is not None and left is not None and left > open_:
         yield Doubt(
             "frames",
-            f"the closed frame {closed.name!r} leaves {free[1]:.0f} mm² free, the reference "
-            f"{reference.name!r} {free[0]:.0f} mm²: are the frames exchanged?",
+            f"the closed frame {closed.name!r} leaves {left:.0f} mm² free, the reference "
+            f"{reference.name!r} {open_:.0f} mm²: are the frames exchanged?",
             mistake=True,
         )
         return
-    yield from _outside(f"frames.{reference.name}", "the open orifice", free[0], "open_orifice")
+    yield from _outside(f"frames.{reference.name}", "the open orifice", open_, "open_orifice")
 
 
 def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = None) -> float | None:
@@ -318,7 +323,9 @@ def free_orifice(case: ValveCase, frame: Frame, vertices: FloatArray | None = No
 
 def _of_stretch(case: ValveCase) -> Iterator[Doubt]:
     """Whether the leaflets keep their size from the open to the closed frame."""
-    surface, closed = case.surface, case.frame(Role.CLOSED)
+    surface, closed = case.surface, case.closed
+    if closed is None:
+        return
     field = f"frames.{closed.name}.surface"
     for number, name in enumerate(surface.region_names):
         before = areas(surface.vertices, surface.triangles[surface.region == number]).sum()
@@ -357,7 +364,7 @@ def _of_chordae(case: ValveCase) -> Iterator[Doubt]:
     chordae = case.chordae
     if not len(chordae):
         return
-    reference, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
+    reference, closed = case.frame(Role.REFERENCE), case.closed
     open_ = np.linalg.norm(chordae.insertion - reference.papillary_tips[chordae.tip], axis=1)
     expected = RANGES["chord_length"]
     strange = [k for k, length in enumerate(open_) if float(length) not in expected]
@@ -367,7 +374,7 @@ def _of_chordae(case: ValveCase) -> Iterator[Doubt]:
             f"{len(strange)} of {len(open_)} chords are not {expected} long, chord {strange[0]} "
             f"{open_[strange[0]]:.1f} mm",
         )
-    if not closed.corresponds:
+    if closed is None or not closed.corresponds:
         return
     _, at = cKDTree(case.surface.vertices).query(chordae.insertion)
     length = np.linalg.norm(closed.vertices[at] - closed.papillary_tips[chordae.tip], axis=1)

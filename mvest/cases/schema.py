@@ -181,8 +181,8 @@ class CaseFile(_Model):
     fibre: Name | None = Field(
         None, description="the name of point data (3 components) of the reference surface"
     )
-    frames: Annotated[list[FrameEntry], Field(min_length=2)] = Field(
-        description="a list of at least two frames in the order of time"
+    frames: Annotated[list[FrameEntry], Field(min_length=1)] = Field(
+        description="a list of frames in the order of time, or the reference alone"
     )
     pressure_curve: Name | None = Field(
         None, description="a .csv file with the columns time,pressure"

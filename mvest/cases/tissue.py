@@ -167,7 +167,8 @@ def _laid_out(
     band = LeafletBand.of(
         seen.vertices, seen.triangles, reference.region, rims.annulus, rims.free_edge, anterior
     )
-    closed, closed_rims = next(p for p in placed if p[0].role is Role.CLOSED)
+    seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
+    closed, closed_rims = seen_closed[0] if seen_closed else placed[0]
     goal: LeafletBand | FloatArray
     if closed.corresponds:
         how, goal = "its vertices", closed.vertices
@@ -184,6 +185,10 @@ def _laid_out(
     chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips)
     derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
-        f"rest lengths from the closed frame (through {how})"
+        + (
+            f"rest lengths from the closed frame (through {how})"
+            if seen_closed
+            else "rest lengths from the open frame, for there is no closed one"
+        )
     )
     return chordae

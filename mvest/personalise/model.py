@@ -111,9 +111,9 @@ def build_coarse(
     mechanical = _mechanical(settings)
     free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
     fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
-    protocol = replace(
-        settings.mechanics.protocol, pressure_mmHg=case.frame(Role.CLOSED).pressure_mmHg
-    )
+    protocol = settings.mechanics.protocol
+    if case.closed is not None:
+        protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
     mechanics = replace(settings.mechanics, protocol=protocol)
     valve, mesh = case.valve, settings.mesh
     band = _band(case)

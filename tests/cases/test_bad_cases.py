@@ -453,7 +453,8 @@ CASES = {
     "two closed frames": (frame(2, "closed", 0.5), I, "frames", r"2 frames have the role closed"),
     "same name": (put("frames", 1, "name", "open"), I, "frames", "'open' occurs twice"),
     "unknown role": (put("frames", 1, "role", "shut"), I, "frames.1.role", "found 'shut'"),
-    "one frame": (drop("frames", 1), I, "frames", "at least two frames"),
+    "no frame": (put("frames", []), I, "frames", "a list of frames"),
+    "a closed frame alone": (drop("frames", 0), I, "frames", r"0 frames .* reference \(none\)"),
     "does not correspond": (
         both(put("corresponds", True), surface(lambda x, t, r: (x, t[::-1], r[::-1]), "closed")),
         I, "corresponds", "identical triangles",
