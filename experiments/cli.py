@@ -7,7 +7,6 @@ line says how); 130, 143 or 129 stopped by Ctrl-C, SIGTERM or SIGHUP.
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import re
 import shutil
@@ -15,9 +14,9 @@ import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from experiments.common.places import EXPERIMENTS
+from experiments.console import Parser
 from experiments.runner.interruption import interruptible
 from mvest import __version__
 from mvest.errors import MvestError
@@ -29,6 +28,8 @@ COMMANDS = {
     "run": "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
     "own-valve": "moduli of a valve from a case folder",
     "volume": "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
+    "import": "a case folder from what another program wrote: import NAME SOURCE CASE",
+    "export": "a case or a result for another program: export NAME SOURCE TARGET",
     "tables": "every table and figure of results/ anew, from the records that are kept there",
     "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
     "collect": "what became of the jobs of a sweep that others ran",
@@ -37,14 +38,6 @@ COMMANDS = {
 
 CHECK = "only read, check and draw it, in seconds, and say what an estimate would be able to tell"
 OVERRIDES = "settings as in `mvest run`, for example seed=2 or imaged.pressure_mmHg=120"
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one line, as everything here does."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say it and leave with status 2."""
-        self.exit(2, f"error: {message}\n")
 
 
 @interruptible
@@ -67,6 +60,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _application(_one_file("own-valve", "FOLDER", "own_valve", "case", rest))
         case "volume":
             return _application(_one_file("volume", "FILE", "volume", "volume", rest))
+        case "import":
+            from experiments.doors import import_command
+
+            return import_command(rest)
+        case "export":
+            from experiments.doors import export_command
+
+            return export_command(rest)
         case "tables":
             from experiments.tables import main as tables
 
