@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.anatomy import Anatomy, anatomy_of, build_mesh, guide_of
 from experiments.common.extrapolated import Extrapolated
 from experiments.common.schema import build
 from experiments.common.store import Store, StoredModel
@@ -42,36 +43,20 @@ from mvest.observation.errors import (
 from mvest.observation.vertices import require_frames
 from mvest.problem.problem import Problem
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template, TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface, Valve
-from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
 __all__ = [
     "Twin",
-    "build_mesh",
     "build_twin",
     "closure_model",
     "filter_of",
     "mechanics_of",
-    "template_of",
 ]
 
 Values = Mapping[str, Any]
 
-ENVELOPE_SHARE = 0.05
-"""Envelope of an unstructured mesh over its edge length."""
-
-COARSEST = (24, 3)
-"""Cells around and along the leaflets of the coarsest mesh on which a closure is followed."""
-
 MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo", "importance")
 """Filters that a configuration can name."""
-
-UNSTRUCTURED_SURFACE = (112, 29)
-"""Vertices of the surface that an unstructured mesh fills, whatever is observed."""
 
 
 def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureModel:
@@ -84,20 +69,20 @@ def closure_model(config: Values, variation: GateCase = REFERENCE) -> ClosureMod
     MvestError
         If a setting is inadmissible; the message names it.
     """
-    template, settings = template_of(config), mechanics_of(config)
+    anatomy, settings = anatomy_of(config), mechanics_of(config)
     observed, points = config["observation"], config["mechanics"]["contact_points"]
     mesh = dict(config["mesh"]) | _varied(config["mesh"], variation.mesh)
     model = ClosureModel(
-        template.valve(observed["columns"], observed["rows"]),
-        template.valve(**_varied(points, variation.sampling)),
-        build_mesh(template, mesh, config["mechanics"]["element"], _meshes(config)),
+        anatomy.valve(observed["columns"], observed["rows"]),
+        anatomy.valve(**_varied(points, variation.sampling)),
+        build_mesh(anatomy, mesh, config["mechanics"]["element"], _meshes(config)),
         settings,
         tuple(config["parameters"]),
         dict(config["fixed"]),
     )
     if variation is REFERENCE:
         return model
-    model.guide = guide_of(model, template, mesh) if variation.guided else None
+    model.guide = guide_of(model, anatomy, mesh) if variation.guided else None
     return vary(model, replace(variation, mesh=1.0, sampling=1.0))
 
 
@@ -185,9 +170,9 @@ def build_twin(config: Values) -> Twin:
     true_settings = truth_mechanics(settings, truth)
     _require_tissue(true_settings, parameters, values)
 
-    template = template_of(config)
+    anatomy = anatomy_of(config)
     observation = config["observation"]
-    valve = template.valve(observation["columns"], observation["rows"])
+    valve = anatomy.valve(observation["columns"], observation["rows"])
     check_parameters([*parameters, *config["fixed"], *truth["fixed"]], valve, settings)
     correlations = Correlations(valve.surface)
     errors = observation_errors(observation, correlations)
@@ -200,10 +185,10 @@ def build_twin(config: Values) -> Twin:
         reach=np.inf if config["continuation_reach"] is None else config["continuation_reach"],
     )
     if config["guided"]:
-        model.guide = guide_of(model, template, config["mesh"])
+        model.guide = guide_of(model, anatomy, config["mesh"])
         model.anchors = Anchors(Path(config["paths"]["outputs"]) / "anchors")
 
-    truth_model, source = _truth(config, plain, true_settings, template)
+    truth_model, source = _truth(config, plain, true_settings, anatomy)
     problem = Problem(parameters, model, prior, filter_, transform, settings.tissue)
     return Twin(
         problem,
@@ -220,7 +205,7 @@ def build_twin(config: Values) -> Twin:
 
 
 def _truth(
-    config: Values, plain: ClosureModel, settings: MechanicsSettings, template: Template
+    config: Values, plain: ClosureModel, settings: MechanicsSettings, anatomy: Anatomy
 ) -> tuple[ClosureModel, StoredModel | Extrapolated]:
     """The model that the observation is made from, and the same behind its store."""
     truth, element = config["truth"], config["mechanics"]["element"]
@@ -231,12 +216,12 @@ def _truth(
         same = mesh == dict(config["mesh"]) and other == element
         model = replace(
             plain,
-            mesh=plain.mesh if same else build_mesh(template, mesh, other, _meshes(config)),
+            mesh=plain.mesh if same else build_mesh(anatomy, mesh, other, _meshes(config)),
             settings=settings,
             fixed={**config["fixed"], **truth["fixed"]},
         )
         if coarser:  # meshes as fine as these take minutes from the open valve
-            model.guide = guide_of(model, template, mesh)
+            model.guide = guide_of(model, anatomy, mesh)
         described = {
             "valve": config["valve"],
             "mechanics": {k: v for k, v in config["mechanics"].items() if k != "element"},
@@ -318,11 +303,6 @@ def truth_mechanics(settings: MechanicsSettings, truth: Values) -> MechanicsSett
     return replace(settings, tissue=tissue, protocol=protocol)
 
 
-def template_of(config: Values) -> Template:
-    """The configured anatomy."""
-    return Template(build(TemplateParameters, config["valve"]))
-
-
 def mechanics_of(config: Values) -> MechanicsSettings:
     """The configured mechanics."""
     return build(MechanicsSettings, config["mechanics"])
@@ -345,41 +325,6 @@ def truth_mesh(mesh: Values, truth: Values) -> dict[str, Any]:
 def _cells(mesh: Values) -> dict[str, Any]:
     """What decides a structured mesh besides its element."""
     return {k: mesh[k] for k in ("source", "columns", "rows", "layers")}
-
-
-def guide_of(model: ClosureModel, template: Template, mesh: Values) -> ClosureModel | None:
-    """The model on a mesh of half as many cells each way, guided itself; None at the coarsest.
-
-    Guides have solid-shells, whatever the element and the source of the model's mesh.
-    """
-    if mesh["columns"] <= COARSEST[0]:
-        return None
-    cells = COARSEST
-    if mesh["columns"] > 2.5 * COARSEST[0]:
-        cells = (2 * round(mesh["columns"] / 4), max(mesh["rows"] // 2, COARSEST[1]))
-    coarse = replace(model, mesh=structured_mesh(template, "hex18", *cells), guide=None)
-    coarse.guide = guide_of(coarse, template, {"columns": cells[0], "rows": cells[1]})
-    return coarse
-
-
-def build_mesh(template: Template, mesh: Values, element: str, store: Path) -> SolidMesh:
-    """The mesh of a template; an unstructured one is made once and kept in ``store``."""
-    if mesh["source"] == "structured":
-        return structured_mesh(template, element, mesh["columns"], mesh["rows"], mesh["layers"])
-    if mesh["source"] != "tetwild":
-        raise ConfigurationError(
-            f"mesh.source = {mesh['source']!r}, expected structured or tetwild"
-        )
-    if element not in ("tet4", "tet10"):
-        raise ConfigurationError(
-            f"mechanics.element = {element!r}: an unstructured mesh needs tet10 or tet4"
-        )
-    columns, rows = UNSTRUCTURED_SURFACE
-    j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    normals = template.normal(360.0 * i / columns, j / (rows - 1))
-    settings = TetwildSettings(mesh["edge_length"], ENVELOPE_SHARE * mesh["edge_length"])
-    surface = template.valve(columns, rows).surface
-    return tetrahedral_leaflets(surface, settings, element, store, normals)
 
 
 def build_filter(

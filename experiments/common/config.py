@@ -17,6 +17,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from experiments.common.anatomy import ValveFolderConfig, folder_hash
 from experiments.common.schema import schema, with_contents
 from experiments.common.study import load_settings, study_names
 from mvest.estimation.filters.ensemble import EnsembleFilter
@@ -29,7 +30,14 @@ from mvest.valve.anatomy.template import TemplateParameters
 
 __all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
 
-AS_BEFORE: dict[str, Any] = {"check_runs": 0, "curve": [], "active": True, "extrapolated_from": []}
+AS_BEFORE: dict[str, Any] = {
+    "check_runs": 0,
+    "curve": [],
+    "active": True,
+    "extrapolated_from": [],
+    "folder_sha256": None,
+    "annulus_contraction": 0.0,
+}
 """Settings that came after results which are as with these values; so they leave no trace in the
 hash, wherever they stand in a configuration."""
 
@@ -56,11 +64,12 @@ NOT_THE_RESULT = (
     "external.folder",
     "external.processes",
     "models.processes",
+    "valve.folder",
 )
 """What in a configuration changes no number of the result, left out of its hash."""
 
 
-TemplateConfig = schema(TemplateParameters)
+TemplateConfig = schema(TemplateParameters, ValveFolderConfig)
 EnsembleFilterConfig = schema(EnsembleFilter)
 MonteCarloFilterConfig = schema(MonteCarloFilter)
 
@@ -313,6 +322,11 @@ def _room(config_path: str) -> str:
     return name.removesuffix(".yaml") if group == GROUP else ""
 
 
+def _valve_folder(*, _root_: DictConfig) -> str | None:
+    """SHA-256 of the case folder whose anatomy is configured, if there is one."""
+    return folder_hash(_root_.valve.folder)
+
+
 def _chosen(group: str, *, _root_: DictConfig) -> str:
     """What was chosen of a group; its name where that is not known."""
     # A job of a sweep is composed with Hydra's part, one by itself is not.
@@ -326,10 +340,12 @@ def register() -> None:
     """Make the schemas and the resolvers known; may be called again.
 
     ``${config_hash:}`` is the hash of the configuration, ``${package_model:}`` that of the
-    package's detectors, ``${chosen:GROUP}`` what was chosen of a group.
+    package's detectors, ``${chosen:GROUP}`` what was chosen of a group,
+    ``${valve_folder:}`` the hash of the case whose anatomy is configured.
     """
     Plugins.instance().register(StudySource)
     OmegaConf.register_new_resolver("package_model", _package_model, replace=True)
+    OmegaConf.register_new_resolver("valve_folder", _valve_folder, replace=True)
     OmegaConf.register_new_resolver("chosen", _chosen, replace=True)
     OmegaConf.register_new_resolver(
         "config_hash", lambda *, _root_: hash_of(_root_)[:16], replace=True

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-__all__ = ["CONF", "EXPERIMENTS", "GATE_RECORDS"]
+__all__ = ["ANATOMIES", "CONF", "EXPERIMENTS", "GATE_RECORDS"]
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -14,6 +14,9 @@ CONF = next(
 
 EXPERIMENTS = CONF / "experiment"
 """One YAML file an experiment."""
+
+ANATOMIES = tuple(sorted({path.stem for path in (CONF / "valve").glob("*.yaml")} - {"folder"}))
+"""The anatomies that ship; ``folder`` is whatever a case folder holds."""
 
 GATE_RECORDS = _PACKAGE.parent / "results" / "records" / "gate"
 """Kept records of the gate in a checkout; an installation has none."""

@@ -11,16 +11,13 @@ from mvest.cases.case import Frame, Role, ValveCase
 from mvest.closure.anchors import Anchors
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
-from mvest.errors import GeometryError, InputError
+from mvest.errors import InputError
 from mvest.mechanics.valve_system import HeldState, check_parameters
 from mvest.personalise.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.valve.anatomy.band import Band
-from mvest.valve.anatomy.valve import Valve
+from mvest.valve.mesh.given import GivenValve
 from mvest.valve.mesh.solid_mesh import SolidMesh
-from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
 __all__ = ["build_coarse", "build_model", "frames_model", "held_state", "with_pressures"]
 
@@ -94,12 +91,12 @@ def build_model(
         If the leaflets cannot be meshed.
     """
     _check_unknowns(case, settings)
-    band = _band(case)
     coarse = build_coarse(case, settings, store)
     anchors = None if store is None else Anchors(store)
-    if band is None:
+    shape = GivenValve(case.valve)
+    if shape.band is None:
         return replace(coarse, anchors=anchors)
-    solid = _solid(case.valve, band, settings.mesh, store)
+    solid = _solid(shape, settings.mesh, store)
     return replace(coarse, mesh=solid, guide=coarse, anchors=anchors)
 
 
@@ -115,17 +112,13 @@ def build_coarse(
     if case.closed is not None:
         protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
     mechanics = replace(settings.mechanics, protocol=protocol)
-    valve, mesh = case.valve, settings.mesh
-    band = _band(case)
-    if band is None:
-        contact, solid = valve, _solid(valve, band, mesh, store)
-    else:
-        contact = band.sampled(mesh.contact_columns, mesh.contact_rows)
-        cells = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
-        solid = _solid(valve, band, cells, store)
+    shape, mesh = GivenValve(case.valve), settings.mesh
+    if shape.band is not None:
+        mesh = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
+    solid = _solid(shape, mesh, store)
     return ClosureModel(
-        valve,
-        contact,
+        shape.given,
+        shape.valve(mesh.contact_columns, mesh.contact_rows),
         solid,
         mechanics,
         free,
@@ -160,23 +153,7 @@ def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
         )
 
 
-def _band(case: ValveCase) -> Band | None:
-    return Band(case.valve) if len(case.surface.region_names) == 2 else None
-
-
-def _solid(valve: Valve, band: Band | None, mesh: CaseMesh, store: Path | None) -> SolidMesh:
+def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
     if mesh.source == "structured":
-        if band is None:
-            raise InputError(
-                "a structured mesh needs a valve with two leaflets; expected mesh source tetwild"
-            )
-        try:
-            return structured_mesh(band, "hex18", mesh.columns, mesh.rows)
-        except GeometryError as fault:
-            raise GeometryError(
-                f"structured mesh of {mesh.columns} x {mesh.rows} cells: {fault}; the reference "
-                "surface or the line between its leaflets is too jagged: smooth it, change the "
-                "number of cells, or take mesh source tetwild"
-            ) from fault
-    settings = TetwildSettings(mesh.edge_length, 0.05 * mesh.edge_length)
-    return tetrahedral_leaflets(valve.surface, settings, "tet10", store)
+        return shape.layers("hex18", mesh.columns, mesh.rows)
+    return shape.tetrahedra(mesh.edge_length, "tet10", store)

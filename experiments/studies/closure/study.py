@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from experiments.common.build import closure_model, template_of
+from experiments.common.anatomy import anatomy_of
+from experiments.common.build import closure_model
 from experiments.common.forward import outcome_of
 from experiments.common.gate import gate_of
 from experiments.common.progress import SolveBar
@@ -32,8 +31,6 @@ from mvest.valve.mesh.embedding import embed
 
 __all__ = ["STUDY", "run_closure"]
 
-Values = Mapping[str, Any]
-
 
 def run_closure(job: Job[Settings]) -> Outcome[Findings]:
     """Close the valve once and measure every stored step."""
@@ -46,7 +43,8 @@ def run_closure(job: Job[Settings]) -> Outcome[Findings]:
     contact = model.settings.contact
     thickness = float(model.valve.surface.thickness.mean())
     distance = 0.5 * thickness * (contact.reference_distance + contact.activation_distance)
-    normals = _normals(values)
+    observed = values["observation"]
+    normals = anatomy_of(values).normals(observed["columns"], observed["rows"])
     simulation = result.simulation
     findings = Findings(
         rows=measure_steps(model, result, distance, normals),
@@ -82,13 +80,6 @@ def _write_fields(
         # Of faces, which are half a thickness nearer than midsurfaces on both sides.
         reach_mm=contact_reach(model) - valve.surface.thickness[valve.free_edge].mean(),
     )
-
-
-def _normals(values: Values) -> FloatArray:
-    """Directions ``(n, 3)`` of the thickness at the observed vertices."""
-    columns, rows = (values["observation"][key] for key in ("columns", "rows"))
-    j, i = (v.ravel() for v in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-    return template_of(values).normal(360.0 * i / columns, j / (rows - 1))
 
 
 STUDY = Study(

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import mechanics_of, template_of
+from experiments.common.anatomy import template_of
+from experiments.common.build import mechanics_of
 from experiments.common.cases.own_case import settings_of
 from experiments.common.forward import outcome_of
 from experiments.common.progress import say

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.common.places import CONF
+from experiments.common.places import ANATOMIES
 from experiments.common.record import Record
 from experiments.common.report import percent
 from experiments.studies.gate.findings import Findings, Limits
@@ -92,8 +92,7 @@ def write_gate(folder: Path, records: Records, _arrays: Mapping[str, Path]) -> l
     base = folder / first.table
     table = gate_table(records)
     lines = "  \n".join(f"{record.row}: {record.line}" for record in records.values())
-    shipped = {path.stem for path in (CONF / "valve").glob("*.yaml")}
-    missing = sorted(shipped - {record.row for record in records.values()})
+    missing = sorted(set(ANATOMIES) - {record.row for record in records.values()})
     note = f"**Not asked yet: {', '.join(missing)}.**\n\n" if missing else ""
     text = f"# {first.title}\n\n{note}{gate_words(records)}\n\n{lines}\n"
     return [

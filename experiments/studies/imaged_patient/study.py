@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import mechanics_of, template_of
+from experiments.common.anatomy import template_of
+from experiments.common.build import mechanics_of
 from experiments.common.cases import findings as of_cases
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.record import Outcome, Status

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import mechanics_of, template_of
+from experiments.common.anatomy import template_of
+from experiments.common.build import mechanics_of
 from experiments.common.cycle_settings import CycleSettings
 from experiments.common.expectation import expect_cycle
 from experiments.common.findings import vector

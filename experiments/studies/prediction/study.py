@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import Twin, build_mesh, build_twin, template_of
+from experiments.common.anatomy import anatomy_of, build_mesh
+from experiments.common.build import Twin, build_twin
 from experiments.common.findings import Rows, rows, vector
 from experiments.common.forward import outcome_of
 from experiments.common.gate import gate_of
@@ -96,7 +97,7 @@ def run_prediction(job: Job[Settings]) -> Outcome[Findings]:
     scenarios = settings.scenarios
     twin = build_twin(config)
     # Measured on more points than are observed, which cost time where their errors are correlated.
-    valve = template_of(config).valve(*MEASURED_ON)
+    valve = anatomy_of(config).valve(*MEASURED_ON)
     asked = _Asked(
         scenarios,
         np.array(settings.spread, dtype=float),
@@ -238,7 +239,7 @@ def _mesh_of(config: Values, cells: Sequence[int]) -> SolidMesh:
     """The configured mesh with ``cells`` around and along the leaflets."""
     columns, rows = cells
     return build_mesh(
-        template_of(config),
+        anatomy_of(config),
         {**config["mesh"], "columns": columns, "rows": rows},
         config["mechanics"]["element"],
         Path(config["paths"]["outputs"]) / "meshes",

@@ -147,10 +147,17 @@ class Band:
         zeta = np.broadcast_to(np.asarray(zeta, float), np.shape(phi))
         if not np.any(zeta):
             return middle
-        normal = _mean(at, surface, self._normals)
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        normal = self._normal(at)
         half = 0.5 * zeta * _mean(at, surface, surface.thickness)
         return np.asarray(middle + half[..., None] * normal)
+
+    def normal(self, phi: FloatArray, s: FloatArray) -> FloatArray:
+        """Unit normals ``(k, 3)`` towards the ventricle, along which the leaflets are thick."""
+        return self._normal(self._at(phi, s))
+
+    def _normal(self, at: tuple[IntArray, FloatArray]) -> FloatArray:
+        normal = _mean(at, self.valve.surface, self._normals)
+        return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(..., 3)`` as seen from the leaflet ``region``."""

@@ -189,6 +189,11 @@ class Template:
             total += weight * n / np.linalg.norm(n, axis=-1, keepdims=True)
         return total / np.linalg.norm(total, axis=-1, keepdims=True)
 
+    def normals(self, columns: int, rows: int) -> FloatArray:
+        """Directions ``(n, 3)`` of the thickness at the vertices of `valve`."""
+        grid = band_grid(columns, rows)
+        return self.normal(grid.phi, grid.s)
+
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(k, 3)`` seen from the leaflet ``region``."""
         t, r = self.tangents(phi, s)

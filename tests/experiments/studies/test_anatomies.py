@@ -5,14 +5,14 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.build import template_of
+from experiments.common.anatomy import template_of
 from experiments.common.config import plain, register
+from experiments.common.places import ANATOMIES
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
 from tests.places import CONF
 
-NAMES = sorted(path.stem for path in (CONF / "valve").glob("*.yaml"))
-NORMAL = [name for name in NAMES if name.startswith("normal")]
+NORMAL = [name for name in ANATOMIES if name.startswith("normal")]
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def diameters(template: Template) -> tuple[float, float]:
     return float(np.ptp(y)), float(np.ptp(x))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ANATOMIES)
 def test_every_anatomy_is_a_valve_that_can_be_meshed(name: str) -> None:
     template = anatomy(name)
     valve = template.valve()

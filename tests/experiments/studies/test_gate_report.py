@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from experiments.common.gate import anatomy_digest, gate_of
-from experiments.common.places import GATE_RECORDS
+from experiments.common.places import ANATOMIES, GATE_RECORDS
 from experiments.common.record import (
     NOT_GATED,
     Mesh,
@@ -25,7 +25,6 @@ from tests.experiments.studies.test_gate_study import composed
 from tests.places import CONF
 
 LIMITS = Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SEEN, SLOPE_LIMIT, SIDE_LIMIT)
-ANATOMIES = sorted(path.stem for path in (CONF / "valve").glob("*.yaml"))
 
 
 def findings(values, *rows, path=None, gap=0.0):
@@ -125,7 +124,7 @@ def test_a_record_says_the_verdict_in_its_line_where_it_has_one(calm):
 def test_every_anatomy_that_ships_is_one_of_those_that_are_asked():
     asked = CONF.joinpath("experiment", "gate.yaml").read_text(encoding="utf-8")
     (line,) = (line for line in asked.splitlines() if line.strip().startswith("valve:"))
-    assert sorted(line.partition(":")[2].strip().split(",")) == ANATOMIES
+    assert sorted(line.partition(":")[2].strip().split(",")) == list(ANATOMIES)
 
 
 @pytest.mark.parametrize("path", sorted(GATE_RECORDS.glob("*.json")), ids=lambda path: path.stem)
