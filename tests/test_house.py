@@ -69,6 +69,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     ),
     "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
     "mvest.cases.from_images": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
+    "mvest.cases.importing": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
     "mvest.personalise": (
         *LEAVES,
         "mvest.valve",

@@ -99,7 +99,7 @@ class FrameEntry(_Model):
         "further closed frame, under another pressure, fitted with it) or held_out"
     )
     surface: SurfaceFiles = Field(
-        description="a file (.vtp, .vtu, .stl, .obj, .ply), or one file for every region"
+        description="a file (.vtp, .vtu, .vtk, .stl, .obj, .ply), or one file for every region"
     )
     annulus: Curve | None = Field(
         None, description="a list of vertex numbers in the order of the loop, or a .csv file"

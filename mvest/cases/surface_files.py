@@ -25,7 +25,7 @@ from mvest.reading.text import MAX_NUMBER
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
 
-__all__ = ["MERGE_TOLERANCE", "RegionSurface", "read_regions"]
+__all__ = ["MERGE_TOLERANCE", "RegionSurface", "merged", "read_regions"]
 
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
@@ -81,7 +81,7 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     if isinstance(files, Path):
         with refusing(files, "surface"):
             return _checked(_of_one_file(files, regions), regions)
-    return _checked(_merged(_joined(files, list(regions.values()))), regions)
+    return _checked(merged(_joined(files, list(regions.values()))), regions)
 
 
 def _of_one_file(file: Path, regions: Mapping[int, str]) -> RegionSurface:
@@ -91,7 +91,7 @@ def _of_one_file(file: Path, regions: Mapping[int, str]) -> RegionSurface:
     )
     suffix = file.suffix.lower()
     return (
-        _merged(surface) if suffix == ".stl" or (suffix == ".obj" and _apart(surface)) else surface
+        merged(surface) if suffix == ".stl" or (suffix == ".obj" and _apart(surface)) else surface
     )
 
 
@@ -144,7 +144,7 @@ def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:
     )
 
 
-def _merged(surface: RegionSurface) -> RegionSurface:
+def merged(surface: RegionSurface) -> RegionSurface:
     """The surface with coincident vertices made one, numbered as the triangles name them."""
     n = len(surface.vertices)
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))

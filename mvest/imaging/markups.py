@@ -1,4 +1,4 @@
-"""Points and curves as 3D Slicer's markups (``.mrk.json``), written and read.
+"""Points and curves as 3D Slicer's markups (``.mrk.json``), written and read; its ``.fcsv`` read.
 
 The format is the JSON schema ``markups-schema-v1.0.3.json`` of Slicer's module Markups. Positions
 here are always LPS in mm.
@@ -6,6 +6,8 @@ here are always LPS in mm.
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,10 +21,10 @@ from mvest.files import write_atomically
 from mvest.imaging.reading.stated import fault
 from mvest.imaging.writing.slicer import checked_path
 from mvest.reading.bounded import refusing
-from mvest.reading.text import MAX_NUMBER, read_bytes
+from mvest.reading.text import MAX_NUMBER, check_words, number, read_bytes, read_text
 from mvest.typing import FloatArray
 
-__all__ = ["PointList", "read_markups", "write_markups"]
+__all__ = ["TO_LPS", "PointList", "read_fcsv", "read_markups", "write_markups"]
 
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
@@ -30,6 +32,9 @@ SCHEMA = (
 )
 KINDS = ("Fiducial", "Curve", "ClosedCurve")
 TO_LPS = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
+FCSV_AXES = {"LPS": "LPS", "RAS": "RAS", "0": "RAS", "1": "LPS"}
+"""As numbers before Slicer 4.11."""
+FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
 MAX_BYTES = 2**24
 
 
@@ -142,6 +147,40 @@ def read_markups(path: Path | str) -> dict[str, PointList]:
         return _read(source)
 
 
+def read_fcsv(path: Path | str) -> list[tuple[str, FloatArray]]:
+    """Read the labels and positions ``(3,)`` (LPS, mm) of Slicer's older lists of points.
+
+    Raises
+    ------
+    InputError
+        No such file, unknown axes, a row without position.
+    """
+    source = Path(path)
+    with refusing(source, "list of points"):
+        axes, columns, rows = "RAS", list(FCSV_COLUMNS), []
+        for line in csv.reader(io.StringIO(read_text(source, MAX_BYTES), newline=""), strict=True):
+            key, _, value = ",".join(line).removeprefix("#").strip().partition("=")
+            match key.strip():
+                case "CoordinateSystem" if line[0].startswith("#"):
+                    if value.strip() not in FCSV_AXES:
+                        raise fault(source, "CoordinateSystem", repr(value.strip()), "LPS or RAS")
+                    axes = FCSV_AXES[value.strip()]
+                case "columns" if line[0].startswith("#"):
+                    columns = [name.strip() for name in value.split(",")]
+                case _ if line and not line[0].startswith("#"):
+                    rows.append(line)
+        if not {"x", "y", "z", "label"} <= set(columns):
+            raise fault(source, "columns", ",".join(columns), "x, y, z and label")
+        at = [columns.index(name) for name in ("x", "y", "z", "label")]
+        result = []
+        for row, cells in enumerate(rows):
+            if len(cells) <= max(at):
+                raise fault(source, f"row {row}", f"{len(cells)} cells", f"{len(columns)}")
+            position = np.array([number(cells[k]) for k in at[:3]]) * TO_LPS[axes]
+            result.append((check_words(cells[at[3]]).strip(), position))
+        return result
+
+
 def _read(source: Path) -> dict[str, PointList]:
     try:
         content = json.loads(read_bytes(source, MAX_BYTES))
@@ -152,9 +191,9 @@ def _read(source: Path) -> dict[str, PointList]:
     if "/markups-schema-v1." not in schema:
         raise fault(source, "@schema", repr(schema), "markups-schema-v1.0.3.json or alike")
     result: dict[str, PointList] = {}
-    for number, item in enumerate(_member(source, "markups", content.get("markups"), list)):
-        where = f"markups[{number}]"
-        name, points = _read_list(source, where, _member(source, where, item, dict), number)
+    for index, item in enumerate(_member(source, "markups", content.get("markups"), list)):
+        where = f"markups[{index}]"
+        name, points = _read_list(source, where, _member(source, where, item, dict), index)
         if name in result:
             raise fault(source, f"{where}.name", repr(name), "another name in every list")
         result[name] = points

@@ -133,6 +133,43 @@ def vtk(path: Path, form: str) -> Path:
     return path
 
 
+def legacy_vtk(folder: Path, version: str, *, binary: bool) -> Path:
+    """A legacy VTK file with polygons, a strip, normals and a field."""
+
+    def put(values: list[list[float]], kind: str) -> bytes:
+        if binary:
+            return np.concatenate(values).astype(kind).tobytes() + b"\n"
+        return "".join(" ".join(f"{x:g}" for x in row) + "\n" for row in values).encode()
+
+    old = version < "5"
+    corners = [[3.0, *map(float, row)] for row in TRIANGLES[:2]]
+    if old:
+        polygons = b"POLYGONS 2 8\n" + put(corners, ">i4")
+        strips = b"TRIANGLE_STRIPS 1 5\n" + put([[4.0, 0, 1, 2, 3]], ">i4")
+    else:
+        flat = [[0.0, 1, 2, 2, 1, 3]]
+        polygons = b"POLYGONS 3 6\nOFFSETS vtktypeint64\n" + put([[0.0, 3, 6]], ">i8")
+        polygons += b"CONNECTIVITY vtktypeint64\n" + put(flat, ">i8")
+        strips = b"TRIANGLE_STRIPS 2 4\nOFFSETS vtktypeint64\n" + put([[0.0, 4]], ">i8")
+        strips += b"CONNECTIVITY vtktypeint64\n" + put([[0.0, 1, 2, 3]], ">i8")
+    head = f"# vtk DataFile Version {version}\n3D Slicer output. SPACE=LPS\n"
+    head += f"{'BINARY' if binary else 'ASCII'}\nDATASET POLYDATA\nPOINTS 5 float\n"
+    parts = (
+        head.encode(),
+        put(POINTS.tolist(), ">f4"),
+        polygons,
+        strips,
+        b"CELL_DATA 3\nSCALARS region int 1\nLOOKUP_TABLE default\n",
+        put([[1.0, 2, 2]], ">i4"),
+        b"POINT_DATA 5\nNORMALS Normals double\n",
+        put(POINTS.tolist(), ">f8"),
+        b"METADATA\nINFORMATION 0\n\nFIELD FieldData 1\nwall%20thickness 1 5 float\n",
+        put([[1.0, 2, 3, 4, 5]], ">f4"),
+    )
+    (folder / "a.vtk").write_bytes(b"".join(parts))
+    return folder / "a.vtk"
+
+
 def leaflets(path: Path) -> Path:
     names = ("anterior", "posterior")
     fibre = np.tile([1.0, 0.0, 0.0], (5, 1))
@@ -173,6 +210,15 @@ READERS = (
         tuple(
             lambda folder, form=form: vtk(folder / "a.vtu", form)
             for form in ("ascii", "binary", "appended")
+        ),
+    ),
+    Reader(
+        "surface.vtk",
+        regions,
+        tuple(
+            lambda folder, v=version, b=binary: legacy_vtk(folder, v, binary=b)
+            for version in ("4.2", "5.1")
+            for binary in (False, True)
         ),
     ),
     Reader(

@@ -7,7 +7,7 @@ import nibabel
 import numpy as np
 import SimpleITK
 
-from mvest.imaging.markups import read_markups
+from mvest.imaging.markups import read_fcsv, read_markups
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality
 from tests.fuzz.trial import Reader
@@ -86,6 +86,15 @@ def philips(path: Path, explicit: bool, preamble: bool) -> Path:
     return test_philips.save(path, test_philips.dataset(SHAPE), explicit, preamble)
 
 
+def fcsv(folder: Path) -> Path:
+    (folder / "a.fcsv").write_text(
+        "# Markups fiducial file version = 5.0\n# CoordinateSystem = LPS\n"
+        "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID\n"
+        '1,1.5,-2.5e1,30,0,0,0,1,1,1,0,ALC,,\n2,3,4,5,0,0,0,1,1,1,0,"P, M",,\n'
+    )
+    return folder / "a.fcsv"
+
+
 def markups(folder: Path) -> Path:
     """As 3D Slicer's own example has it."""
     point = (
@@ -132,5 +141,6 @@ READERS = (
             lambda folder: philips(folder / "a.dcm", False, False),
         ),
     ),
+    Reader("fcsv", read_fcsv, (fcsv,)),
     Reader("markups", read_markups, (markups,)),
 )

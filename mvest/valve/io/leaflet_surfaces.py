@@ -1,4 +1,4 @@
-"""Reading and writing surfaces and solid meshes: VTU, VTP, STL, OBJ, PLY, time series for ParaView.
+"""Reading and writing surfaces and solid meshes: VTK, STL, OBJ, PLY, time series for ParaView.
 
 Coordinates are mm. A file appears under its name only once it is complete.
 """
@@ -20,6 +20,7 @@ from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
+from mvest.valve.io.vtk_legacy import read_vtk
 from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
 
 __all__ = [
@@ -36,12 +37,15 @@ __all__ = [
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 
-SURFACE_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
+WRITTEN_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
+SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk")
+"""That are read."""
 
 
 _READERS = {
     ".vtu": lambda path: _triangles(read_vtu(path)),
     ".vtp": read_vtp,
+    ".vtk": read_vtk,
     ".stl": read_stl,
     ".obj": read_obj,
     ".ply": read_ply,
@@ -72,8 +76,8 @@ def read_surface(path: Path | str) -> SurfaceFile:
     Raises
     ------
     InputError
-        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.stl``, ``.obj``,
-        ``.ply``.
+        Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.vtk`` (legacy),
+        ``.stl``, ``.obj``, ``.ply``.
     GeometryError
         No triangles, other cells, or points that are not finite.
     """
@@ -143,7 +147,7 @@ def write_surface(
         a file that cannot be written.
     """
     target = Path(path)
-    _check_suffix(target, SURFACE_SUFFIXES)
+    _check_suffix(target, WRITTEN_SUFFIXES)
     points = np.ascontiguousarray(vertices, dtype=np.float64)
     faces = np.ascontiguousarray(triangles, dtype=np.int64)
     _check_cells(points, faces, 3, str(target))

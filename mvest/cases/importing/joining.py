@@ -1,0 +1,392 @@
+"""Two leaflets that were surfaced one by one, joined along their commissures to the band of a case.
+
+Each leaflet is a disc: its boundary runs along the annulus from one commissure to the other and
+back along the free edge. At a commissure two such boundaries lie side by side for some way before
+the free edges part; a strip of triangles is laid between them there. The band is then drawn anew on
+the lines of its own coordinates, so that it has triangles of one size whatever the leaflets had.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mvest.cases.chord_layout import LeafletBand
+from mvest.cases.ears import without_ears
+from mvest.cases.rims import loop_vector_area, two_loops
+from mvest.cases.surface_files import RegionSurface, merged
+from mvest.errors import GeometryError
+from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.geometry.surface_coordinates import boundary_loops
+from mvest.valve.geometry.thickening import smooth_vertex_normals
+from mvest.valve.geometry.triangles import areas, surface_edges
+
+__all__ = ["Commissures", "JoinedLeaflets", "Leaflet", "commissures_on", "drawn_anew", "joined"]
+
+COINCIDENT = 1e-6
+"""mm, below which vertices of both leaflets are one."""
+REGIONS = ("anterior", "posterior")
+MAX_HOLE = 0.2
+"""Of a leaflet's boundary: how long that of a hole may be, which is closed."""
+MAX_GAP = 6.0
+"""mm between the leaflets at a commissure, and from a commissure to the leaflets."""
+MAX_SEAM = 0.25
+"""Of a free edge, from commissure to commissure: how far it may run beside the other one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaflet:
+    """One leaflet as a disc.
+
+    Attributes
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm and ``(m, 3)``.
+    loop
+        ``(k,)`` its boundary, in the direction of its triangles.
+    holes : int
+        How many were closed.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    loop: IntArray
+    holes: int
+
+    @classmethod
+    def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
+        """The largest piece of a surface, with coincident vertices made one and holes closed.
+
+        Raises
+        ------
+        GeometryError
+            It is closed, no manifold, or has a hole that is a second boundary.
+        """
+        whole = merged(
+            RegionSurface(vertices, triangles, np.zeros(len(triangles), dtype=np.int64), {})
+        )
+        faces = whole.triangles
+        apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        faces = faces[apart & (areas(whole.vertices, faces) > 0)]
+        faces = _largest_piece(whole.vertices, faces)
+        loops = boundary_loops(faces)
+        if not loops:
+            raise GeometryError(
+                "a closed surface, expected one side of a leaflet: an open surface that ends at "
+                "the annulus and at the free edge"
+            )
+        length = [_length(whole.vertices[loop]) for loop in loops]
+        outer = int(np.argmax(length))
+        points = [whole.vertices]
+        n = len(whole.vertices)
+        for number, loop in enumerate(loops):
+            if number == outer:
+                continue
+            if length[number] > MAX_HOLE * length[outer]:
+                raise GeometryError(
+                    f"boundaries of {length[outer]:.0f} and {length[number]:.0f} mm, expected one: "
+                    "a leaflet that ends at the annulus and at the free edge"
+                )
+            points.append(whole.vertices[loop].mean(axis=0, keepdims=True))
+            fan = np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), n)])
+            faces = np.concatenate([faces, fan])
+            n += 1
+        used, inverse = np.unique(faces, return_inverse=True)
+        faces = inverse.reshape(-1, 3)
+        loop = np.searchsorted(used, loops[outer])
+        return cls(np.concatenate(points)[used], faces, loop, len(loops) - 1)
+
+    def turned(self) -> Leaflet:
+        """The same with its triangles facing the other way."""
+        return Leaflet(self.vertices, self.triangles[:, ::-1], self.loop[::-1], self.holes)
+
+    def arcs(self, first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
+        """The loop from the vertex nearest to a point to that nearest to another, and the rest.
+
+        Both arcs have both ends.
+        """
+        curve = self.vertices[self.loop]
+        start, stop = (
+            int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
+        )
+        if start == stop:
+            raise GeometryError(
+                "both commissures are at the same vertex of a leaflet; are they those of this "
+                "valve, in the same axes?"
+            )
+        turned = np.roll(self.loop, -start)
+        cut = (stop - start) % len(turned)
+        return turned[: cut + 1], np.append(turned[cut:], turned[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commissures:
+    """Where the annulus passes from one leaflet to the other.
+
+    Attributes
+    ----------
+    points
+        ``(2, 3)`` mm.
+    contour
+        ``(k, 3)`` mm, closed curve along the annulus, or None.
+    """
+
+    points: FloatArray
+    contour: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedLeaflets:
+    """Both leaflets as one surface, which faces the ventricle.
+
+    Attributes
+    ----------
+    vertices, triangles, region
+        ``(n, 3)`` mm, ``(m, 3)`` and ``(m,)``: 0 anterior, 1 posterior.
+    annulus, free_edge
+        The boundary loops, in the direction of their triangles.
+    seams
+        ``(2, 2)`` share of each leaflet's free edge (columns) that is joined at each commissure.
+    gap
+        mm, largest distance between the leaflets that a strip of triangles spans.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray
+    annulus: IntArray
+    free_edge: IntArray
+    seams: FloatArray
+    gap: float
+
+
+def commissures_on(contour: FloatArray, anterior: Leaflet, posterior: Leaflet) -> FloatArray:
+    """The two points ``(2, 3)`` of a contour where the nearer leaflet changes.
+
+    Raises
+    ------
+    GeometryError
+        It is not near to each of the leaflets once, in one piece.
+    """
+    distance = [
+        _nearest(contour, leaflet.vertices[leaflet.loop])[0] for leaflet in (anterior, posterior)
+    ]
+    # Over as many neighbours as make a few mm, so that no single point decides.
+    difference = distance[0] - distance[1]
+    width = max(1, round(0.02 * len(contour)))
+    smooth = sum(np.roll(difference, k) for k in range(-width, width + 1))
+    nearer = smooth < 0
+    changes = np.flatnonzero(nearer != np.roll(nearer, 1))
+    if len(changes) != 2:
+        raise GeometryError(
+            f"along the annulus the nearer leaflet changes {len(changes)} times, expected twice; "
+            "give the commissures as landmarks ALC and PMC"
+        )
+    return contour[changes]
+
+
+def joined(
+    anterior: Leaflet,
+    posterior: Leaflet,
+    where: Commissures,
+    down: FloatArray,
+    max_seam_mm: float,
+    seams: FloatArray | None = None,
+) -> JoinedLeaflets:
+    """Join two leaflets.
+
+    Parameters
+    ----------
+    anterior, posterior
+    where
+    down
+        ``(3,)`` from the annulus to the ventricle.
+    max_seam_mm
+        Distance up to which boundaries that leave a commissure side by side are joined.
+    seams
+        Share of the free edges that is joined instead, `seams` of another frame: where the
+        valve is closed the edges lie side by side all along.
+
+    Raises
+    ------
+    GeometryError
+        The commissures are not at the leaflets, or what is joined is no leaflets.
+    """
+    leaflets = (anterior, posterior)
+    for name, leaflet in zip(REGIONS, leaflets, strict=True):
+        away = float(_nearest(where.points, leaflet.vertices[leaflet.loop])[0].max())
+        if away > MAX_GAP:
+            raise GeometryError(
+                f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
+                f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
+            )
+    front, front_annulus, front_edge = _facing_ventricle(anterior, posterior, where, down)
+    back, back_annulus, back_edge = _facing_ventricle(posterior, anterior, where, down)
+    ends = front.vertices[front_annulus[[0, -1]]]
+    begin = back.vertices[back_annulus[0]]
+    if np.argmin(np.linalg.norm(ends - begin, axis=1)) != 1:
+        raise GeometryError("both leaflets lie on the same side of the commissures")
+    vertices = np.concatenate([front.vertices, back.vertices])
+    offset = len(front.vertices)
+    front_edge, back_edge = front_edge, back_edge + offset
+    triangles = [front.triangles, back.triangles + offset]
+    region = [np.zeros(len(triangles[0]), np.int64), np.ones(len(triangles[1]), np.int64)]
+    same, shares, gaps = np.arange(len(vertices)), np.zeros((2, 2)), []
+    # A free edge begins where the annulus of its leaflet ends, and there the other one ends.
+    for k, (a, b) in enumerate(((front_edge, back_edge[::-1]), (back_edge, front_edge[::-1]))):
+        given = None if seams is None else (seams[k, k], seams[k, 1 - k])
+        i, j = _seam(vertices[a], vertices[b], max_seam_mm, given)
+        shares[k, k], shares[k, 1 - k] = _shares(vertices[a])[i], _shares(vertices[b])[j]
+        a, b = a[: i + 1], b[: j + 1]
+        strip, of_first, gap = _strip(vertices, a, b)
+        distance, nearest = _nearest(vertices[b], vertices[a])
+        same[b[distance < COINCIDENT]] = a[nearest[distance < COINCIDENT]]
+        triangles.append(strip)
+        region.append(np.where(of_first, k, 1 - k))
+        gaps.append(gap)
+    faces, labels = same[np.concatenate(triangles)], np.concatenate(region)
+    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    used, inverse = np.unique(faces[proper], return_inverse=True)
+    vertices = vertices[used]
+    faces, _ = without_ears(inverse.reshape(-1, 3))
+    middle = np.searchsorted(used, same[front_annulus[len(front_annulus) // 2]])
+    annulus, edge = sorted(two_loops(vertices, faces), key=lambda loop: middle not in loop)
+    return JoinedLeaflets(vertices, faces, labels[proper], annulus, edge, shares, max(gaps))
+
+
+def _facing_ventricle(
+    leaflet: Leaflet, other: Leaflet, where: Commissures, down: FloatArray
+) -> tuple[Leaflet, IntArray, IntArray]:
+    """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
+    for candidate in (leaflet, leaflet.turned()):
+        arcs = candidate.arcs(where.points[0], where.points[1])
+        annulus = _which_is_annulus(candidate, arcs, other, where.contour)
+        ring = np.vstack([candidate.vertices[arcs[annulus]], other.vertices[other.loop].mean(0)])
+        if loop_vector_area(ring) @ down > 0:
+            return candidate, arcs[annulus], arcs[1 - annulus]
+    raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
+
+
+def _which_is_annulus(
+    leaflet: Leaflet,
+    arcs: tuple[IntArray, IntArray],
+    other: Leaflet,
+    contour: FloatArray | None,
+) -> int:
+    """The arc that is nearer to the annulus, or else farther from the other leaflet."""
+    to = other.vertices if contour is None else contour
+    distance = [float(_nearest(leaflet.vertices[arc], to)[0].mean()) for arc in arcs]
+    return int(np.argmax(distance) if contour is None else np.argmin(distance))
+
+
+def _shares(curve: FloatArray) -> FloatArray:
+    length = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(curve, axis=0), axis=1)])
+    return length / length[-1]
+
+
+def _seam(
+    a: FloatArray, b: FloatArray, max_mm: float, given: tuple[float, float] | None
+) -> tuple[int, int]:
+    """How far two curves that begin beside each other are joined: last point of each, 1 or more."""
+    shares = _shares(a), _shares(b)
+    if given is None:
+        distance, nearest = _nearest(a, b)
+        beside = (distance <= max_mm) & (shares[0] <= MAX_SEAM) & (shares[1][nearest] <= MAX_SEAM)
+        last = len(a) if beside.all() else int(np.argmin(beside))
+        i = max(1, last - 1)
+        given = float(shares[0][i]), float(shares[1][nearest[i]])
+    i, j = (
+        int(np.clip(np.searchsorted(share, part, "right") - 1, 1, len(share) - 2))
+        for share, part in zip(shares, given, strict=True)
+    )
+    return i, j
+
+
+def _strip(vertices: FloatArray, a: IntArray, b: IntArray) -> tuple[IntArray, BoolArray, float]:
+    """Triangles between two rows of vertices, whether each has two of the first, and their width.
+
+    The first row runs as the boundary of its leaflet does, the second one against it.
+    """
+    i = j = 0
+    triangles, of_first = [], []
+    width = float(np.linalg.norm(vertices[a[0]] - vertices[b[0]]))
+    while i + 1 < len(a) or j + 1 < len(b):
+        ahead_a = ahead_b = np.inf
+        if i + 1 < len(a):
+            ahead_a = float(np.linalg.norm(vertices[a[i + 1]] - vertices[b[j]]))
+        if j + 1 < len(b):
+            ahead_b = float(np.linalg.norm(vertices[b[j + 1]] - vertices[a[i]]))
+        first = ahead_a <= ahead_b
+        triangles.append([a[i + 1], a[i], b[j]] if first else [b[j], b[j + 1], a[i]])
+        of_first.append(first)
+        i, j = (i + 1, j) if first else (i, j + 1)
+        width = max(width, min(ahead_a, ahead_b))
+    return np.array(triangles, dtype=np.int64), np.array(of_first, dtype=np.bool_), width
+
+
+def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distance ``(k,)`` of each point ``(k, 3)`` to the nearest of others, and its number."""
+    distance, number = cKDTree(to).query(points)
+    return np.atleast_1d(distance), np.atleast_1d(number)
+
+
+def _length(curve: FloatArray) -> float:
+    return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
+
+
+def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
+    edges = surface_edges(triangles)
+    n = len(vertices)
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    of_triangle = label[triangles[:, 0]]
+    area = np.bincount(of_triangle, weights=areas(vertices, triangles))
+    return triangles[of_triangle == np.argmax(area)]
+
+
+def drawn_anew(
+    leaflets: JoinedLeaflets, edge_mm: float, offset_mm: tuple[float, float]
+) -> RegionSurface:
+    """The band with triangles of one size on the lines of its coordinates, moved off its side.
+
+    Parameters
+    ----------
+    leaflets
+    edge_mm
+        Of the triangles, on average.
+    offset_mm
+        By which the anterior and the posterior leaflet are moved to the ventricle: half a thickness
+        turns an atrial surface into the midsurface.
+
+    Raises
+    ------
+    GeometryError
+        Its coordinates fold over.
+    """
+    chart = LeafletBand.of(
+        leaflets.vertices,
+        leaflets.triangles,
+        leaflets.region,
+        leaflets.annulus,
+        leaflets.free_edge,
+        0,
+    )
+    round_mm = 0.5 * sum(
+        _length(leaflets.vertices[loop]) for loop in (leaflets.annulus, leaflets.free_edge)
+    )
+    columns = 4 * max(6, round(round_mm / edge_mm / 4))
+    rows = max(4, round(areas(leaflets.vertices, leaflets.triangles).sum() / round_mm / edge_mm))
+    grid = band_grid(columns, rows + 1)
+    # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
+    vertices = chart.position(np.mod(180.0 - grid.phi, 360.0), grid.s)
+    between = np.mod(grid.phi, 180.0) == 0
+    by = np.where(between, sum(offset_mm) / 2, np.where(grid.phi < 180, *offset_mm))
+    if any(offset_mm):
+        normals = smooth_vertex_normals(vertices, grid.triangles)
+        vertices = vertices + by[:, None] * normals
+    return RegionSurface(vertices, grid.triangles, grid.region, {})
