@@ -70,6 +70,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
     "mvest.cases.from_images": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
     "mvest.cases.importing": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
+    "mvest.cases.exporting": (
+        *LEAVES,
+        "mvest.valve",
+        "mvest.imaging",
+        "mvest.cases",
+        "mvest.reporting",
+    ),
     "mvest.personalise": (
         *LEAVES,
         "mvest.valve",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Final
 
-from mvest.errors import InputError
+import numpy as np
+
+from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = ["LANDMARKS", "landmark_vertices", "landmarks"]
+__all__ = ["ANNULUS_LABELS", "LANDMARKS", "landmark_vertices", "landmarks", "slicerheart_labels"]
 
 _ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
     "commissure_0": (0.0, 0),
@@ -25,6 +27,8 @@ _ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
 }
 _TIPS: Final = ("tip_0", "tip_180")
 
+ANNULUS_LABELS: Final = "AnnulusLabelsMarkup"
+"""What SlicerHeart calls its list of labelled points."""
 LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *_TIPS)
 """Every name, in the order of `landmarks`: those on the leaflets, then the papillary tips."""
 
@@ -64,3 +68,56 @@ def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
     for name, tip in zip(_TIPS, sequence.tips[frame], strict=True):
         positions[name] = tip.copy()
     return positions
+
+
+def slicerheart_labels(ring: FloatArray, end: int, down: FloatArray) -> dict[str, FloatArray]:
+    """Points ``(3,)`` of the annulus by the labels that SlicerHeart gives them.
+
+    ALC and PMC are the commissures, A and P the middles of the annulus between them, AL and PM
+    where the plane through the middle across the line from P to A meets the annulus, MC is the
+    middle (``ValveQuantificationLib/MeasurementPresetMitralValve.py`` there). From the atrium the
+    antero-lateral commissure lies on the left of the anterior leaflet.
+
+    Parameters
+    ----------
+    ring
+        ``(k, 3)`` mm, the annulus, of which the points 0 to ``end`` bound the anterior leaflet.
+    end
+    down
+        ``(3,)`` from the atrium to the ventricle.
+
+    Raises
+    ------
+    GeometryError
+        The annulus is no loop round its middle.
+    """
+    middle = ring.mean(axis=0)
+    anterior = _half_way(ring[: end + 1])
+    posterior = _half_way(np.vstack([ring[end:], ring[:1]]))
+    forward = anterior - posterior
+    left, right = ring[0], ring[end]
+    if np.linalg.det(np.stack([left - right, forward, down])) < 0:
+        left, right = right, left
+    height = (ring - middle) @ forward
+    following = np.roll(height, -1)
+    cut = np.flatnonzero((height >= 0) != (following >= 0))
+    if len(cut) != 2:
+        raise GeometryError(f"the annulus meets a plane through its middle {len(cut)} times, not 2")
+    share = (height[cut] / (height[cut] - following[cut]))[:, None]
+    sides = (1 - share) * ring[cut] + share * np.roll(ring, -1, axis=0)[cut]
+    at_left = int(np.argmin(np.linalg.norm(sides - left, axis=1)))
+    return {
+        "A": anterior,
+        "P": posterior,
+        "AL": sides[at_left],
+        "PM": sides[1 - at_left],
+        "ALC": left,
+        "PMC": right,
+        "MC": middle,
+    }
+
+
+def _half_way(curve: FloatArray) -> FloatArray:
+    """Point ``(3,)`` at half the length of a curve ``(k, 3)``."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    return np.array([np.interp(length[-1] / 2, length, axis) for axis in curve.T])

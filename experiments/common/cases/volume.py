@@ -32,7 +32,7 @@ from mvest.imaging.detection.trained_model import (
     default_model,
     load_model,
 )
-from mvest.imaging.landmarks import LANDMARKS
+from mvest.imaging.landmarks import ANNULUS_LABELS, LANDMARKS
 from mvest.imaging.markups import read_markups
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
@@ -292,8 +292,8 @@ def _landmarks(files: Mapping[int, str]) -> dict[int, dict[str, FloatArray]] | N
     for frame, file in files.items():
         points = {
             label: item.points[k]
-            for item in read_markups(Path(file)).values()
-            if item.kind == "Fiducial"
+            for name, item in read_markups(Path(file)).items()
+            if item.kind == "Fiducial" and name != ANNULUS_LABELS
             for k, label in enumerate(item.labels)
         }
         strange = sorted(set(points) - set(LANDMARKS))

@@ -10,11 +10,11 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
-from mvest.imaging.landmarks import landmarks
+from mvest.imaging.landmarks import ANNULUS_LABELS, landmarks, slicerheart_labels
 from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.imaging.writing.slicer import write_segmentation
+from mvest.imaging.writing.slicer import segment_name, write_segmentation
 from mvest.imaging.writing.voxels import voxelise_leaflets
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface
 
@@ -49,8 +49,8 @@ def write_surfaces(folder: Path, sequence: ValveSequence, name: str = "valve") -
 def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
     """Write the named points of one frame as markups of 3D Slicer.
 
-    The lists are ``landmarks`` (see `mvest.imaging.landmarks`), and ``annulus`` and ``free edge``
-    as closed curves, which begin at phi = 0.
+    The lists are ``landmarks`` (see `mvest.imaging.landmarks`), ``annulus`` and ``free edge`` as
+    closed curves, which begin at phi = 0, and SlicerHeart's labels of the annulus.
 
     Parameters
     ----------
@@ -65,12 +65,16 @@ def write_landmarks(path: Path, valve: ValveSequence, frame: int) -> Path:
         be written.
     """
     named = landmarks(valve, frame)
+    down = valve.tips[frame].mean(axis=0) - valve.annulus[frame].mean(axis=0)
+    half = valve.annulus.shape[1] // 2
+    labels = slicerheart_labels(valve.annulus[frame], half, down)
     return write_markups(
         path,
         {
             "landmarks": PointList(tuple(named), np.stack(list(named.values()))),
             "annulus": PointList.numbered("annulus", valve.annulus[frame], "ClosedCurve"),
             "free edge": PointList.numbered("edge", valve.free_edge[frame], "ClosedCurve"),
+            ANNULUS_LABELS: PointList(tuple(labels), np.stack(list(labels.values()))),
         },
     )
 
@@ -108,7 +112,7 @@ def write_for_slicer(
     if not (np.isfinite(thickness_mm) and thickness_mm > 0):
         raise InputError(f"thickness_mm = {thickness_mm}, expected a finite number > 0")
     layout = valve.layout
-    names = {1 + k: f"{region} leaflet" for k, region in enumerate(layout.region_names)}
+    names = {1 + k: segment_name(region) for k, region in enumerate(layout.region_names)}
     written = []
     for frame in frames:
         base = folder / f"{name}_{frame:04d}"

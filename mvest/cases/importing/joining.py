@@ -35,6 +35,11 @@ MAX_HOLE = 0.2
 """Of a leaflet's boundary: how long that of a hole may be, which is closed."""
 MAX_GAP = 6.0
 """mm between the leaflets at a commissure, and from a commissure to the leaflets."""
+MAX_MISS = 8.0
+"""mm along a leaflet's boundary from where a commissure is marked to where it is."""
+CORNER, SETTLED, DENSE = 3.0, 0.15, 0.2
+"""mm: behind the corner the distance to the other leaflet no longer falls, by that much over that
+way; spacing of the points among which the nearest is taken."""
 MAX_SEAM = 0.25
 """Of a free edge, from commissure to commissure: how far it may run beside the other one."""
 
@@ -225,12 +230,22 @@ def joined(
                 f"the {name} leaflet ends {away:.1f} mm from a commissure, expected at most "
                 f"{MAX_GAP:g} mm: do leaflets and annulus have the same axes and phase?"
             )
-    front, front_annulus, front_edge = _facing_ventricle(anterior, posterior, where, down)
-    back, back_annulus, back_edge = _facing_ventricle(posterior, anterior, where, down)
+    front, front_annulus, front_edge = _facing_ventricle(
+        anterior, posterior, where, down, max_seam_mm
+    )
+    back, back_annulus, back_edge = _facing_ventricle(posterior, anterior, where, down, max_seam_mm)
     ends = front.vertices[front_annulus[[0, -1]]]
     begin = back.vertices[back_annulus[0]]
     if np.argmin(np.linalg.norm(ends - begin, axis=1)) != 1:
         raise GeometryError("both leaflets lie on the same side of the commissures")
+    gap = max(
+        float(np.linalg.norm(front.vertices[a] - back.vertices[b]))
+        for a, b in ((front_annulus[0], back_annulus[-1]), (front_annulus[-1], back_annulus[0]))
+    )
+    if gap > MAX_GAP:
+        raise GeometryError(
+            f"the leaflets are {gap:.1f} mm apart at a commissure, expected at most {MAX_GAP:g} mm"
+        )
     vertices = np.concatenate([front.vertices, back.vertices])
     offset = len(front.vertices)
     front_edge, back_edge = front_edge, back_edge + offset
@@ -260,16 +275,64 @@ def joined(
 
 
 def _facing_ventricle(
-    leaflet: Leaflet, other: Leaflet, where: Commissures, down: FloatArray
+    leaflet: Leaflet, other: Leaflet, where: Commissures, down: FloatArray, beside_mm: float
 ) -> tuple[Leaflet, IntArray, IntArray]:
     """The leaflet with its triangles facing the ventricle, its arcs of annulus and free edge."""
     for candidate in (leaflet, leaflet.turned()):
         arcs = candidate.arcs(where.points[0], where.points[1])
-        annulus = _which_is_annulus(candidate, arcs, other, where.contour)
-        ring = np.vstack([candidate.vertices[arcs[annulus]], other.vertices[other.loop].mean(0)])
+        annulus = arcs[_which_is_annulus(candidate, arcs, other, where.contour)]
+        ring = np.vstack([candidate.vertices[annulus], other.vertices[other.loop].mean(0)])
         if loop_vector_area(ring) @ down > 0:
-            return candidate, arcs[annulus], arcs[1 - annulus]
+            return candidate, *_cornered(candidate, annulus, other, beside_mm)
     raise GeometryError("a leaflet lies in the axis of the annulus, to neither side of the other")
+
+
+def _cornered(
+    leaflet: Leaflet, rough: IntArray, other: Leaflet, beside_mm: float
+) -> tuple[IntArray, IntArray]:
+    """Arcs of annulus and free edge, parted where the boundary comes to lie beside the other one.
+
+    A commissure is marked to some mm. Along the annulus the other leaflet comes nearer up to the
+    corner; behind it the two boundaries lie beside each other.
+    """
+    start = rough[len(rough) // 2]
+    loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == start)[0]))
+    to = _dense(other.vertices[other.loop])
+    reach = _length(leaflet.vertices[loop])
+    half = _shares(leaflet.vertices[rough])[len(rough) // 2] * _arc(leaflet.vertices[rough])
+    ends = []
+    for way, expected in (
+        (loop, _arc(leaflet.vertices[rough]) - half),
+        (loop[[0, *range(len(loop) - 1, 0, -1)]], half),
+    ):
+        along = np.cumsum(
+            np.r_[0.0, np.linalg.norm(np.diff(leaflet.vertices[way], axis=0), axis=1)]
+        )
+        near = np.abs(along - expected) <= min(MAX_MISS, 0.2 * reach)
+        distance = np.where(near, _nearest(leaflet.vertices[way], to)[0], np.inf)
+        beside = distance <= max(beside_mm, float(distance.min()))
+        first = int(np.argmax(beside))
+        window = (along >= along[first]) & (along <= along[first] + CORNER)
+        settled = distance <= distance[window].min() + SETTLED
+        ends.append(way[first + int(np.argmax(settled[first:]))])
+    last, begin = (int(np.flatnonzero(loop == end)[0]) for end in ends)
+    if last >= begin:
+        raise GeometryError("the two leaflets lie beside each other all along the annulus")
+    return np.r_[loop[begin:], loop[: last + 1]], loop[last : begin + 1]
+
+
+def _arc(curve: FloatArray) -> float:
+    return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
+
+
+def _dense(loop: FloatArray) -> FloatArray:
+    """A closed curve with points so near to each other that the nearest is that of the curve."""
+    following = np.roll(loop, -1, axis=0)
+    count = np.maximum(1, np.ceil(np.linalg.norm(following - loop, axis=1) / DENSE).astype(int))
+    share = np.concatenate([np.arange(n) / n for n in count])[:, None]
+    return (
+        np.repeat(loop, count, axis=0) * (1 - share) + np.repeat(following, count, axis=0) * share
+    )
 
 
 def _which_is_annulus(

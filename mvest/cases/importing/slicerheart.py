@@ -40,6 +40,8 @@ TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}
 """s after the open phase, in the order of a cardiac cycle."""
 GENERIC_PRESSURE = 110.0
 """mmHg on the closed valve: ventricle less atrium from mid to end of systole."""
+CORRELATED_MM = 10.0
+"""Along the leaflets over which errors of a segmentation are alike."""
 MAX_RMS = 4.0
 """mm between the annulus and the leaflets' edges, beyond which they are not of one valve."""
 
@@ -70,6 +72,8 @@ class SlicerheartOptions:
         Of the triangles of the case.
     seam_mm : float
         Up to which distance the leaflets are joined where they part at a commissure.
+    std_mm : float or None
+        Standard deviation of a coordinate of the surfaces; 1 mm assumed.
     mirrored : bool
         Take the valve although its landmarks lie as in a mirror.
     """
@@ -83,7 +87,8 @@ class SlicerheartOptions:
     thickness_mm: tuple[float, ...] | None = None
     midsurface: bool = False
     edge_mm: float = 1.2
-    seam_mm: float = 2.0
+    seam_mm: float = 1.5
+    std_mm: float | None = None
     mirrored: bool = False
 
     def __post_init__(self) -> None:
@@ -372,5 +377,10 @@ def _document(
         "regions": list(REGIONS),
         "thickness": dict(zip(REGIONS, map(float, thickness), strict=True)),
         "frames": frames,
+        **(
+            {}
+            if options.std_mm is None
+            else {"observation": {"std_mm": options.std_mm, "correlation_length_mm": CORRELATED_MM}}
+        ),
         "derived": derived,
     }

@@ -122,7 +122,7 @@ class CaseFields:
         return np.stack([self.tips[frame][self.chord_tip], points[self.chord_insertion]], axis=1)
 
 
-def read_case_fields(path: Path) -> CaseFields:
+def read_case_fields(path: Path, *, turned: bool = True) -> CaseFields:
     """Read ``fields.npz`` and turn it: z to the atrium, the first leaflet towards positive y.
 
     Parameters
@@ -130,6 +130,8 @@ def read_case_fields(path: Path) -> CaseFields:
     path : Path
         An ``.npz`` file with at least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames``
         and ``seen``; the others as in `CaseFields`, and ``observed_points_<frame>``.
+    turned : bool
+        Otherwise it is left in the axes of the case.
 
     Raises
     ------
@@ -139,7 +141,8 @@ def read_case_fields(path: Path) -> CaseFields:
     try:
         arrays = read_npz(path, where=path.name)
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
-        return _turned(_fields(arrays, points))
+        fields = _fields(arrays, points)
+        return _turned(fields) if turned else fields
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise InputError(f"{path}: no fields of a case ({one_line(error, 200)})") from error
 

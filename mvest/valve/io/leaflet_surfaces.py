@@ -6,7 +6,8 @@ Coordinates are mm. A file appears under its name only once it is complete.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ __all__ = [
     "write_leaflets",
     "write_series",
     "write_surface",
+    "write_surface_series",
 ]
 
 Data = Mapping[str, NDArray[np.generic]]
@@ -311,17 +313,57 @@ def write_series(
                 f"{index}: point data {name!r} has shape {np.shape(values)}, expected "
                 f"{frames.shape[:2]} first"
             )
-    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
-    collection = ET.SubElement(root, "Collection")
-    for number, time in enumerate(times):
-        state = index.with_name(f"{index.stem}_{number:04d}.vtu")
+    names = [f"{index.stem}_{number:04d}.vtu" for number in range(len(times))]
+    for number, name in enumerate(names):
+        state = index.with_name(name)
         for _, block in cells:
             _check_cells(frames[number], np.asarray(block), np.shape(block)[1], str(state))
         data = {name: values[number] for name, values in (point_data or {}).items()}
         data["displacement"] = frames[number] - frames[0]
         checked = _checked_data(data, frames.shape[1], "point")
         write_cells(state, frames[number], cells, checked, cell_data or {})
-        ET.SubElement(collection, "DataSet", timestep=repr(float(time)), file=state.name)
+    return _write_index(index, times, names)
+
+
+def write_surface_series(
+    path: Path | str, times: Sequence[float], states: Sequence[SurfaceFile]
+) -> Path:
+    """Write surfaces over time for ParaView and 3D Slicer, each with triangles and data of its own.
+
+    As `write_series`, but ``NAME_0000.vtp``, ..., which name their axes (LPS) as Slicer does.
+
+    Raises
+    ------
+    InputError
+        As many times as states, at least one, increasing; data of another number of rows.
+    """
+    index = Path(path)
+    _check_suffix(index, (".pvd",))
+    moments = np.asarray(times, dtype=np.float64)
+    if len(states) != len(moments) or not len(states) or (np.diff(moments) <= 0).any():
+        raise InputError(
+            f"{index}: {len(states)} states and times {moments.tolist()}, expected as many, "
+            "increasing, at least one"
+        )
+    names = [f"{index.stem}_{number:04d}.vtp" for number in range(len(states))]
+    for name, state in zip(names, states, strict=True):
+        target = index.with_name(name)
+        _check_cells(state.vertices, state.triangles, 3, str(target))
+        content = SurfaceFile(
+            state.vertices,
+            state.triangles,
+            _checked_data(state.point_data, len(state.vertices), "point"),
+            _checked_data(state.cell_data, len(state.triangles), "cell"),
+        )
+        write_atomically(target, partial(write_vtp, data=content, space="LPS"))
+    return _write_index(index, moments, names)
+
+
+def _write_index(index: Path, times: FloatArray, names: Sequence[str]) -> Path:
+    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ET.SubElement(root, "Collection")
+    for time, name in zip(times, names, strict=True):
+        ET.SubElement(collection, "DataSet", timestep=repr(float(time)), file=name)
     tree = ET.ElementTree(root)
     write_atomically(index, lambda file: tree.write(file, xml_declaration=True, encoding="utf-8"))
     return index

@@ -320,8 +320,11 @@ def _whole(values: NDArray[np.generic], name: str) -> IntArray:
     return values.astype(np.int64).ravel()
 
 
-def write_vtp(path: Path, data: SurfaceFile) -> None:
-    """Write triangles and their data as a ``.vtp`` file (inline base64, zlib)."""
+def write_vtp(path: Path, data: SurfaceFile, space: str = "") -> None:
+    """Write triangles and their data as a ``.vtp`` file (inline base64, zlib).
+
+    ``space`` (``LPS``) is the name of the axes, which 3D Slicer looks for among the field data.
+    """
     root = ET.Element(
         "VTKFile",
         type="PolyData",
@@ -331,8 +334,20 @@ def write_vtp(path: Path, data: SurfaceFile) -> None:
         compressor="vtkZLibDataCompressor",
     )
     count = len(data.triangles)
+    whole = ET.SubElement(root, "PolyData")
+    if space:
+        words = ET.SubElement(
+            ET.SubElement(whole, "FieldData"),
+            "Array",
+            type="String",
+            Name="SPACE",
+            NumberOfTuples="1",
+            format="ascii",
+        )
+        # VTK writes text as the numbers of its bytes, each string with a zero at its end.
+        words.text = " ".join(str(byte) for byte in (*space.encode("ascii"), 0))
     piece = ET.SubElement(
-        ET.SubElement(root, "PolyData"),
+        whole,
         "Piece",
         NumberOfPoints=str(len(data.vertices)),
         NumberOfVerts="0",

@@ -36,7 +36,8 @@ def test_the_surfaces_carry_their_times_confidence_and_leaflets(tmp_path):
 def test_landmarks_are_read_back_in_place(tmp_path):
     valve = made_up_sequence.sequence((1.0, 0.0), SMALL)
     lists = read_markups(write_landmarks(tmp_path / "points.mrk.json", valve, 1))
-    assert list(lists) == ["landmarks", "annulus", "free edge"]
+    assert list(lists) == ["landmarks", "annulus", "free edge", "AnnulusLabelsMarkup"]
+    assert lists["AnnulusLabelsMarkup"].labels == ("A", "P", "AL", "PM", "ALC", "PMC", "MC")
     named = lists["landmarks"]
     assert named.labels == LANDMARKS
     middle = valve.vertices[1, SMALL.vertex(90, -1)]
@@ -56,7 +57,7 @@ def test_slicer_gets_the_frames_asked_for(tmp_path):
     labels, header = nrrd.read(str(written[1]))
     assert labels.shape == volume.frames.shape[1:]
     assert {header["Segment0_Name"], header["Segment1_Name"]} == {
-        "anterior leaflet", "posterior leaflet",
+        "mitral_anterior_leaflet", "mitral_posterior_leaflet",
     }  # fmt: skip
     for label, phi in ((1, 90), (2, 270)):
         at = volume.index(valve.vertices[1, SMALL.vertex(phi, 4)]).round().astype(int)
