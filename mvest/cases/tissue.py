@@ -9,7 +9,12 @@ import numpy as np
 
 from mvest.cases.case import Frame, Role
 from mvest.cases.checks import at, check_chordae, check_thickness
-from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.cases.chord_layout import (
+    CLOSED_DEPTH,
+    LeafletBand,
+    assumed_closure,
+    lay_out_chordae,
+)
 from mvest.cases.frames import MM_PER, ReferenceFrame, SeenFrame
 from mvest.cases.paths import CaseFolder
 from mvest.cases.rims import Rims
@@ -170,10 +175,16 @@ def _laid_out(
     seen_closed = [p for p in placed if p[0].role is Role.CLOSED]
     closed, closed_rims = seen_closed[0] if seen_closed else placed[0]
     goal: LeafletBand | FloatArray
-    if closed.corresponds:
-        how, goal = "its vertices", closed.vertices
+    if not seen_closed:
+        how = (
+            "an assumed closure: the free edges meet half-way between where they are open, at "
+            f"{CLOSED_DEPTH:g} of their depth below the annulus"
+        )
+        goal = assumed_closure(band, closed.annulus, closed.papillary_tips)
+    elif closed.corresponds:
+        how, goal = "the closed frame (through its vertices)", closed.vertices
     else:
-        how = "the same material coordinates in it"
+        how = "the closed frame (through the same material coordinates in it)"
         goal = LeafletBand.of(
             closed.vertices,
             closed.triangles,
@@ -185,10 +196,6 @@ def _laid_out(
     chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips)
     derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
-        + (
-            f"rest lengths from the closed frame (through {how})"
-            if seen_closed
-            else "rest lengths from the open frame, for there is no closed one"
-        )
+        f"rest lengths from {how}"
     )
     return chordae

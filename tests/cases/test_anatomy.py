@@ -7,10 +7,12 @@ import pytest
 
 from experiments.run import main
 from mvest.cases.case import Role
+from mvest.cases.chord_layout import CLOSED_DEPTH, LeafletBand, assumed_closure
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
+from mvest.valve.anatomy.template import Template
 from tests.cases.folders import plain_folder, save, template_case
 from tests.cases.test_folder import assert_equal
 
@@ -49,16 +51,40 @@ def test_what_is_there_is_judged(anatomy):
     assert "regions" in {doubt.field for doubt in doubts(replace(anatomy, surface=exchanged))}
 
 
-def test_chordae_are_laid_out_by_the_open_frame_alone(tmp_path):
+def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
     document = plain_folder(tmp_path / "case", 40, 12)
     document["frames"] = document["frames"][:1]
     del document["chordae"]
     case = read_case(save(tmp_path / "case", document))
-    reach = np.linalg.norm(
-        case.chordae.insertion - case.frames[0].papillary_tips[case.chordae.tip], axis=1
+    assert any("an assumed closure: the free edges meet" in each for each in case.derived)
+    # The template itself knows how long they have to be.
+    own = Template().chordae()
+    marginal = case.chordae.family == 0
+    ratio = case.chordae.rest_length[marginal] / own.rest_length[own.family == 0]
+    assert abs(np.median(ratio) - 1) < 0.1
+    assert ratio.min() > 0.75
+
+
+def test_an_assumed_closure_brings_the_edges_together(anatomy):
+    band = LeafletBand.of(
+        anatomy.surface.vertices,
+        anatomy.surface.triangles,
+        anatomy.surface.region,
+        anatomy.annulus,
+        anatomy.free_edge,
+        0,
     )
-    np.testing.assert_allclose(case.chordae.rest_length, 1.035 * reach)
-    assert any("there is no closed one" in sentence for sentence in case.derived)
+    frame = anatomy.frames[0]
+    closed = assumed_closure(band, frame.annulus, frame.papillary_tips)
+    np.testing.assert_allclose(closed[anatomy.annulus], frame.annulus, atol=1e-9)
+    phi = np.linspace(10.0, 170.0, 9)
+    moved = replace(band, vertices=closed)
+    gap = moved.position(phi, np.ones(9)) - moved.position(360.0 - phi, np.ones(9))
+    before = band.position(phi, np.ones(9)) - band.position(360.0 - phi, np.ones(9))
+    assert np.linalg.norm(gap, axis=1).max() < 0.5 < 5.0 < np.linalg.norm(before, axis=1).max()
+    middle = frame.annulus[:, 2].mean()
+    depth = closed[anatomy.free_edge, 2].mean() - middle
+    assert depth == pytest.approx(CLOSED_DEPTH * (frame.free_edge[:, 2].mean() - middle), rel=0.02)
 
 
 def test_it_is_checked_and_no_estimate_is_made_of_it(tmp_path, anatomy, monkeypatch, capsys):

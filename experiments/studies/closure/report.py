@@ -127,10 +127,12 @@ def _valve(arrays: Mapping[str, Any], shapes: FloatArray) -> CaseFields:
 
 
 def _moments(found: Findings) -> list[int]:
-    """Open, half open, nearly closed, closed."""
+    """Open, half open, nearly closed, closed; the last one for what is never reached."""
     opening = np.array([row.orifice_mm2 for row in found.rows])
     share = opening / max(float(opening[0]), 1e-9)
-    return [0, *(int(np.argmax(share < level)) for level in (0.75, 0.1)), len(opening) - 1]
+    last = len(opening) - 1
+    reached = [np.append(np.flatnonzero(share < level), last)[0] for level in (0.75, 0.1)]
+    return [0, *map(int, reached), last]
 
 
 def _draw_moments(
