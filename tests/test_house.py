@@ -69,13 +69,18 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     ),
     "mvest.cases": (*LEAVES, "mvest.provenance", "mvest.valve"),
     "mvest.cases.from_images": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
+    "mvest.febio": (*LEAVES, "mvest.valve", "mvest.mechanics", "mvest.closure"),
     "mvest.cases.importing": (*LEAVES, "mvest.valve", "mvest.imaging", "mvest.cases"),
     "mvest.cases.exporting": (
         *LEAVES,
         "mvest.valve",
+        "mvest.mechanics",
         "mvest.imaging",
+        "mvest.closure",
+        "mvest.problem",
         "mvest.cases",
         "mvest.reporting",
+        "mvest.febio",
     ),
     "mvest.personalise": (
         *LEAVES,

@@ -8,6 +8,7 @@ from experiments.common.record import read_record, write_record
 from experiments.runner.plan import Plan
 from mvest.cases.case import ErrorSamples
 from mvest.cases.error_file import write_error_samples
+from mvest.cases.exporting.febio import read_run
 from mvest.cases.folder import read_case
 from mvest.estimation.prediction import Prediction
 from mvest.external.contract import (
@@ -17,6 +18,7 @@ from mvest.external.contract import (
     write_answer,
     write_request,
 )
+from mvest.febio.program import read_positions
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.provenance import write_json
@@ -145,6 +147,32 @@ def request(folder: Path) -> Path:
     return folder / "request.json"
 
 
+def positions(folder: Path) -> Path:
+    """As FEBio logs the positions of three nodes."""
+    steps = [
+        f"*Step  = {k}\n*Time  = {0.1 * k:.9g}\n*Data  = positions\n"
+        + "".join(f"{n},{n - 1.5 * k},{0.25 * n},-3.5e-05\n" for n in (1, 2, 3))
+        for k in range(3)
+    ]
+    (folder / "a.csv").write_text("".join(steps))
+    return folder / "a.csv"
+
+
+def estimated(name: str):
+    """One of the files of a run that estimated a case."""
+
+    def maker(folder: Path) -> Path:
+        unknown = {"name": "E_f.anterior", "prior_mean": 6.23, "estimate": 7.5}
+        tissue = {"anterior": {"ratio": 2.65, "nu": 0.488, "reading": "A"}}
+        found = {"unknowns": [unknown], "settings": {"mechanics": {"tissue": tissue}}}
+        write_json(folder / "result.json", {"findings": {"case": found}})
+        write_json(folder / "config.json", {"case": "valve"})
+        return folder / name
+
+    maker.__name__ = name
+    return maker
+
+
 READERS = (
     Reader("case", lambda path: read_case(path.parent),
            (case, beside("chordae.csv"), beside("pressure.csv"), beside("errors.npz"))),
@@ -157,4 +185,7 @@ READERS = (
     Reader("answer", lambda path: read_answer(path.parent, REQUEST),
            (answer("response.json"), answer("observation.csv"), answer("jacobian.csv"))),
     Reader("request", read_request, (request,)),
+    Reader("febio", lambda path: read_positions(path, 3), (positions,)),
+    Reader("estimates", lambda path: read_run(path.parent),
+           (estimated("result.json"), estimated("config.json"))),
 )  # fmt: skip

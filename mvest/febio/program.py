@@ -1,0 +1,182 @@
+"""The program ``febio4``, where there is one, and what it says of a run.
+
+It is no part of this project. The variable ``MVEST_FEBIO`` names it, or it is found on ``PATH``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvest.errors import ConfigurationError, InputError
+from mvest.febio.document import FebDocument, positions_file
+from mvest.processes import run
+from mvest.reading.text import read_text
+from mvest.typing import FloatArray
+
+__all__ = ["VARIABLE", "FebRun", "febio_program", "read_positions", "run_febio"]
+
+VARIABLE = "MVEST_FEBIO"
+MAX_LOG = 1 << 28
+"""Bytes of a log that are read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FebRun:
+    """What became of a run.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether FEBio came to the end.
+    reason : str
+        The last complaint of its log, where it did not.
+    times : (s,)
+        s of the steps that it completed, the reference state first.
+    frames : (s, n, 3) mm
+        Positions of the nodes of the mesh that was given.
+    steps, iterations : int
+        As FEBio counts them.
+    seconds : float
+        Processor time of the program.
+    version : str
+    """
+
+    converged: bool
+    reason: str
+    times: FloatArray
+    frames: FloatArray
+    steps: int
+    iterations: int
+    seconds: float
+    version: str
+
+
+def febio_program() -> Path:
+    """The program.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none.
+    """
+    given = os.environ.get(VARIABLE)
+    found = given or shutil.which("febio4")
+    if not found or not Path(found).is_file():
+        raise ConfigurationError(
+            f"no FEBio: {given or 'febio4'} is no program; expected one on PATH, or its place in "
+            f"the variable {VARIABLE} (febio.org)"
+        )
+    return Path(found)
+
+
+def run_febio(
+    document: FebDocument, path: Path, *, threads: int = 1, time_limit_s: float = 3600.0
+) -> FebRun:
+    """Write a document and run FEBio on it.
+
+    Parameters
+    ----------
+    document : FebDocument
+    path : Path
+        Of the input file; FEBio writes beside it.
+    threads : int
+    time_limit_s : float
+        After which it is stopped, which is a run that did not converge.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no program.
+    OSError
+        If it cannot be started, or a file cannot be written.
+    """
+    program = febio_program()
+    document.write(path)
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
+    command = [str(program), "-i", path.name, "-nosplash", "-silent"]
+    before = os.times()
+    reason = ""
+    try:
+        ended = run(
+            command,
+            timeout=time_limit_s,
+            cwd=path.parent,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        code = ended.returncode
+    except subprocess.TimeoutExpired:
+        code, reason = 1, f"stopped after {time_limit_s:g} s"
+    after = os.times()
+    seconds = after.children_user + after.children_system
+    seconds -= before.children_user + before.children_system
+    log = path.with_suffix(".log")
+    said = read_text(log, MAX_LOG) if log.is_file() else ""
+    converged = code == 0 and "N O R M A L" in said
+    if not (converged or reason):
+        complaints = re.findall(r"^ *\*[^*\n]*[a-z][^*\n]*\* *$", said, re.MULTILINE)
+        reason = complaints[-1].strip(" *") if complaints else f"exit status {code}"
+    rest = np.vstack([document.mesh.solid.nodes, document.further])
+    logged = positions_file(path)
+    times, frames = np.zeros(0), np.zeros((0, *rest.shape))
+    if logged.is_file():
+        times, frames = read_positions(logged, len(rest))
+    frames = np.concatenate([rest[None], frames])[:, : len(document.mesh.solid.nodes)]
+    return FebRun(
+        converged,
+        reason,
+        np.concatenate([[0.0], times]),
+        document.mesh.restored(frames),
+        len(times),
+        _iterations(said),
+        seconds,
+        _version(said),
+    )
+
+
+def read_positions(path: Path, n: int) -> tuple[FloatArray, FloatArray]:
+    """Times ``(s,)`` and positions ``(s, n, 3)`` mm that FEBio has logged of n nodes.
+
+    A last step that was not written in full is left out.
+
+    Raises
+    ------
+    InputError
+        If the file is not such a log.
+    """
+    times: list[float] = []
+    frames: list[FloatArray] = []
+    parts = re.split(r"^\*Step.*$", read_text(path, MAX_LOG), flags=re.MULTILINE)
+    for part in parts[1:]:
+        found = re.search(r"^\*Time\s*=\s*(\S+)\s*$", part, re.MULTILINE)
+        rows = [line for line in part.splitlines() if line and not line.startswith("*")]
+        if found is None or len(rows) < n:
+            continue
+        try:
+            values = np.array([row.split(",") for row in rows], dtype=np.float64)
+            time_s = float(found.group(1))
+        except ValueError as error:
+            raise InputError(f"{path}: rows that are no log of positions") from error
+        if values.shape != (n, 4) or not np.array_equal(values[:, 0], np.arange(1, n + 1)):
+            raise InputError(f"{path}: rows of shape {values.shape}, expected {n} nodes x,y,z")
+        times.append(time_s)
+        frames.append(values[:, 1:])
+    return np.array(times), np.array(frames).reshape(len(frames), n, 3)
+
+
+def _iterations(said: str) -> int:
+    counts = re.findall(r"Total number of equilibrium iterations[ .]*: (\d+)", said)
+    return int(counts[-1]) if counts else 0
+
+
+def _version(said: str) -> str:
+    found = re.search(r"version\s+(\d[\d.]*)", said)
+    return found.group(1) if found else ""
