@@ -1,0 +1,406 @@
+"""The midsurface of thick leaflets: from a closed surface to a band with a thickness.
+
+The two walls of the closed surface (`mvest.valve.geometry.walls`) are bands with the same two
+edges. Points of both with the same harmonic coordinates face each other, and the middles of such
+pairs are a first midsurface. It is then moved to where both walls are equally far, which is the
+medial sheet of the tissue. Along the edges, where the nearest wall is the rim, the thickness is
+that of the tissue next to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import band_grid
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
+from mvest.valve.geometry.triangles import area_vectors
+from mvest.valve.geometry.walls import Wall, closed_band, walls
+
+__all__ = ["Midsurface", "midsurface"]
+
+EDGE_MM = 1.2
+"""Edge length of the triangles, on average."""
+ROUNDS = 8
+"""In which the sheet is drawn to the middle and its vertices are spread again."""
+MAX_STEP = 0.5
+"""mm, of one step to the middle."""
+RIM_SHARE = 0.8
+"""Of the thickness: within this distance of an edge the nearest wall is the rim."""
+FINE = 200
+"""Samples of a line from annulus to free edge before its vertices are spread."""
+MIN_LEAFLET = 0.25
+"""Of a turn, from one commissure to the other."""
+TIP_CONE = 60.0
+"""Degrees round the direction of a papillary tip within which its commissure lies."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Midsurface:
+    """The midsurface of two leaflets.
+
+    Attributes
+    ----------
+    vertices : (n, 3) mm
+        A grid: vertex ``j * columns + i`` is column i, row j, the first row the annulus and the
+        last one the free edge; the commissures are columns 0 and ``columns / 2``.
+    triangles : (m, 3)
+        Facing the ventricle.
+    region : (m,)
+        0 anterior, 1 posterior.
+    thickness : (n,) mm
+    annulus, free_edge : (columns,)
+        Vertices in loop order.
+    derived : tuple of str
+        What was not given but follows from the shape.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    region: IntArray
+    thickness: FloatArray
+    annulus: IntArray
+    free_edge: IntArray
+    derived: tuple[str, ...]
+
+    @property
+    def commissures(self) -> IntArray:
+        """Vertices ``(2, 2)``: of each commissure that on the annulus and that on the free edge."""
+        columns = len(self.annulus)
+        return np.column_stack([self.annulus, self.free_edge])[[0, columns // 2]]
+
+
+def midsurface(
+    vertices: FloatArray,
+    triangles: IntArray,
+    *,
+    tips: FloatArray | None = None,
+    commissures: FloatArray | None = None,
+    anterior: FloatArray | None = None,
+    label: Callable[[FloatArray], IntArray] | None = None,
+    edge_mm: float = EDGE_MM,
+) -> Midsurface:
+    """The midsurface of the closed surface of two thick leaflets round one orifice.
+
+    Parameters
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm and ``(m, 3)``.
+    tips
+        ``(t, 3)`` mm, papillary tips: they tell the free edge, and at which of the places where
+        the leaflets are short the commissures are. Without them the free edge is the shorter loop.
+    commissures
+        ``(2, 3)`` mm, if known.
+    anterior
+        ``(3,)`` mm, a point nearer to the anterior leaflet's part of the annulus, if known.
+        Otherwise the anterior leaflet is the taller one.
+    label
+        Leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known; then nothing is derived.
+    edge_mm
+        Edge length of the triangles, on average.
+
+    Raises
+    ------
+    GeometryError
+        No closed surface of one thin band, or leaflets that cannot be told apart.
+    """
+    first, second = walls(*closed_band(vertices, triangles))
+    derived: list[str] = []
+    annulus = _annulus(first, tips, derived)
+    pair = _PairedWalls(first, second, annulus)
+    perimeter = np.mean([_length(first.vertices[loop]) for loop in first.loops])
+    columns = max(24, 2 * round(perimeter / edge_mm / 2))
+    angle = 2 * np.pi * np.arange(2 * columns) / (2 * columns)
+    lines = pair.middle(angle, np.linspace(0, 1, FINE)[:, None])
+    heights = _arc_lengths(lines)[-1]
+    if label is not None:
+        seams = _label_seams(lines, angle, label)
+    else:
+        seams = _short_seams(lines, angle, heights, tips, commissures, anterior, derived)
+    rows = max(6, round(float(heights.mean()) / edge_mm) + 1)
+    sheet = _sheet(pair, seams, columns, rows)
+    for _ in range(ROUNDS):
+        sheet = _centred(_spread(_smoothed(sheet), rows), first, second)
+    thickness = _thickness(sheet, first, second)
+    grid = band_grid(columns, rows)
+    points = sheet.reshape(-1, 3)
+    triangles = grid.triangles
+    down = sheet[-1].mean(axis=0) if tips is None else np.asarray(tips).mean(axis=0)
+    if area_vectors(points, triangles).sum(axis=0) @ (down - sheet[0].mean(axis=0)) < 0:
+        triangles = triangles[:, ::-1]
+    return Midsurface(
+        points,
+        triangles,
+        grid.region,
+        thickness.ravel(),
+        np.arange(columns),
+        np.arange(columns) + (rows - 1) * columns,
+        tuple(derived),
+    )
+
+
+def _length(loop: FloatArray) -> float:
+    return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
+
+
+def _annulus(wall: Wall, tips: FloatArray | None, derived: list[str]) -> int:
+    """Which loop of a wall is the annulus."""
+    loops = [wall.vertices[loop] for loop in wall.loops]
+    if tips is None:
+        derived.append("annulus: the longer of the two edges of the leaflets")
+        return int(np.argmax([_length(loop) for loop in loops]))
+    distance = [
+        np.linalg.norm(loop[:, None] - np.asarray(tips), axis=2).min(axis=1).mean()
+        for loop in loops
+    ]
+    return int(np.argmax(distance))
+
+
+class _PairedWalls:
+    """Both walls in coordinates that agree along their common edges.
+
+    A place is an angle (rad) and s from annulus to free edge. The harmonic angles of the walls
+    differ along the edges; between them the difference is taken to be linear in s.
+    """
+
+    def __init__(self, first: Wall, second: Wall, annulus: int) -> None:
+        self._walls = (first, second)
+        self._coordinates: list[SurfaceCoordinates] = []
+        for wall in self._walls:
+            around, edge = wall.loops[annulus], wall.loops[1 - annulus]
+            self._coordinates.append(
+                surface_coordinates(wall.vertices, wall.triangles, around, edge)
+            )
+        # For each wall, at each end, (2, k): the common angle and the wall's own.
+        self._tables: list[list[FloatArray]] = [[], []]
+        beginning = 0.0
+        for end in (annulus, 1 - annulus):
+            own = [
+                _rising(coordinates.theta[wall.loops[end]])
+                for wall, coordinates in zip(self._walls, self._coordinates, strict=True)
+            ]
+            if end == annulus:
+                # The angle of each wall has a beginning of its own.
+                beginning = float(np.mean(own[0] - own[1]))
+            shifted = own[1] + beginning
+            turns = 2 * np.pi * np.round(np.mean(own[0] - shifted) / (2 * np.pi))
+            common = 0.5 * (own[0] + shifted + turns)
+            self._tables[0].append(np.stack([common, own[0]]))
+            self._tables[1].append(np.stack([common, own[1] + turns]))
+
+    def middle(self, angle: FloatArray, s: FloatArray) -> FloatArray:
+        """Middles ``(..., 3)`` mm of the pairs of points at common angles and s ``(...)``."""
+        angle, s = np.broadcast_arrays(angle, s)
+        points = []
+        for wall, coordinates, tables in zip(
+            self._walls, self._coordinates, self._tables, strict=True
+        ):
+            ends = [_periodic(angle, *table) for table in tables]
+            # Of the second end that turn which is nearer to the first.
+            ends[1] = ends[0] + _wrap(ends[1] - ends[0])
+            theta = (1 - s) * ends[0] + s * ends[1]
+            triangle, weights = coordinates.locate(np.mod(theta.ravel(), 2 * np.pi), s.ravel())
+            corners = wall.vertices[wall.triangles[triangle]]
+            points.append(np.einsum("kc,kci->ki", weights, corners).reshape(*angle.shape, 3))
+        return np.asarray(0.5 * (points[0] + points[1]))
+
+
+def _wrap(angle: FloatArray) -> FloatArray:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _rising(theta: FloatArray) -> FloatArray:
+    """Angles ``(k,)`` once round a loop, unwrapped."""
+    return np.asarray(np.unwrap(theta))
+
+
+def _periodic(angle: FloatArray, common: FloatArray, own: FloatArray) -> FloatArray:
+    """The own angle at common ones, both of which rise (or fall) by a turn along the table."""
+    order = np.argsort(common, kind="stable")
+    x, y = common[order], np.maximum.accumulate(np.sort(own))
+    turn = 2 * np.pi
+    low = x[0]
+    inside = low + np.mod(angle - low, turn)
+    x, y = np.append(x, x[0] + turn), np.append(y, y[0] + turn)
+    return np.asarray(np.interp(inside, x, y))
+
+
+def _label_seams(
+    lines: FloatArray, angle: FloatArray, label: Callable[[FloatArray], IntArray]
+) -> FloatArray:
+    """Angles ``(2, 2)`` of the seams, by end and commissure; anterior from the first on.
+
+    Along each level line the labels are an arc, whose share and centre give both its ends.
+    """
+    front = label(lines.reshape(-1, 3)).reshape(lines.shape[:2]) == 0
+    share = front.mean(axis=1)
+    if not 0.1 <= front.mean() <= 0.9:
+        raise GeometryError(
+            f"{100 * front.mean():.0f} % of the leaflets are anterior by their labels; expected "
+            "both leaflets"
+        )
+    centre = np.unwrap(np.angle(np.sum(front * np.exp(1j * angle), axis=1)))
+    s = np.linspace(0, 1, len(lines))
+    known = (share > 0.02) & (share < 0.98)
+    ends = []
+    for seam in (centre - np.pi * share, centre + np.pi * share):
+        slope, start = np.polyfit(s[known], seam[known], 1)
+        ends.append([start, start + slope])
+    return np.array(ends).T
+
+
+def _short_seams(
+    lines: FloatArray,
+    angle: FloatArray,
+    heights: FloatArray,
+    tips: FloatArray | None,
+    commissures: FloatArray | None,
+    anterior: FloatArray | None,
+    derived: list[str],
+) -> FloatArray:
+    """As `_label_seams`, where the leaflets are short."""
+    annulus = lines[0]
+    smooth = gaussian_filter1d(heights, max(1.0, len(angle) / 60), mode="wrap")
+    if commissures is not None:
+        away = np.linalg.norm(annulus[:, None] - np.asarray(commissures), axis=2)
+        chosen = away.argmin(axis=0)
+    else:
+        chosen = _shortest(annulus, angle, smooth, tips, derived)
+    a, b = sorted(chosen.tolist())
+    within = (np.arange(len(angle)) > a) & (np.arange(len(angle)) < b)
+    if not 2 < within.sum() < len(angle) - 2:
+        raise GeometryError("both commissures are at the same place of the annulus")
+    if anterior is None:
+        first = smooth[within].max() > smooth[~within].max()
+        derived.append(
+            f"anterior leaflet: the taller one ({smooth.max():.1f} mm, the other "
+            f"{min(smooth[within].max(), smooth[~within].max()):.1f} mm)"
+        )
+    else:
+        away = np.linalg.norm(annulus - np.asarray(anterior), axis=1)
+        first = bool(within[away.argmin()])
+    seam = np.array([angle[a], angle[b]]) if first else np.array([angle[b], angle[a] + 2 * np.pi])
+    return np.stack([seam, seam])
+
+
+def _shortest(
+    annulus: FloatArray,
+    angle: FloatArray,
+    heights: FloatArray,
+    tips: FloatArray | None,
+    derived: list[str],
+) -> IntArray:
+    """Two columns where the leaflets are shortest, each on the side of a tip."""
+    n = len(angle)
+    apart = np.abs(_wrap(angle[:, None] - angle))
+    if tips is not None and len(tips) == 2:
+        derived.append("commissures: where the leaflets are shortest on the side of each tip")
+        centre = annulus.mean(axis=0)
+        normal = np.cross(annulus - centre, np.roll(annulus, -1, axis=0) - centre).sum(axis=0)
+        normal /= np.linalg.norm(normal)
+        rays = [v - (v @ normal) * normal for v in (np.asarray(tips) - np.mean(tips, axis=0))]
+        cosine = [(annulus - centre) @ ray / np.linalg.norm(ray) for ray in rays]
+        flat = annulus - centre - ((annulus - centre) @ normal)[:, None] * normal
+        size = np.linalg.norm(flat, axis=1)
+        sides = [c / size > np.cos(np.radians(TIP_CONE)) for c in cosine]
+        return np.array([np.where(side, heights, np.inf).argmin() for side in sides])
+    derived.append("commissures: the two places where the leaflets are shortest")
+    total = heights[:, None] + heights
+    total[apart < 2 * np.pi * MIN_LEAFLET] = np.inf
+    return np.array(np.unravel_index(total.argmin(), (n, n)))
+
+
+def _sheet(pair: _PairedWalls, seams: FloatArray, columns: int, rows: int) -> FloatArray:
+    """A first midsurface ``(rows, columns, 3)``, its columns by shares of the edges' arcs."""
+    angles = []
+    for end in (0, 1):
+        begin, middle = seams[end]
+        middle = begin + np.mod(middle - begin, 2 * np.pi)
+        stops, parts = (begin, middle, begin + 2 * np.pi), []
+        for low, high in itertools.pairwise(stops):
+            fine = np.linspace(low, high, FINE)
+            curve = pair.middle(fine, np.full(FINE, float(end)))
+            arc = np.append(0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+            share = np.arange(columns // 2) / (columns // 2)
+            parts.append(np.interp(share, arc / arc[-1], fine))
+        angles.append(np.concatenate(parts))
+    angles[1] += 2 * np.pi * np.round((angles[0][0] - angles[1][0]) / (2 * np.pi))
+    s = np.linspace(0, 1, FINE)[:, None]
+    return _spread(pair.middle((1 - s) * angles[0] + s * angles[1], s), rows)
+
+
+def _arc_lengths(lines: FloatArray) -> FloatArray:
+    """Lengths ``(k, c)`` mm along columns ``(k, c, 3)`` from their beginning."""
+    steps = np.linalg.norm(np.diff(lines, axis=0), axis=2)
+    return np.concatenate([np.zeros((1, lines.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _spread(lines: FloatArray, rows: int) -> FloatArray:
+    """Columns ``(k, c, 3)`` sampled at equal distances ``(rows, c, 3)``."""
+    arc = _arc_lengths(lines)
+    share = np.linspace(0, 1, rows)
+    result = np.empty((rows, lines.shape[1], 3))
+    for column in range(lines.shape[1]):
+        for axis in range(3):
+            result[:, column, axis] = np.interp(
+                share, arc[:, column] / arc[-1, column], lines[:, column, axis]
+            )
+    return result
+
+
+def _centred(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
+    """The sheet with all but its edges moved to where both walls are equally far.
+
+    One step of Newton's method for the difference of the two distances, along its gradient.
+    """
+    inner = sheet[1:-1].reshape(-1, 3)
+    distances, directions = [], []
+    for wall in (first, second):
+        found = closest_points(inner, wall.vertices, wall.triangles)
+        away = inner - found.interpolate(wall.vertices, wall.triangles)
+        distances.append(found.distance)
+        directions.append(away / np.maximum(found.distance, 1e-9)[:, None])
+    difference = distances[0] - distances[1]
+    gradient = directions[0] - directions[1]
+    squared = np.einsum("ij,ij->i", gradient, gradient)
+    step = np.where(squared > 0.5, -difference / np.maximum(squared, 0.5), 0.0)[:, None] * gradient
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    step *= np.minimum(1.0, MAX_STEP / np.maximum(length, 1e-9))
+    result = sheet.copy()
+    result[1:-1] += step.reshape(sheet[1:-1].shape)
+    return result
+
+
+def _smoothed(sheet: FloatArray) -> FloatArray:
+    """Interior vertices moved a quarter of the way to the mean of their neighbours."""
+    result = sheet.copy()
+    around = np.roll(sheet, 1, axis=1) + np.roll(sheet, -1, axis=1)
+    mean = 0.25 * (around[1:-1] + sheet[:-2] + sheet[2:])
+    result[1:-1] += 0.25 * (mean - sheet[1:-1])
+    return result
+
+
+def _thickness(sheet: FloatArray, first: Wall, second: Wall) -> FloatArray:
+    """Sum ``(rows, columns)`` mm of the distances to both walls; near an edge that inside of it."""
+    shape = sheet.shape[:2]
+    points = sheet.reshape(-1, 3)
+    total = sum(
+        closest_points(points, wall.vertices, wall.triangles).distance for wall in (first, second)
+    )
+    thickness = np.asarray(total).reshape(shape)
+    arc = _arc_lengths(sheet)
+    near = np.minimum(arc, arc[-1] - arc)
+    row = np.arange(shape[0])
+    for column in range(shape[1]):
+        known = near[:, column] > RIM_SHARE * thickness[:, column]
+        if not known.any():
+            known = row == shape[0] // 2
+        thickness[:, column] = np.interp(row, row[known], thickness[known, column])
+    return thickness

@@ -1,0 +1,153 @@
+"""Closed surfaces whose midsurface is known: the template, thickened, and read back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvest.errors import GeometryError
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.valve import Valve
+from mvest.valve.geometry.midsurface import Midsurface, midsurface
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.surface_checks import check_surface
+from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
+from mvest.valve.geometry.thickening import ClosedSurface, thicken
+from mvest.valve.geometry.triangles import unit_normals
+from mvest.valve.geometry.walls import closed_band, walls
+
+
+@pytest.fixture(scope="module")
+def valve() -> Valve:
+    return Template(TemplateParameters()).valve(64, 20)
+
+
+@pytest.fixture(scope="module")
+def solid(valve: Valve) -> ClosedSurface:
+    return thicken(valve.surface)
+
+
+@pytest.fixture(scope="module")
+def middle(valve: Valve, solid: ClosedSurface) -> Midsurface:
+    return midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips)
+
+
+def test_walls_are_the_faces_that_were_thickened(solid: ClosedSurface) -> None:
+    parts = walls(*closed_band(solid.vertices, solid.triangles))
+    faces = [solid.triangles[solid.kind == kind] for kind in (0, 1)]
+    corners = [solid.vertices[face].mean(axis=1) for face in faces]
+    for part in parts:
+        own = [closest_points(c, part.vertices, part.triangles).distance for c in corners]
+        shares = [float((distance < 1e-9).mean()) for distance in own]
+        # All triangles of one face, none of the other.
+        assert sorted(shares) == pytest.approx([0.0, 1.0], abs=0.01)
+
+
+def test_the_loops_of_both_walls_are_the_same_points(solid: ClosedSurface) -> None:
+    first, second = walls(*closed_band(solid.vertices, solid.triangles))
+    for one, other in zip(first.loops, second.loops, strict=True):
+        np.testing.assert_array_equal(first.vertices[one], second.vertices[other])
+
+
+def test_midsurface_is_that_which_was_thickened(valve: Valve, middle: Midsurface) -> None:
+    surface = valve.surface
+    nearest = closest_points(middle.vertices, surface.vertices, surface.triangles)
+    assert nearest.distance.mean() < 0.04
+    back = closest_points(surface.vertices, middle.vertices, middle.triangles)
+    assert back.distance.mean() < 0.05
+    thickness = nearest.interpolate(surface.thickness, surface.triangles)
+    error = middle.thickness - thickness
+    assert np.abs(error).mean() < 0.02
+    assert np.percentile(np.abs(error), 95) < 0.05
+
+
+def test_it_is_a_band_in_good_order(valve: Valve, middle: Midsurface) -> None:
+    check_surface(middle.vertices, middle.triangles)
+    loops = [set(loop.tolist()) for loop in boundary_loops(middle.triangles)]
+    assert sorted(map(len, loops)) == [len(middle.annulus)] * 2
+    assert set(middle.annulus.tolist()) in loops
+    assert set(middle.free_edge.tolist()) in loops
+    coordinates = surface_coordinates(
+        middle.vertices, middle.triangles, middle.annulus, middle.free_edge
+    )
+    assert not coordinates.folded().size
+    # Its annulus is the template's and not the free edge, and it faces the ventricle.
+    annulus = closest_points(
+        middle.vertices[middle.annulus], valve.surface.vertices[valve.annulus], _fan(valve.annulus)
+    )
+    assert annulus.distance.mean() < 0.3
+    down = valve.papillary_tips.mean(axis=0) - middle.vertices[middle.annulus].mean(axis=0)
+    area = unit_normals(middle.vertices, middle.triangles).mean(axis=0)
+    assert area @ down > 0
+
+
+def _fan(loop: IntArray) -> IntArray:
+    n = len(loop)
+    return np.column_stack([np.arange(n), np.roll(np.arange(n), -1), np.arange(n)])
+
+
+def test_leaflets_are_told_apart_by_their_heights(valve: Valve, middle: Midsurface) -> None:
+    surface = valve.surface
+    centres = middle.vertices[middle.triangles].mean(axis=1)
+    truth = surface.region[closest_points(centres, surface.vertices, surface.triangles).triangle]
+    assert (truth == middle.region).mean() > 0.95
+    corners = surface.vertices[valve.annulus][[0, len(valve.annulus) // 2]]
+    own = middle.vertices[middle.commissures[:, 0]]
+    away = np.linalg.norm(own[:, None] - corners, axis=2).min(axis=1)
+    assert away.max() < 3.0
+    assert any("taller" in sentence for sentence in middle.derived)
+
+
+def test_labels_decide_where_they_are_known(valve: Valve, solid: ClosedSurface) -> None:
+    surface = valve.surface
+
+    def label(points: FloatArray) -> IntArray:
+        near = closest_points(points, surface.vertices, surface.triangles)
+        return 1 - surface.region[near.triangle]
+
+    swapped = midsurface(solid.vertices, solid.triangles, tips=valve.papillary_tips, label=label)
+    centres = swapped.vertices[swapped.triangles].mean(axis=1)
+    assert (label(centres) == swapped.region).mean() > 0.98
+    assert swapped.derived == ()
+
+
+def test_a_point_says_which_leaflet_is_anterior(valve: Valve, solid: ClosedSurface) -> None:
+    surface = valve.surface
+    back = surface.vertices[valve.annulus[3 * len(valve.annulus) // 4]]
+    turned = midsurface(solid.vertices, solid.triangles, anterior=back)
+    centres = turned.vertices[turned.triangles].mean(axis=1)
+    truth = surface.region[closest_points(centres, surface.vertices, surface.triangles).triangle]
+    assert (truth == turned.region).mean() < 0.05
+
+
+def test_triangles_that_face_inwards_are_turned(solid: ClosedSurface, middle: Midsurface) -> None:
+    vertices, triangles = closed_band(solid.vertices, solid.triangles[:, ::-1])
+    np.testing.assert_array_equal(triangles, solid.triangles)
+    assert len(vertices) == len(solid.vertices)
+
+
+def test_what_is_no_thick_band_is_refused(solid: ClosedSurface) -> None:
+    two = np.concatenate([solid.triangles, solid.triangles + len(solid.vertices)])
+    apart = np.concatenate([solid.vertices, solid.vertices + 100.0])
+    with pytest.raises(GeometryError, match="2 pieces"):
+        closed_band(apart, two)
+    with pytest.raises(GeometryError, match="open surface with 1 holes"):
+        closed_band(solid.vertices, solid.triangles[1:])
+    corners = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9.0]])
+    ball = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    with pytest.raises(GeometryError, match="Euler number 2, expected 0: no orifice"):
+        closed_band(corners, ball)
+
+
+def test_a_thick_ring_has_no_two_walls() -> None:
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(48), np.arange(24)))
+    big, small = 2 * np.pi * u / 48, 2 * np.pi * v / 24
+    radius = 20 + 8 * np.cos(small)
+    ring = np.column_stack([radius * np.cos(big), radius * np.sin(big), 8 * np.sin(small)])
+    a, b = v * 48 + u, v * 48 + (u + 1) % 48
+    c, d = (v + 1) % 24 * 48 + (u + 1) % 48, (v + 1) % 24 * 48 + u
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    with pytest.raises(GeometryError, match="expected thin leaflets"):
+        walls(*closed_band(ring, faces))
