@@ -232,7 +232,10 @@ def made_up_case(
 
 
 def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
-    """Let ``personalise`` build the formula instead of a closure; the models it builds."""
+    """Let ``personalise`` build the formula instead of a closure; the models it builds.
+
+    It has no geometry and no law that could be in doubt.
+    """
     built: list[MadeUpClosure] = []
 
     def build(case: ValveCase, wanted: PersonaliseSettings, store: Any = None) -> MadeUpClosure:
@@ -244,4 +247,6 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
         return built[-1]
 
     monkeypatch.setattr("mvest.personalise.chain.build_model", build)
+    monkeypatch.setattr("mvest.personalise.considered_geometry._variations", lambda *_: [])
+    monkeypatch.setattr("mvest.personalise.chain.law_columns", lambda *_: ())
     return built

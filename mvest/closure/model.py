@@ -428,20 +428,32 @@ class ClosureModel:
         return Prediction(self.observed(simulation.frames[-1]).ravel(), np.stack(moved, axis=1))
 
     def rests(
-        self, m: FloatArray, states: Sequence[HeldState], *, sensitivities: bool = False
+        self,
+        m: FloatArray,
+        states: Sequence[HeldState],
+        *,
+        sensitivities: bool = False,
+        start: FloatArray | None = None,
     ) -> list[Simulation]:
         """The closure and the ways from one state to the next, up to the first that fails.
 
-        As `held`, not yet embedded.
+        As `held`, not yet embedded. With nodal positions ``start (n, 3)``, as of a closed valve of
+        other tissue, the closed state is where that comes to rest under the final loads.
         """
-        closure = self.close(m, sensitivities=sensitivities)
         parameters = self.tuned(m)[1] if sensitivities else ()
-        ends = [closure.simulation]
+        if start is None:
+            closure = self.close(m, sensitivities=sensitivities)
+            system, first = closure.system, closure.simulation
+        else:
+            system = self.tuned(m)[0]
+            loading = boundary_loading(system, self.valve, self.contact_valve, self.settings)
+            first = self._rest(system, loading, start, parameters, damped=True)
+        ends = [first]
         for state in states:
             if not ends[-1].converged:
                 break
-            loading = held_loading(closure.system, self.contact_valve, state)
-            ends.append(self._rest(closure.system, loading, ends[-1].frames[-1], parameters))
+            loading = held_loading(system, self.contact_valve, state)
+            ends.append(self._rest(system, loading, ends[-1].frames[-1], parameters))
         return ends
 
     def _rest(
@@ -450,8 +462,13 @@ class ClosureModel:
         loading: Callable[[float], Loads],
         start: FloatArray,
         parameters: Sequence[Parameter] = (),
+        *,
+        damped: bool = False,
     ) -> Simulation:
-        """Equilibrium under constant loads from nodal positions ``start (n, 3)``."""
+        """Equilibrium under constant loads from nodal positions ``start (n, 3)``.
+
+        It is looked for at once, or, where that fails or ``damped``, after some steps of time.
+        """
         end = self.settings.protocol.end
 
         def run(steps: Sequence[Step]) -> Simulation:
@@ -468,12 +485,13 @@ class ClosureModel:
                 initial_time=end,
             )
 
-        simulation = run([Step(end + 1.0, static=True)])
-        if not simulation.converged:
-            # Damping by stiffness helps leaflets to slide over each other to where they are held.
-            rests = [Step(end + t) for t in accumulate(REST)]
-            simulation = run([*rests, Step(end + sum(REST) + 1.0, static=True)])
-        return simulation
+        if not damped:
+            simulation = run([Step(end + 1.0, static=True)])
+            if simulation.converged:
+                return simulation
+        # Damping by stiffness helps leaflets to slide over each other to where they are held.
+        rests = [Step(end + t) for t in accumulate(REST)]
+        return run([*rests, Step(end + sum(REST) + 1.0, static=True)])
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
         """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""

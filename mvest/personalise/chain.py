@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,6 +39,7 @@ from mvest.observation.surfaces import (
 )
 from mvest.observation.vertices import Observation
 from mvest.personalise.considered_geometry import geometry_columns
+from mvest.personalise.considered_law import law_columns
 from mvest.personalise.design import SHARES, FrameDesigns, StatedErrors
 from mvest.personalise.geometry_errors import (
     GeometryErrors,
@@ -129,7 +130,10 @@ def personalise_case(
         frames = chain.compared(before, chain.closed_frames(result.estimate, result.fitted))
         timed("held_out", began)
         narrower = chain.narrower(result)
+    image_share = chain.image_share(result)
     moduli_only = paper = confirmed = None
+    # With everything else known.
+    chain.considered = ()
     if settings.moduli_only:
         moduli_only = chain.estimate_moduli(
             IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations),
@@ -161,7 +165,8 @@ def personalise_case(
         confirmed,
         seconds,
         chain.geometry,
-        chain.image_share(result),
+        image_share,
+        chain.unconsidered,
     )
 
 
@@ -182,7 +187,7 @@ def expect_case(
 def _expected(chain: _Chain) -> Expectation:
     generic = chain.shared(chain.shared.start)
     if generic.converged:
-        chain.consider_geometry(chain.shared.start, generic.y)
+        chain.consider(chain.shared.start, generic.y)
     return expect(chain.problem(chain.filter), chain.observation())
 
 
@@ -241,7 +246,7 @@ def _designed(
     generic = chain.registered(start)
     if not generic.converged:
         return generic.reason
-    chain.consider_geometry(start, generic.y)
+    chain.consider(start, generic.y)
     return FrameDesigns(
         pressures,
         chain.designs(start, generic),
@@ -305,6 +310,7 @@ class _Chain:
         self.geometry: GeometryErrors | None = None
         self.errors: SampledErrors | None = None
         self.considered: tuple[ErrorColumns, ...] = ()
+        self.unconsidered: tuple[str, ...] = ()
         self._family: NoiseFamily | None = None
 
     def _filter(self, tolerance: float, start: tuple[float, ...] | None = None) -> Filter:
@@ -314,8 +320,18 @@ class _Chain:
             return SchmidtFilter(inner, self._held)
         return replace(inner, start=start)
 
-    def consider_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
-        """Find out what the geometry, as far as it is not known, does to the observation at ``m``.
+    @property
+    def _kinds(self) -> tuple[str, ...]:
+        """Names of what is considered."""
+        return tuple(own.name for own in self.considered)
+
+    @property
+    def considers(self) -> bool:
+        """Whether anything that is not among the unknowns widens the intervals."""
+        return self.settings.considered_geometry is not None or bool(self.settings.considered_law)
+
+    def consider(self, m: FloatArray, predicted: FloatArray) -> None:
+        """Find out what geometry and law, as far as not known, do to the observation at ``m``.
 
         Parameters
         ----------
@@ -323,20 +339,33 @@ class _Chain:
         predicted : array
             Both frames there, stacked.
         """
-        if self.settings.considered_geometry is None:
+        settings, observation = self.settings, self.plain_observation()
+        if self.considers and not settings.mechanics.protocol.equilibrium:
+            self.unconsidered = ("the closure does not end in an equilibrium",)
             return
-        columns = geometry_columns(
-            self.case,
-            self.settings.considered_geometry,
-            self.registered,
-            self.plain_observation(),
-            self.noise(geometry=0.0),
-            m,
-            predicted,
-        )
-        if isinstance(columns, str):
-            return  # what is known of them from elsewhere serves
-        self.considered = columns
+        found: list[tuple[ErrorColumns, ...] | str] = []
+        if settings.considered_geometry is not None:
+            noise = self.noise(without=self._kinds)
+            found.append(
+                geometry_columns(
+                    self.case,
+                    settings.considered_geometry,
+                    self.registered,
+                    observation,
+                    noise,
+                    m,
+                    predicted,
+                )
+            )
+        if settings.considered_law:
+            found.append(
+                law_columns(settings.considered_law, self.registered, observation, m, predicted)
+            )
+        self.unconsidered = tuple(reason for reason in found if isinstance(reason, str))
+        known = [columns for columns in found if not isinstance(columns, str)]
+        if not known:
+            return  # what was found out elsewhere serves
+        self.considered = tuple(own for columns in known for own in columns)
         if self.errors is not None:
             self.errors = replace(self.errors, base=self.noise())
 
@@ -348,7 +377,7 @@ class _Chain:
         values = np.array([u.mean if u.is_positive else 1.0 for u in self.unknowns])
         names = (*self.names, *self.modes)
         values = np.concatenate([values, np.ones(len(self.modes))])
-        noise = self.noise(geometry=0.0)
+        noise = self.noise(without=self._kinds)
         # Errors of different frames are independent: without the others' rows a frame is by itself.
         of_frame = np.repeat([int(frame.name) for frame in self.fitted], observation.sizes)
         return tuple(
@@ -373,26 +402,32 @@ class _Chain:
         return own | dict.fromkeys(self.modes, 1.0)
 
     def estimate_all(self) -> StudyResult:
-        """All unknowns, the geometry considered where it is doubtful.
+        """All unknowns, with what is considered about an estimate without it.
 
         What its errors do depends on the moduli: with a modulus half as large the derivatives are
         off by a quarter. So all unknowns are estimated without them first, roughly.
         """
-        if self.settings.considered_geometry is None:
+        if not self.considers:
             return self.estimate(self.filter, self.observation())
         rough = self.estimate(self._filter(max(ROUGH, self.settings.tolerance)), self.observation())
         at = self.shared.start if rough.estimate is None else rough.estimate
         prediction = self.shared(at)
         if not prediction.converged:
+            self.unconsidered = (prediction.reason,)
             return rough
-        self.consider_geometry(at, prediction.y)
+        self.consider(at, prediction.y)
         result = self.estimate(
             self._filter(self.settings.tolerance, tuple(at.tolist())), self.observation()
         )
         return replace(result, seconds=rough.seconds + result.seconds)
 
     def noise(
-        self, learned: LearnedNoise | None = None, *, geometry: float = 1.0, stated: bool = False
+        self,
+        learned: LearnedNoise | None = None,
+        *,
+        considered: float = 1.0,
+        without: Collection[str] = (),
+        stated: bool = False,
     ) -> ObservationNoise:
         """Noise of the observation without that of error samples.
 
@@ -400,8 +435,10 @@ class _Chain:
         ----------
         learned : LearnedNoise, optional
             By which it is known, and not as it is stated.
-        geometry : float
-            Factor on what the considered geometry adds.
+        considered : float
+            Factor on what is added by all that is considered.
+        without : collection of str
+            Kinds of it that are left out.
         stated : bool
             See `plain_observation`.
         """
@@ -414,13 +451,12 @@ class _Chain:
             log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
             base = family.without_columns().at(log[: len(log) - count])
             scales = np.exp(log[len(log) - count :])
-        if not self.considered or not geometry:
-            return base
         columns = [
-            geometry * scale * own.columns
+            considered * scale * own.columns
             for scale, own in zip(scales, self.considered, strict=True)
+            if own.name not in without
         ]
-        return low_rank_noise(base, np.concatenate(columns, axis=1))
+        return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
     def sample_geometry(self, generic: FloatArray) -> None:
         """Find out what errors of the case's frames do to the observation.
@@ -721,9 +757,9 @@ class _Chain:
             # The doubt of now: of less it may take more away than there is.
             return np.sqrt(np.where(own + more > 0.0, own + more, own))[moduli]
 
-        def linear(P: FloatArray, scale: float = 1.0, geometry: float = 1.0) -> FloatArray:
-            # Errors of the geometry stay what they are where the frame is seen better.
-            plain = self.noise(learned, geometry=scale * geometry, stated=True)
+        def linear(P: FloatArray, scale: float = 1.0, without: Collection[str] = ()) -> FloatArray:
+            # What is considered stays what it is where the frame is seen better.
+            plain = self.noise(learned, considered=scale, without=without, stated=True)
             update = kalman_update(Gaussian(z, P), np.zeros(len(H)), H * scale, plain)
             return widened(update.posterior.covariance, scale)
 
@@ -740,8 +776,11 @@ class _Chain:
                 stds[words] = std(prior.covariance * np.outer(share, share))
         stds["4 beats averaged"] = std(prior.covariance, 2.0)
         stds["any number of beats averaged"] = std(prior.covariance, 1e3)
-        if self.errors is not None or self.considered:
-            stds["geometry known exactly"] = linear(prior.covariance, geometry=0.0)
+        if self.errors is not None:
+            stds["geometry known exactly"] = linear(prior.covariance, without=self._kinds)
+            return stds
+        for kind in self._kinds:
+            stds[f"{kind} known exactly"] = linear(prior.covariance, without=(kind,))
         return stds
 
     def _measurable(self) -> dict[str, tuple[str, ...]]:

@@ -10,26 +10,29 @@ modes with the parameters, and to report the parameters alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvest.cases.case import ErrorSamples, ValveCase
-from mvest.cases.displaced import displaced_case
+from mvest.cases.case import Role, ValveCase
+from mvest.cases.chord_layout import ChordLayout
 from mvest.closure.frames import FramesModel
+from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.noise_family import ErrorColumns, smooth_basis
 from mvest.estimation.prediction import Prediction, predict
 from mvest.mechanics.reference import RestVariation
+from mvest.mechanics.valve_system import HeldState
 from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.proximity import closest_points
 
-__all__ = ["ConsideredGeometry", "geometry_columns"]
+__all__ = ["ConsideredGeometry", "closure_at", "geometry_columns", "observed_change"]
 
 SEEN = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
@@ -38,9 +41,6 @@ _SCALES = ("shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "thickness", "f
 
 TOLERANCE = 1e-4
 """Of derivatives, relative, far below what is known of the size of errors."""
-
-TIP_STEP = 0.01
-"""mm, by which tips are moved to differentiate rest lengths that follow from them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,29 +127,50 @@ def geometry_columns(
     predicted : array
         All frames as predicted at ``m``, stacked.
     """
-    model, states = registered.model, []
-    if isinstance(model, FramesModel):
-        states = model.under(registered.own(m), model.states)
-        model = model.model
+    model, at, states = closure_at(registered, m)
     geometry = RestGeometry(model)
     kinds = _variations(case, considered, geometry)
     if not kinds:
         return ()
     joined = RestVariation.joined([own for _, own, _ in kinds])
-    change = geometry.change(registered.mechanical(m), joined, states, TOLERANCE)
+    change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):
         return change
-    turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
-    change[1:] = np.einsum("ij,fnjq->fniq", turn, change[1:])
-    jacobian = change.reshape(len(predicted), -1)
-    linear = observation.of(lambda _: Prediction(predicted, jacobian))
-    rows = predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
+    rows = observed_change(registered, observation, m, predicted, change)
     columns, start = [], 0
     for name, own, factor in kinds:
         members = rows[:, start : start + len(own)]
         columns.append(ErrorColumns(name, _of_low_rank(members, noise), factor))
         start += len(own)
     return tuple(columns)
+
+
+def closure_at(
+    registered: RegisteredModel, m: FloatArray
+) -> tuple[ClosureModel, FloatArray, list[HeldState]]:
+    """The closure of a model, its parameters at ``m (p,)``, and what further frames are held by."""
+    model = registered.model
+    if not isinstance(model, FramesModel):
+        return model, registered.mechanical(m), []
+    return model.model, registered.mechanical(m), model.under(registered.own(m), model.states)
+
+
+def observed_change(
+    registered: RegisteredModel,
+    observation: Observed,
+    m: FloatArray,
+    predicted: FloatArray,
+    change: FloatArray,
+) -> FloatArray:
+    """What changes ``(f, n, 3, q)`` mm of the valve do to an observation ``(k, q)``.
+
+    ``predicted`` are all frames at ``m (p,)``, stacked.
+    """
+    turn = Rotation.from_rotvec(registration_of(registered.names, m)[3:], degrees=True).as_matrix()
+    turned = np.concatenate([change[:1], np.einsum("ij,fnjq->fniq", turn, change[1:])])
+    jacobian = turned.reshape(len(predicted), -1)
+    linear = observation.of(lambda _: Prediction(predicted, jacobian))
+    return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
 
 
 def _variations(
@@ -170,7 +191,9 @@ def _variations(
             kinds.append(("annulus", geometry.annulus(moves), considered.factor))
         if considered.tips_mm:
             moves = considered.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
-            kinds.append(("papillary tips", geometry.tips(moves, _lengths(case, moves)), 1.0))
+            kinds.append(
+                ("papillary tips", geometry.tips(moves, rest_lengths_by_tips(case, moves)), 1.0)
+            )
     if considered.insertions_mm:
         ends = np.eye(len(case.valve.chordae))[:, None, :, None]
         moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
@@ -209,21 +232,27 @@ def _leaflets(surface: LeafletSurface) -> FloatArray:
     return own.astype(np.float64)
 
 
-def _lengths(case: ValveCase, moves: FloatArray) -> FloatArray | None:
+def rest_lengths_by_tips(case: ValveCase, moves: FloatArray) -> FloatArray | None:
     """Relative change ``(q, c)`` of the chordae's rest lengths where they follow from the tips.
 
-    Tips are in error in all frames alike: what is hard to make out is so at any time.
+    They are in proportion to a chord's distance in the closed frame, or, where that would be too
+    short, in the open one (`mvest.cases.chord_layout.lay_out_chordae`). Where vertices of the
+    closed frame do not correspond, so that it is not known where a chord ends there, the open one
+    stands for it. Tips are in error in all frames alike: what is hard to make out is so at any
+    time.
     """
     if not case.chordae_follow:
         return None
-    frames = len(case.frames)
-    still = np.zeros((2 * len(moves), frames, len(case.surface.vertices), 3))
-    steps = np.concatenate([TIP_STEP * moves, -TIP_STEP * moves])
-    there = np.repeat(steps[:, None], frames, axis=1)
-    sampled = replace(case, error_samples=ErrorSamples(still, there))
-    lengths = np.array([displaced_case(sampled, k).chordae.rest_length for k in range(len(steps))])
-    ahead, behind = np.split(lengths, 2)
-    return np.asarray((ahead - behind) / (2 * TIP_STEP * case.chordae.rest_length))
+    closed, surface, chordae = case.frame(Role.CLOSED), case.surface, case.chordae
+    away = chordae.insertion - np.asarray(case.frame(Role.REFERENCE).papillary_tips)[chordae.tip]
+    if closed.corresponds:
+        place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+        ends = place.interpolate(closed.vertices, surface.triangles)
+        in_closed = ends - np.asarray(closed.papillary_tips)[chordae.tip]
+        by_open = ChordLayout().open_slack * np.linalg.norm(away, axis=1)
+        away = np.where((chordae.rest_length > (1 + 1e-6) * by_open)[:, None], in_closed, away)
+    squared = np.sum(away**2, axis=1)
+    return np.asarray(-np.einsum("qci,ci->qc", moves[:, chordae.tip], away) / squared)
 
 
 def _of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:

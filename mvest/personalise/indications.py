@@ -40,7 +40,10 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
     result, closed = fit.result, fit.case.frame(Role.CLOSED)
     found = doubts(fit.case)
     mistakes = tuple(str(doubt) for doubt in found if doubt.mistake)
-    doubtful = tuple(str(doubt) for doubt in found if not doubt.mistake)
+    doubtful = tuple(str(doubt) for doubt in found if not doubt.mistake) + tuple(
+        f"what is not known of geometry or law is not in the intervals: {reason}"
+        for reason in fit.unconsidered
+    )
     filtered = result.filtered
     if filtered is None or result.estimate is None:
         ended = f"{result.reason} ({result.detail})" if result.detail else result.reason

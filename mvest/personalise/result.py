@@ -74,6 +74,8 @@ class Personalised:
     image_share : (q,) or None
         Share of the variance of the logarithm of each modulus that these account for; None where
         they did not enter.
+    unconsidered : tuple of str
+        Why what is to be considered of geometry and law was not.
     """
 
     case: ValveCase
@@ -93,6 +95,7 @@ class Personalised:
     seconds: Mapping[str, float]
     geometry: GeometryErrors | None = None
     image_share: FloatArray | None = None
+    unconsidered: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         distances = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -12,7 +12,7 @@ from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
 from mvest.errors import InputError
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.mechanics.parameters import is_positive
-from mvest.mechanics.settings import MechanicsSettings
+from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.considered_geometry import ConsideredGeometry
 from mvest.problem.registration import REGISTRATION
@@ -194,6 +194,9 @@ class PersonaliseSettings:
     considered_geometry : ConsideredGeometry or None
         How well the geometry is known that the model is built from: what is not counts as an error
         of the observation. None takes it as it was seen.
+    considered_law : mapping of str to ExponentialTissue
+        Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
+        as an error of the observation. Empty: the linear law is taken to be right.
     pressures : PressureErrors or None
         How well stated pressures are known where several closed frames are fitted; None: each of
         them but for the common factor, if that is an unknown.
@@ -211,6 +214,7 @@ class PersonaliseSettings:
     correspondence: bool = True
     errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
     considered_geometry: ConsideredGeometry | None = None
+    considered_law: Mapping[str, ExponentialTissue] = field(default_factory=dict)
     pressures: PressureErrors | None = None
 
     def __post_init__(self) -> None:

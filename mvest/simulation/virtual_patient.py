@@ -284,11 +284,7 @@ def patient_model(
     guide = None
     own = (simulation.element, simulation.columns, simulation.rows)
     # Closures are followed on coarser meshes only.
-    guides = [
-        cells
-        for cells in GUIDES
-        if cells[1] * cells[2] < own[1] * own[2] and simulation.world.guided
-    ]
+    guides = [cells for cells in GUIDES if cells[1] * cells[2] < own[1] * own[2]]
     for element, columns, rows in (*guides, own):
         guide = ClosureModel(
             seen,

@@ -9,7 +9,7 @@ valve with the same errors, but for what the world adds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -17,10 +17,8 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.distance import cdist
 
 from mvest.errors import InputError
-from mvest.mechanics.law.biaxial import biaxial_stress
-from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.exponential import ExponentialLaw
-from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings, TissueSettings
+from mvest.mechanics.law.equivalent import as_stiff
+from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import TemplateParameters
@@ -37,10 +35,6 @@ KERNELS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
 
 ANNULUS_LENGTH_MM = 20.0
 """Over which errors of the annulus are alike."""
-
-STRETCHES = (1.0, 1.11)
-"""Along the fibres and across them, at which an exponential tissue is as stiff as the linear one
-whose modulus is its truth: the medians of closed leaflets (``results/law.md``)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,8 +63,6 @@ class World:
     exponential : mapping
         Region -> tissue of the exponential law that takes the place of the linear one, its stresses
         scaled to that one's (see `MechanicsSettings`); empty: the linear law.
-    guided : bool
-        Whether the valve is closed with guides on coarser meshes.
     """
 
     kernel: str = "matern"
@@ -83,7 +75,6 @@ class World:
     outliers: float = 0.0
     outlier_mm: float = 4.0
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
-    guided: bool = True
 
     def __post_init__(self) -> None:
         if self.kernel not in ("matern", *KERNELS):
@@ -145,7 +136,7 @@ class World:
             region: replace(
                 linear,
                 law="exponential",
-                exponential=_as_stiff(self.exponential[region], linear, values[f"E_f.{region}"]),
+                exponential=as_stiff(self.exponential[region], linear, values[f"E_f.{region}"]),
             )
             for region, linear in mechanics.tissue.items()
         }
@@ -217,21 +208,6 @@ def _factor(kernel: str, points: FloatArray, length: float) -> FloatArray:
 def _off(share: float, rng: np.random.Generator) -> float:
     """A factor, or its inverse."""
     return float((1.0 + share) ** rng.choice([-1.0, 1.0]))
-
-
-def _as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> ExponentialTissue:
-    stretches = np.array([STRETCHES])
-    wanted = biaxial_stress(BiotLaw.of([linear.moduli(E_f).material]), stretches).mean()
-    factor = float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
-    exponents = {"c1", "c2"}
-    return replace(
-        tissue,
-        **{
-            each.name: factor * getattr(tissue, each.name)
-            for each in fields(tissue)
-            if each.name not in exponents
-        },
-    )
 
 
 def _filled(field: FloatArray, hidden: IntArray, triangles: IntArray) -> FloatArray:

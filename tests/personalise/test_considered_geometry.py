@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mvest.cases.case import ErrorSamples, Role
+from mvest.cases.displaced import displaced_case
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise import observation_noise
@@ -15,9 +17,11 @@ from mvest.personalise import personalise_case
 from mvest.personalise.considered_geometry import (
     ConsideredGeometry,
     geometry_columns,
+    rest_lengths_by_tips,
     smooth_modes,
 )
 from mvest.problem.registration import RegisteredModel
+from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, model_of
 from tests.made_up_closure import FIELDS, made_up_case, settings, use
 
@@ -25,6 +29,7 @@ NONE = ConsideredGeometry(
     shape_mm=0, annulus_mm=0, tips_mm=0, insertions_mm=0, thickness=0, fibre_degrees=0
 )
 MODULI = ("E_f.anterior", "E_f.posterior")
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_smooth_modes_have_the_share_of_the_variance_that_is_asked_for():
@@ -85,6 +90,41 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     assert columns_of(shape_mm=0.3, tips_mm=1.0) == ()
 
 
+@pytest.mark.parametrize("lift", [0.0, 8.0])
+def test_rest_lengths_that_follow_the_tips_change_as_those_of_a_case_with_other_tips(lift):
+    # Of leaflets that are farther from the tips when closed the closed frame decides.
+    plain = corresponding(40, 12)
+    plain = replace(
+        plain,
+        frames=tuple(
+            replace(one, vertices=one.vertices + lift * (one.role is Role.CLOSED) * UP)
+            for one in plain.frames
+        ),
+    )
+    frames, n = len(plain.frames), len(plain.surface.vertices)
+    move = np.random.default_rng(4).standard_normal((1, len(plain.valve.papillary_tips), 3))
+    tips = np.stack([h * move[0] for h in (0.01, -0.01, 0.0, 0.0)])[:, None].repeat(frames, 1)
+    samples = ErrorSamples(np.zeros((4, frames, n, 3)), tips)
+    case = replace(plain, chordae_follow=True, error_samples=samples)
+    ahead, behind, still = (displaced_case(case, k).chordae for k in range(3))
+    case = replace(case, chordae=still)
+    expected = (ahead.rest_length - behind.rest_length) / (0.02 * still.rest_length)
+    (found,) = rest_lengths_by_tips(case, move)
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+    assert rest_lengths_by_tips(plain, move) is None
+    # Of a closed frame without correspondence only the open valve is known.
+    apart = [replace(frame, corresponds=False) for frame in plain.frames]
+    case = replace(plain, chordae_follow=True, frames=tuple(apart))
+
+    def distance(h):
+        tips = case.frame(Role.REFERENCE).papillary_tips + h * move[0]
+        chordae = case.chordae
+        return np.linalg.norm(chordae.insertion - tips[chordae.tip], axis=1)
+
+    expected = (distance(1e-4) - distance(-1e-4)) / (2e-4 * distance(0.0))
+    np.testing.assert_allclose(rest_lengths_by_tips(case, move)[0], expected, atol=1e-7)
+
+
 def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
@@ -104,7 +144,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         )
         anterior = doubtful.names.index("E_f.anterior")
         assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
-        exact = doubtful.narrower["geometry known exactly"]
+        exact = doubtful.narrower["open shape known exactly"]
         assert doubtful.narrower["now"][0] > 1.3 * exact[0]
         # Averaging leaves the errors of the geometry as they are.
         assert (

@@ -65,6 +65,7 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         personal.correspondence,
         personal.errors,
         considered_geometry=personal.considered_geometry,
+        considered_law=personal.considered_law,
         pressures=personal.pressures,
     )
 

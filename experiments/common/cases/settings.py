@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from experiments.common.schema import InputFile, Reads, contents
+from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.considered_geometry import ConsideredGeometry
 from mvest.personalise.settings import CaseMesh, PaperSettings, PressureErrors
@@ -59,6 +60,7 @@ class PersonalSettings:
     correspondence: bool = True  # use corresponding vertices as such, where there are any
     errors: ErrorBeliefs | None = None  # learn the errors that the case states
     considered_geometry: ConsideredGeometry | None = None  # how well it is known; null: exactly
+    considered_law: dict[str, ExponentialTissue] = field(default_factory=dict)  # it may follow
     pressures: PressureErrors | None = None  # of several closed frames, beside a common factor
 
 

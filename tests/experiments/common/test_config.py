@@ -169,3 +169,14 @@ def test_an_independent_truth_differs_in_mesh_element_and_step() -> None:
 def test_the_default_observation_has_3248_vertices() -> None:
     observation = plain(composed("experiment=table1"))["observation"]
     assert observation["columns"] * observation["rows"] == 3248
+
+
+@pytest.mark.parametrize("name", ["own_valve", "patients", "population", "calibration"])
+def test_what_is_not_known_is_carried_by_default(name: str) -> None:
+    personal = plain(composed(f"experiment={name}"))["personal"]
+    assert personal["considered_geometry"]["thickness"] == 0.2
+    assert set(personal["considered_law"]) == {"anterior", "posterior"}
+    assert personal["unknowns"]["pressure_scale"]["std"] == 0.15
+    known = plain(composed(f"experiment={name}", "personal=nuisances"))["personal"]
+    assert known["considered_geometry"] is None
+    assert known["considered_law"] == {}

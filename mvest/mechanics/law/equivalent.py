@@ -1,0 +1,36 @@
+"""An exponential tissue that is as stiff as a linear one where closed leaflets are."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+
+from mvest.mechanics.law.biaxial import biaxial_stress
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.settings import ExponentialTissue, TissueSettings
+
+__all__ = ["CLOSED_STRETCHES", "as_stiff"]
+
+CLOSED_STRETCHES = (1.0, 1.11)
+"""Along the fibres and across them: the medians of closed leaflets (``results/law.md``)."""
+
+
+def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> ExponentialTissue:
+    """The tissue with all stresses scaled to those of a linear one of modulus ``E_f`` MPa.
+
+    At `CLOSED_STRETCHES` the stresses along and across the fibres then have the same mean.
+    """
+    stretches = np.array([CLOSED_STRETCHES])
+    wanted = biaxial_stress(BiotLaw.of([linear.moduli(E_f).material]), stretches).mean()
+    factor = float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
+    exponents = {"c1", "c2"}
+    return replace(
+        tissue,
+        **{
+            each.name: factor * getattr(tissue, each.name)
+            for each in fields(tissue)
+            if each.name not in exponents
+        },
+    )
