@@ -223,8 +223,8 @@ def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(made):
 def test_what_would_narrow_is_said_of_each_modulus(made):
     outcome, fit = made
     narrow = outcome.findings.case.narrow
-    # The prior's 10 % of 100 mmHg, five times as well.
-    measured = "pressure measured to ±2 mmHg"
+    # The prior's 15 % of 100 mmHg, five times as well.
+    measured = "pressure measured to ±3 mmHg"
     rows = [row for row in narrow if row.what.endswith(measured)]
     assert [row.parameter for row in rows] == ["E_f.anterior", "E_f.posterior"]
     assert rows[0].what == f"E_f anterior, {measured}"
