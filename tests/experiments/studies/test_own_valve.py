@@ -234,7 +234,8 @@ def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
     found = []
     for k, place in enumerate((Scanner(5), Scanner(6, 1e-3))):
         folder = write(tmp_path / f"mine {k}", seen, FORMATS["vtp"], place, corresponds=True)
-        status, _, err = run(f"'{folder}'", "figures=false")
+        # Of so few cells the closed valve jumps where less is held by the frame.
+        status, _, err = run(f"'{folder}'", "personal=nuisances", "figures=false")
         assert status == 0, err
         records = (tmp_path / "outputs" / "own_valve").glob("*/result.json")
         record = json.loads(max(records, key=lambda path: path.stat().st_mtime).read_text())
