@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role, ValveCase
-from mvest.cases.chord_layout import ChordLayout
 from mvest.closure.frames import FramesModel
 from mvest.closure.model import ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
@@ -29,6 +28,7 @@ from mvest.mechanics.valve_system import HeldState
 from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 
