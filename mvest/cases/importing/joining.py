@@ -11,28 +11,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mvest.cases.chord_layout import LeafletBand
 from mvest.cases.ears import without_ears
+from mvest.cases.importing.leaflet import Leaflet, loop_length
 from mvest.cases.rims import loop_vector_area, two_loops
-from mvest.cases.surface_files import RegionSurface, merged
+from mvest.cases.surface_files import RegionSurface
 from mvest.errors import GeometryError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import band_grid
-from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.thickening import smooth_vertex_normals
-from mvest.valve.geometry.triangles import areas, surface_edges
+from mvest.valve.geometry.triangles import areas
 
-__all__ = ["Commissures", "JoinedLeaflets", "Leaflet", "commissures_on", "drawn_anew", "joined"]
+__all__ = ["Commissures", "JoinedLeaflets", "commissures_on", "drawn_anew", "joined"]
 
 COINCIDENT = 1e-6
 """mm, below which vertices of both leaflets are one."""
 REGIONS = ("anterior", "posterior")
-MAX_HOLE = 0.2
-"""Of a leaflet's boundary: how long that of a hole may be, which is closed."""
 MAX_GAP = 6.0
 """mm between the leaflets at a commissure, and from a commissure to the leaflets."""
 MAX_MISS = 8.0
@@ -40,93 +36,10 @@ MAX_MISS = 8.0
 CORNER, SETTLED, DENSE = 3.0, 0.15, 0.2
 """mm: behind the corner the distance to the other leaflet no longer falls, by that much over that
 way; spacing of the points among which the nearest is taken."""
+OPENING = 0.4
+"""mm more than at the corner, from which on two boundaries are free edges that part."""
 MAX_SEAM = 0.25
 """Of a free edge, from commissure to commissure: how far it may run beside the other one."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Leaflet:
-    """One leaflet as a disc.
-
-    Attributes
-    ----------
-    vertices, triangles
-        ``(n, 3)`` mm and ``(m, 3)``.
-    loop
-        ``(k,)`` its boundary, in the direction of its triangles.
-    holes : int
-        How many were closed.
-    """
-
-    vertices: FloatArray
-    triangles: IntArray
-    loop: IntArray
-    holes: int
-
-    @classmethod
-    def of(cls, vertices: FloatArray, triangles: IntArray) -> Leaflet:
-        """The largest piece of a surface, with coincident vertices made one and holes closed.
-
-        Raises
-        ------
-        GeometryError
-            It is closed, no manifold, or has a hole that is a second boundary.
-        """
-        whole = merged(
-            RegionSurface(vertices, triangles, np.zeros(len(triangles), dtype=np.int64), {})
-        )
-        faces = whole.triangles
-        apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        faces = faces[apart & (areas(whole.vertices, faces) > 0)]
-        faces = _largest_piece(whole.vertices, faces)
-        loops = boundary_loops(faces)
-        if not loops:
-            raise GeometryError(
-                "a closed surface, expected one side of a leaflet: an open surface that ends at "
-                "the annulus and at the free edge"
-            )
-        length = [_length(whole.vertices[loop]) for loop in loops]
-        outer = int(np.argmax(length))
-        points = [whole.vertices]
-        n = len(whole.vertices)
-        for number, loop in enumerate(loops):
-            if number == outer:
-                continue
-            if length[number] > MAX_HOLE * length[outer]:
-                raise GeometryError(
-                    f"boundaries of {length[outer]:.0f} and {length[number]:.0f} mm, expected one: "
-                    "a leaflet that ends at the annulus and at the free edge"
-                )
-            points.append(whole.vertices[loop].mean(axis=0, keepdims=True))
-            fan = np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), n)])
-            faces = np.concatenate([faces, fan])
-            n += 1
-        used, inverse = np.unique(faces, return_inverse=True)
-        faces = inverse.reshape(-1, 3)
-        loop = np.searchsorted(used, loops[outer])
-        return cls(np.concatenate(points)[used], faces, loop, len(loops) - 1)
-
-    def turned(self) -> Leaflet:
-        """The same with its triangles facing the other way."""
-        return Leaflet(self.vertices, self.triangles[:, ::-1], self.loop[::-1], self.holes)
-
-    def arcs(self, first: FloatArray, second: FloatArray) -> tuple[IntArray, IntArray]:
-        """The loop from the vertex nearest to a point to that nearest to another, and the rest.
-
-        Both arcs have both ends.
-        """
-        curve = self.vertices[self.loop]
-        start, stop = (
-            int(np.argmin(np.linalg.norm(curve - point, axis=1))) for point in (first, second)
-        )
-        if start == stop:
-            raise GeometryError(
-                "both commissures are at the same vertex of a leaflet; are they those of this "
-                "valve, in the same axes?"
-            )
-        turned = np.roll(self.loop, -start)
-        cut = (stop - start) % len(turned)
-        return turned[: cut + 1], np.append(turned[cut:], turned[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,7 +211,7 @@ def _cornered(
     start = rough[len(rough) // 2]
     loop = np.roll(leaflet.loop, -int(np.flatnonzero(leaflet.loop == start)[0]))
     to = _dense(other.vertices[other.loop])
-    reach = _length(leaflet.vertices[loop])
+    reach = loop_length(leaflet.vertices[loop])
     half = _shares(leaflet.vertices[rough])[len(rough) // 2] * _arc(leaflet.vertices[rough])
     ends = []
     for way, expected in (
@@ -359,7 +272,8 @@ def _seam(
     shares = _shares(a), _shares(b)
     if given is None:
         distance, nearest = _nearest(a, b)
-        beside = (distance <= max_mm) & (shares[0] <= MAX_SEAM) & (shares[1][nearest] <= MAX_SEAM)
+        apart = min(max_mm, float(distance[0]) + OPENING)
+        beside = (distance <= apart) & (shares[0] <= MAX_SEAM) & (shares[1][nearest] <= MAX_SEAM)
         last = len(a) if beside.all() else int(np.argmin(beside))
         i = max(1, last - 1)
         given = float(shares[0][i]), float(shares[1][nearest[i]])
@@ -398,20 +312,6 @@ def _nearest(points: FloatArray, to: FloatArray) -> tuple[FloatArray, IntArray]:
     return np.atleast_1d(distance), np.atleast_1d(number)
 
 
-def _length(curve: FloatArray) -> float:
-    return float(np.linalg.norm(curve - np.roll(curve, -1, axis=0), axis=1).sum())
-
-
-def _largest_piece(vertices: FloatArray, triangles: IntArray) -> IntArray:
-    edges = surface_edges(triangles)
-    n = len(vertices)
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    of_triangle = label[triangles[:, 0]]
-    area = np.bincount(of_triangle, weights=areas(vertices, triangles))
-    return triangles[of_triangle == np.argmax(area)]
-
-
 def drawn_anew(
     leaflets: JoinedLeaflets, edge_mm: float, offset_mm: tuple[float, float]
 ) -> RegionSurface:
@@ -431,20 +331,12 @@ def drawn_anew(
     GeometryError
         Its coordinates fold over.
     """
-    chart = LeafletBand.of(
-        leaflets.vertices,
-        leaflets.triangles,
-        leaflets.region,
-        leaflets.annulus,
-        leaflets.free_edge,
-        0,
-    )
-    round_mm = 0.5 * sum(
-        _length(leaflets.vertices[loop]) for loop in (leaflets.annulus, leaflets.free_edge)
-    )
-    columns = 4 * max(6, round(round_mm / edge_mm / 4))
-    rows = max(4, round(areas(leaflets.vertices, leaflets.triangles).sum() / round_mm / edge_mm))
-    grid = band_grid(columns, rows + 1)
+    loops = leaflets.annulus, leaflets.free_edge
+    chart = LeafletBand.of(leaflets.vertices, leaflets.triangles, leaflets.region, *loops, 0)
+    around = 0.5 * sum(loop_length(leaflets.vertices[loop]) for loop in loops)
+    along = areas(leaflets.vertices, leaflets.triangles).sum() / around
+    columns = 4 * max(6, round(around / edge_mm / 4))
+    grid = band_grid(columns, 1 + max(4, round(along / edge_mm)))
     # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
     vertices = chart.position(np.mod(180.0 - grid.phi, 360.0), grid.s)
     between = np.mod(grid.phi, 180.0) == 0

@@ -15,17 +15,19 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.folder import read_case
+from mvest.cases.importing.chords import write_chords
 from mvest.cases.importing.joining import (
     REGIONS,
     Commissures,
     JoinedLeaflets,
-    Leaflet,
     commissures_on,
     drawn_anew,
     joined,
 )
+from mvest.cases.importing.leaflet import Leaflet
 from mvest.cases.importing.slicerheart_folder import PHASES, SeenPhase, read_batch, read_fem
 from mvest.cases.paths import CASE_FILE
+from mvest.cases.rims import two_loops
 from mvest.cases.surface_files import RegionSurface
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError, MvestError
@@ -67,7 +69,8 @@ class SlicerheartOptions:
         Of the anterior and the posterior leaflet; generic values if not given.
     midsurface : bool
         Whether the surfaces are midsurfaces already; those of ValveBatchExport are atrial ones, and
-        are moved to the ventricle by half the thickness.
+        are moved to the ventricle by half the thickness, as those of ValveFemExport are, whose
+        shells follow the side that is met first.
     edge_mm : float
         Of the triangles of the case.
     seam_mm : float
@@ -86,7 +89,7 @@ class SlicerheartOptions:
     pressure_mmHg: float | None = None
     thickness_mm: tuple[float, ...] | None = None
     midsurface: bool = False
-    edge_mm: float = 1.2
+    edge_mm: float = 1.0
     seam_mm: float = 1.5
     std_mm: float | None = None
     mirrored: bool = False
@@ -377,6 +380,7 @@ def _document(
         "regions": list(REGIONS),
         "thickness": dict(zip(REGIONS, map(float, thickness), strict=True)),
         "frames": frames,
+        **_chordae(folder, phases[0], derived),
         **(
             {}
             if options.std_mm is None
@@ -384,3 +388,13 @@ def _document(
         ),
         "derived": derived,
     }
+
+
+def _chordae(folder: Path, reference: _Phase, derived: list[str]) -> dict[str, Any]:
+    if not len(reference.seen.chords):
+        return {}
+    vertices = reference.surface.vertices
+    loops = two_loops(vertices, reference.surface.triangles)
+    edge = min((vertices[loop] for loop in loops), key=lambda curve: _rms(curve, reference.tips))
+    seen = reference.seen
+    return write_chords(folder, seen.chords, seen.chord_lengths, reference.tips, edge, derived)

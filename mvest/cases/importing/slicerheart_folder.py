@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mvest.cases.importing.chords import chord_lines
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.markups import TO_LPS, read_fcsv, read_markups
 from mvest.reading.bounded import refusing
@@ -23,7 +24,7 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import check_finite
 from mvest.valve.io.vtk_legacy import PolyDataFile, read_polydata
 
-__all__ = ["PHASES", "SeenPhase", "chord_lines", "read_batch", "read_fem"]
+__all__ = ["PHASES", "SeenPhase", "read_batch", "read_fem"]
 
 PHASES = {
     "MD": "mid-diastole",
@@ -356,44 +357,6 @@ def _ends(file: Path, notes: list[str]) -> FloatArray:
         if any(len(line) != 2 for line in model.lines):
             raise InputError("lines of other than two points, expected one for every chord")
         return model.points[np.array(model.lines, dtype=np.int64).reshape(-1, 2)]
-
-
-def chord_lines(segments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chords from papillary tip to insertion of segments that may branch.
-
-    Parameters
-    ----------
-    segments : (k, 2, 3) mm
-        Each from where it begins to where it ends; a branch begins where its trunk ends.
-
-    Returns
-    -------
-    chords : (c, 2, 3) mm
-        From tip to insertion.
-    lengths : (c,) mm
-        Along trunk and branch.
-    tips : (t, 3) mm
-    """
-    joints, number = np.unique(np.round(segments.reshape(-1, 3), 3), axis=0, return_inverse=True)
-    begin, end = number.reshape(-1, 2).T
-    length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
-    trunk = {int(e): k for k, e in enumerate(end)}
-    chords, lengths, tips = [], [], []
-    for k in range(len(segments)):
-        if end[k] in begin:
-            continue
-        root, total, seen = k, float(length[k]), {k}
-        while (before := trunk.get(int(begin[root]))) is not None and before not in seen:
-            root, total = before, total + float(length[before])
-            seen.add(before)
-        chords.append([segments[root, 0], segments[k, 1]])
-        lengths.append(total)
-        tips.append(int(begin[root]))
-    return (
-        np.array(chords).reshape(-1, 2, 3),
-        np.array(lengths),
-        joints[sorted(set(tips))].reshape(-1, 3),
-    )
 
 
 def _middle_of_tube(points: FloatArray) -> FloatArray:

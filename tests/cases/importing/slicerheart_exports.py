@@ -144,3 +144,48 @@ def batch_export(folder: Path, case, scene="P001", **how) -> Path:
         folder / "ValveLandmarkPoints.csv", index=False
     )
     return folder
+
+
+def fem_export(folder: Path, frame, chordae, *, branched=False) -> Path:
+    """What ValveFemExport writes of one frame: shells, the tube of the annulus, bundles of chords.
+
+    A bundle is a model of lines with two points each. Branched chords part 3.5 mm before they end.
+    """
+    folder.mkdir(parents=True)
+    for label, (name, thickness) in enumerate(THICKNESS.items()):
+        model = atrial_leaflet(frame, label, thickness)
+        file = folder / f"mitral_{name}_leaflet_SurfaceModel-fit.vtk"
+        write_model(file, model, binary=False)
+    ring = in_lps(np.vstack([frame.annulus, frame.annulus[:1]]))
+    tube = vtk.vtkTubeFilter()
+    tube.SetRadius(0.5)
+    tube.SetNumberOfSides(20)
+    tube.CappingOff()
+    path = run(polyline(ring), tube, vtk.vtkTriangleFilter())
+    write_model(folder / "AnnulusContourModel.vtk", path, binary=False)
+    for half, bundle in ((chordae.tip == 0, "primary"), (chordae.tip == 1, "secondary")):
+        segments = []
+        for tip, end in zip(chordae.tip[half], chordae.insertion[half], strict=True):
+            start, end = in_lps(frame.papillary_tips[tip]), in_lps(end)
+            fork = end - 3.5 * (end - start) / np.linalg.norm(end - start)
+            segments += [(start, fork), (fork, end)] if branched else [(start, end)]
+        lines = vtk.vtkAppendPolyData()
+        for segment in segments:
+            lines.AddInputData(polyline(np.array(segment)))
+        lines.Update()
+        file = folder / f"Chords_mesh_-_mitral_anterior_leaflet-{bundle}.vtk"
+        write_model(file, lines.GetOutput(), binary=False)
+    return folder
+
+
+def polyline(points):
+    places, cells = vtk.vtkPoints(), vtk.vtkCellArray()
+    places.SetDataTypeToDouble()
+    places.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=1))
+    cells.InsertNextCell(len(points))
+    for k in range(len(points)):
+        cells.InsertCellPoint(k)
+    result = vtk.vtkPolyData()
+    result.SetPoints(places)
+    result.SetLines(cells)
+    return result

@@ -17,6 +17,7 @@ pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
 from tests.cases.importing.slicerheart_exports import (
     atrial_leaflet,
     batch_export,
+    fem_export,
     in_lps,
     write_model,
 )
@@ -190,3 +191,34 @@ def test_damaged_and_closed_surfaces_are_refused(folder):
     sphere.Update()
     write_model(file, sphere.GetOutput())
     refused(folder, "anterior leaflet: a closed surface, expected one side", GeometryError)
+
+
+@pytest.mark.parametrize("branched", [False, True])
+def test_a_folder_of_valve_fem_export_brings_its_chords(tmp_path, branched):
+    reference = TRUTH.frame(Role.REFERENCE)
+    fem = fem_export(tmp_path / "fem", reference, TRUTH.chordae, branched=branched)
+    case = import_slicerheart(fem, SlicerheartOptions())
+    assert [frame.role for frame in case.frames] == [Role.REFERENCE]
+    assert np.sqrt(np.mean(away(case.frame(Role.REFERENCE), reference) ** 2)) < 0.05
+    assert len(case.chordae) == len(TRUTH.chordae)
+    expected = np.linalg.norm(
+        TRUTH.chordae.insertion - reference.papillary_tips[TRUTH.chordae.tip], axis=1
+    )
+    # Files of text have six digits.
+    assert np.sort(case.chordae.rest_length) == pytest.approx(np.sort(expected), abs=1e-2)
+    marginal = TRUTH.chordae.family_names.index("marginal")
+    assert (case.chordae.family == 0).sum() == (TRUTH.chordae.family == marginal).sum()
+    assert case.chordae.axial_stiffness.sum() == pytest.approx(TRUTH.chordae.axial_stiffness.sum())
+    tips = in_lps(reference.papillary_tips)
+    found = case.frame(Role.REFERENCE).papillary_tips
+    assert np.abs(found[:, None] - tips).sum(axis=2).min(axis=1).max() < 1e-2
+
+
+def test_a_second_folder_of_valve_fem_export_is_the_closed_frame(tmp_path):
+    folders = [
+        fem_export(tmp_path / frame.name, frame, TRUTH.chordae)
+        for frame in (TRUTH.frame(Role.REFERENCE), TRUTH.frame(Role.CLOSED))
+    ]
+    options = SlicerheartOptions(closed=str(folders[1]), pressure_mmHg=100.0)
+    case = import_slicerheart(folders[0], options)
+    assert np.sqrt(np.mean(away(case.frame(Role.CLOSED), TRUTH.frame(Role.CLOSED)) ** 2)) < 0.05
