@@ -26,11 +26,11 @@ from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.motion.files import load_population, save_population
 from mvest.simulation.motion.population import Population
-from mvest.valve.io.donor.arrays import load_arrays
+from mvest.valve.io.abaqus.recording import read_recording
 from tests.cases import folders
 from tests.experiments.studies.made_up import made_up
 from tests.fuzz.trial import Reader
-from tests.valve.io import test_donor
+from tests.valve.io import recorded
 
 __all__ = ["READERS"]
 
@@ -77,8 +77,12 @@ def population(folder: Path) -> Path:
     return folder / "valves.npz"
 
 
-def donor(folder: Path) -> Path:
-    return test_donor.write(folder, test_donor.skirt()) / "healthy.npz"
+def deck(folder: Path) -> Path:
+    return recorded.write(folder, recorded.skirt())
+
+
+def frame(folder: Path) -> Path:
+    return deck(folder).with_name(f"{recorded.CASE}_2.vtu")
 
 
 def arrays(folder: Path) -> Path:
@@ -177,7 +181,7 @@ READERS = (
     Reader("case", lambda path: read_case(path.parent),
            (case, beside("chordae.csv"), beside("pressure.csv"), beside("errors.npz"))),
     Reader("population", load_population, (population,)),
-    Reader("donor", load_arrays, (donor,)),
+    Reader("recording", lambda path: read_recording(path.parent, recorded.NAMES), (deck, frame)),
     Reader("arrays", read_npz, (arrays, packed)),
     Reader("fields", read_case_fields, (fields,)),
     Reader("record", lambda path: read_record(path, dict), (record,)),

@@ -58,7 +58,8 @@ class Findings:
     ``distance_mm`` is of the vertices of the first fit from the recording, the innovation in
     standard deviations, seconds of all closures, and memory the largest of the process. The claim
     says what is shown, and what is not. Rows are the generic closure and the fit from each start,
-    and the recorded motion is the mean from the open to the recorded closed frame.
+    and the recorded motion is the mean from the open to the recorded closed frame. ``recording`` is
+    its folder, and the tips' motion the largest, prescribed there.
     """
 
     estimate: Vector | None
@@ -74,6 +75,9 @@ class Findings:
     memory_mb: float
     claim: str
     data: Data
+    recording: str
+    pressure_mmHg: float
+    tip_motion_mm: float
     regions: tuple[str, ...]
     rows: tuple[Row, ...]
     recorded_motion_mm: float

@@ -183,8 +183,9 @@ def donor_words(record: Record[Findings]) -> str:
     first, fitted = (row.distance_mm for row in found.rows[:2])
     lines += ["", found.claim, "", f"Data: {found.data.citation}."]
     facts = [
-        f"Mean motion of the leaflets between the open and the recorded closed frame: "
-        f"{found.recorded_motion_mm:.2f} mm."
+        f"Case {found.recording} under {found.pressure_mmHg:.1f} mmHg; mean motion of the leaflets "
+        f"between the open and the recorded closed frame: {found.recorded_motion_mm:.2f} mm, "
+        f"prescribed motion of the papillary tips: {found.tip_motion_mm:.1f} mm."
     ]
     if spread is not None:
         facts.append(

@@ -34,7 +34,12 @@ from experiments.studies.donor.findings import (
     Row,
 )
 from experiments.studies.donor.report import donor_answer, donor_words, write_donor
-from experiments.studies.donor.settings import DonorSettings, Settings
+from experiments.studies.donor.settings import (
+    CITATION,
+    DonorSettings,
+    Settings,
+    recording_folder,
+)
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -48,9 +53,11 @@ from mvest.observation.surfaces import mean_surface_distance
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Problem
+from mvest.provenance import config_hash
 from mvest.typing import FloatArray
-from mvest.valve.io.donor.arrays import CITATION, donor_file
-from mvest.valve.io.donor.recording import DonorRecording, read_donor
+from mvest.units import mpa_to_mmhg
+from mvest.valve.io.abaqus.leaflet_mesh import SetNames
+from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
 from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh
@@ -62,9 +69,9 @@ Values = Mapping[str, Any]
 CLAIM = (
     "A human tricuspid valve, not a mitral one, whose tissue in the recording follows another "
     "(exponential) law than the linear one fitted here: the moduli are those of the linear tissue "
-    "that closes most like the recording, not properties of the donor. Shown is only that the "
-    "chain is general: it finishes, two starts agree, and the fitted closure is nearer to the "
-    "recording than the generic one."
+    "that closes most like the recording, not properties of the donor. Asked is only whether the "
+    "chain is general: whether it finishes, two starts agree, and the fitted closure is nearer to "
+    "the recording than the generic one."
 )
 
 TYPICAL_SOLVES = 5
@@ -77,7 +84,7 @@ class DonorStudy:
 
     Attributes
     ----------
-    recording : DonorRecording
+    recording : Recording
     coarse : Remeshed
         Its midsurface in the resolution of the mesh; the vertices are what is observed.
     contact : Remeshed
@@ -98,7 +105,7 @@ class DonorStudy:
         See :class:`mvest.closure.model.ClosureModel`.
     """
 
-    recording: DonorRecording
+    recording: Recording
     coarse: Remeshed
     contact: Remeshed
     mesh: SolidMesh
@@ -146,8 +153,9 @@ def build_donor(config: Values, donor: DonorSettings) -> DonorStudy:
         raise ConfigurationError(
             f"donor.starts = {list(donor.starts)}, expected lists of {len(parameters)} moduli each"
         )
-    settings = mechanics_of(config)
-    recording = read_donor(donor.recording)
+    names = SetNames(donor.leaflets, donor.annulus, donor.free_edge)
+    recording = read_recording(recording_folder(donor.recording, donor.case), names)
+    settings = _as_recorded(mechanics_of(config), recording)
     unknown = [f"E_f.{name}" for name in recording.surface.region_names]
     if sorted(unknown) != sorted(parameters):
         raise ConfigurationError(
@@ -179,6 +187,22 @@ def build_donor(config: Values, donor: DonorSettings) -> DonorStudy:
         config["continuation"],
         donor.largest_change,
     )
+
+
+def _as_recorded(settings: MechanicsSettings, recording: Recording) -> MechanicsSettings:
+    """Mechanics under the recorded pressure, which may rise otherwise than the motion."""
+    protocol = settings.protocol
+    if protocol.pressure_mmHg != 0 or protocol.curve:
+        raise ConfigurationError(
+            f"mechanics.protocol.pressure_mmHg = {protocol.pressure_mmHg}: the recording says how "
+            "large the pressure is and how it rises; leave it 0, without a curve"
+        )
+    shares = recording.pressure_share
+    together = np.allclose(shares, recording.phase, rtol=0, atol=1e-12)
+    times = recording.times / recording.times[-1] * protocol.ramp
+    curve = () if together else tuple(zip(times.tolist(), shares.tolist(), strict=True))
+    pressure = mpa_to_mmhg(recording.pressure)
+    return replace(settings, protocol=replace(protocol, pressure_mmHg=pressure, curve=curve))
 
 
 def run_donor(job: Job[Settings]) -> Outcome[Findings]:
@@ -214,6 +238,9 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         )
     run = seed_run(job.values["seed"], first)
     motion = np.linalg.norm(study.observation.positions[-1] - study.coarse.surface.vertices, axis=1)
+    tips = study.recording.papillary_tips
+    donor = job.settings.donor
+    files = recording_files(recording_folder(donor.recording, donor.case))
     findings = Findings(
         estimate=run.estimate,
         std=run.std,
@@ -227,7 +254,10 @@ def run_donor(job: Job[Settings]) -> Outcome[Findings]:
         seconds=sum(row.seconds for row in rows),
         memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         claim=CLAIM,
-        data=Data(CITATION, sha256_of(donor_file(job.settings.donor.recording))),
+        data=Data(CITATION, config_hash({file.name: sha256_of(file) for file in files})),
+        recording=donor.case,
+        pressure_mmHg=study.settings.protocol.pressure_mmHg,
+        tip_motion_mm=float(np.linalg.norm(tips[-1] - tips[0], axis=1).max()),
         regions=tuple(study.recording.surface.region_names),
         rows=rows,
         recorded_motion_mm=float(motion.mean()),
@@ -362,10 +392,16 @@ STUDY = Study(
     run=run_donor,
     words=donor_words,
     write=write_donor,
+    keeps_failures=True,
     sections=(
         Section(
             "donor",
             {"donor": "A recorded donor tricuspid valve and closures of its model."},
+            answer=answer_of_main(donor_answer),
+        ),
+        Section(
+            "donor_diseased",
+            {"donor_diseased": "The same of a regurgitant donor tricuspid valve."},
             answer=answer_of_main(donor_answer),
         ),
     ),

@@ -1,1 +1,1 @@
-"""Files of surfaces and solid meshes, and the recorded donor valve."""
+"""Files of surfaces and solid meshes, and recorded closures."""

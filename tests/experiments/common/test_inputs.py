@@ -27,6 +27,7 @@ from tests.cases.from_images.test_imaged_case import sequence
 from tests.experiments.studies import test_donor
 from tests.external.programs import SPRINGS, springs
 from tests.made_up_closure import made_up_case
+from tests.valve.io import recorded
 
 
 def marked(cls: type, above: str = "") -> Iterator[str]:
@@ -80,6 +81,12 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
     file.write_text("1")
     if name == "case":
         (folder / "case.yaml").write_text("frames: [{surface: {file: a.npz}}]")
+        return str(folder), file
+    if name == "donor.recording":
+        # Without the name of a case it is the folder itself.
+        for ending in (".inp", "_0.vtu", "_1.vtu"):
+            file = folder / f"{folder.name}{ending}"
+            file.write_text("1")
         return str(folder), file
     listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
@@ -202,15 +209,14 @@ def test_nothing_is_read_that_is_not_in_the_hash(given, monkeypatch, made):
 
 
 def test_of_a_recording_nothing_is_read_that_is_not_in_the_hash(given):
-    module = test_donor.reader_tests()
-    place = module.write(given, module.skirt())
-    config = test_donor.settings(*test_donor.SMALL, f"donor.recording={place}")
+    recorded.write(given, recorded.skirt())
+    config = test_donor.settings(*test_donor.SMALL, f"donor.recording={given}")
     with all_digested(given):
         first = hash_of(config)
         build_donor(config, build(DonorSettings, config["donor"]))
-    other = module.skirt()
-    other["frames_xyz_mm"] = other["frames_xyz_mm"] + 1e-3
-    module.write(given, other)
+    other = recorded.skirt()
+    other["frames"] = other["frames"] + 1e-4
+    recorded.write(given, other)
     assert hash_of(config) != first
 
 

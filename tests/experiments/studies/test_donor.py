@@ -1,10 +1,8 @@
 """The study of the recorded donor valve, on a small made-up recording and without any."""
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,15 +15,19 @@ from experiments.common.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
 from experiments.studies.donor.findings import Findings
-from experiments.studies.donor.settings import DonorSettings
+from experiments.studies.donor.settings import CITATION, DATA_VARIABLE, DonorSettings
 from experiments.studies.donor.study import build_donor
-from mvest.valve.io.donor.arrays import CITATION, DATA_VARIABLE
 from mvest.valve.mesh.embedding import embed
 from tests.places import ROOT
+from tests.valve.io.recorded import CASE, NAMES, skirt, write
 
 TRUTH = np.array([2.0, 1.0, 3.0])
 SMALL = [
     "experiment=donor",
+    f"donor.case={CASE}",
+    f"donor.annulus={NAMES.annulus}",
+    f"donor.free_edge={NAMES.free_edge}",
+    *(f"donor.leaflets.{region}={name}" for region, name in NAMES.leaflets.items()),
     "donor.vertices=70",
     "donor.contact_vertices=336",
     "donor.starts=[[1.5,1.5,1.5],[3,1,2]]",
@@ -33,7 +35,6 @@ SMALL = [
     "filter.P0=2.25",
     "filter.R=1e-8",
     "filter.tolerance=1e-3",
-    "mechanics.protocol.pressure_mmHg=-10",
     "mechanics.protocol.dt=0.5",
     "mechanics.protocol.end=1.0",
     "mechanics.newton.tolerance=1e-8",
@@ -69,23 +70,11 @@ def settings(*overrides: str) -> dict:
     return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
 
 
-def reader_tests() -> ModuleType:
-    """The tests of the reader, which make up a recording."""
-    path = ROOT / "tests" / "valve" / "io" / "test_donor.py"
-    spec = importlib.util.spec_from_file_location("tests_valve_donor", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def made_up_recording(folder: Path) -> str:
     """A skirt whose last frame is our own closure with the moduli ``TRUTH``."""
-    module = reader_tests()
-    arrays = module.skirt()
-    arrays["frames_xyz_mm"] = arrays["frames_xyz_mm"].astype(np.float64)
-    place = f"donor.recording={module.write(folder, arrays)}"
+    data = skirt()
+    write(folder, data)
+    place = f"donor.recording={folder}"
     config = settings(*SMALL, place)
     study = build_donor(config, build(DonorSettings, config["donor"]))
     closed = study.model().close(TRUTH, sensitivities=False).simulation
@@ -93,8 +82,8 @@ def made_up_recording(folder: Path) -> str:
     fine = study.recording.surface.vertices
     free = np.setdiff1d(np.arange(len(fine)), study.recording.annulus)
     positions = embed(study.mesh, fine)(closed.frames[-1])
-    arrays["frames_xyz_mm"][-1, free] = positions[free]
-    module.write(folder, arrays)
+    data["frames"][-1, free] = positions[free]
+    write(folder, data)
     return place
 
 
@@ -133,7 +122,7 @@ def test_absent_data_are_one_clear_line(run, tmp_path: Path, monkeypatch) -> Non
     status, out, err = run("experiment=donor")
     assert (status, out) == (2, "")
     assert len(err.strip().splitlines()) == 1
-    assert err.startswith("error: donor valve: there is no file")
+    assert err.startswith("error: donor valve: there is no folder")
     for part in (CITATION, DATA_VARIABLE):
         assert part in err
 
@@ -147,11 +136,13 @@ def test_absent_data_are_one_clear_line(run, tmp_path: Path, monkeypatch) -> Non
         ("donor.vertices=10", "remesh to 10 vertices"),
         ("donor.vertexes=10", "did you mean vertices?"),
         ("mechanics.element=hex18", "cannot thicken into 'hex18'"),
+        ("mechanics.protocol.pressure_mmHg=5", "the recording says how large the pressure is"),
+        ("donor.annulus=Rand", "no node sets 'Rand'; there are VALVE.ALL"),
+        ("donor.case=Other", "there is no folder"),
     ],
 )
 def test_wrong_requests(run, tmp_path: Path, override: str, words: str) -> None:
-    module = reader_tests()
-    module.write(tmp_path, module.skirt())
+    write(tmp_path, skirt())
     status, _, err = run(*SMALL, f"donor.recording={tmp_path}", override)
     assert status == 2
     assert words in err

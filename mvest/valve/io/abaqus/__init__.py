@@ -1,0 +1,1 @@
+"""Input decks of Abaqus, and closures that were computed from them."""

@@ -1,1 +1,0 @@
-"""The recorded human donor valve."""
