@@ -35,7 +35,7 @@ class Distances:
 class Row:
     """One closure: with generic moduli, or fitted from a start ``(p,)``.
 
-    ``equilibria`` are the closed states that it went through.
+    ``equilibria`` are the closed states that it went through, seconds those of the processor.
     """
 
     closure: str
@@ -56,7 +56,8 @@ class Findings:
     """What follows for p moduli; the estimate is that from the first start.
 
     ``distance_mm`` is of the vertices of the first fit from the recording, the innovation in
-    standard deviations, seconds of all closures, and memory the largest of the process. The claim
+    standard deviations, seconds those of the processor for all closures, and memory the largest of
+    the process. The claim
     says what is shown, and what is not. Rows are the generic closure and the fit from each start,
     and the recorded motion is the mean from the open to the recorded closed frame. ``recording`` is
     its folder, and the tips' motion the largest, prescribed there.

@@ -122,7 +122,7 @@ def donor_table(record: Record[Findings]) -> pd.DataFrame:
             "iterations": row.iterations,
             "forward solves": row.forward_solves,
             "equilibria": row.equilibria,
-            "seconds": row.seconds,
+            "CPU [s]": row.seconds,
             "reason": row.reason,
         }
         rows.append(plain)
@@ -158,7 +158,7 @@ def donor_words(record: Record[Findings]) -> str:
         *(f"{part} [mm]" for part in WHOLE),
         "forward solves",
         "equilibria",
-        "time [s]",
+        "CPU [s]",
         "ended",
     ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
@@ -201,7 +201,7 @@ def donor_words(record: Record[Findings]) -> str:
             f"where they were recorded, {first.surface:.2f} → {fitted.surface:.2f} mm of the whole "
             "surface from the recorded one, both ways."
         )
-    facts.append(f"{found.seconds:.0f} s and {found.memory_mb:.0f} MB.")
+    facts.append(f"{found.seconds:.0f} s of one processor and {found.memory_mb:.0f} MB.")
     if found.identifiability is not None:
         bound = found.identifiability.cramer_rao_std
         alone = ", ".join(MISSING if v is None else f"{v:.2g}" for v in bound)
