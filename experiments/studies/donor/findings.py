@@ -57,10 +57,9 @@ class Findings:
 
     ``distance_mm`` is of the vertices of the first fit from the recording, the innovation in
     standard deviations, seconds those of the processor for all closures, and memory the largest of
-    the process. The claim
-    says what is shown, and what is not. Rows are the generic closure and the fit from each start,
-    and the recorded motion is the mean from the open to the recorded closed frame. ``recording`` is
-    its folder, and the tips' motion the largest, prescribed there.
+    the process. The claim says what is shown, and what is not. Rows are the generic closure and the
+    fit from each start, and the recorded motion is the mean from the open to the recorded closed
+    frame. ``recording`` is its folder, and the tips' motion the largest, prescribed there.
     """
 
     estimate: Vector | None
