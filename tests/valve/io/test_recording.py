@@ -10,7 +10,7 @@ import pytest
 from experiments.studies.donor.settings import CITATION, DATA_VARIABLE
 from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.chord_network import trace_cables
-from mvest.valve.io.abaqus.deck import Section
+from mvest.valve.io.abaqus.deck import ElementSection
 from mvest.valve.io.abaqus.keywords import blocks_of
 from mvest.valve.io.abaqus.leaflet_mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording
@@ -129,7 +129,7 @@ def law(text):
 
 def stiffness(leaflet, strain):
     area, pairs = OGDEN[leaflet]
-    section = Section(np.zeros(1, int), "chord", area)
+    section = ElementSection(np.zeros(1, int), "chord", area)
     return truss_stiffness(section, law(f"*Hyperelastic, Ogden, n=3\n{pairs}, 1, 2\n3"), strain)
 
 
@@ -141,7 +141,7 @@ def test_stiffness_of_the_chordae():
     # Those of the deck: 90, 27 and 8 N (their areas here are rounded).
     assert [stiffness(name, 0.01) for name in OGDEN] == pytest.approx([88.1, 27.0, 8.04], rel=5e-3)
     linear = truss_stiffness(
-        Section(np.zeros(1, int), "chord", 0.5), law("*Elastic\n40, 0.3"), 0.01
+        ElementSection(np.zeros(1, int), "chord", 0.5), law("*Elastic\n40, 0.3"), 0.01
     )
     assert linear == 20
 
@@ -160,7 +160,7 @@ def test_stiffness_of_the_chordae():
 )
 def test_materials_that_are_no_chordae(text, message):
     with pytest.raises(InputError, match=message):
-        truss_stiffness(Section(np.zeros(1, int), "chord", 1.0), law(text), 0.01)
+        truss_stiffness(ElementSection(np.zeros(1, int), "chord", 1.0), law(text), 0.01)
 
 
 @pytest.mark.parametrize("strain", [0.0, -0.01, 0.5])

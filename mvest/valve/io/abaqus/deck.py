@@ -13,7 +13,16 @@ from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.abaqus.keywords import Block
 
-__all__ = ["SHELLS", "TRUSSES", "Amplitude", "Deck", "Elements", "Pressure", "Section", "lookup"]
+__all__ = [
+    "SHELLS",
+    "TRUSSES",
+    "Amplitude",
+    "Deck",
+    "ElementSection",
+    "Elements",
+    "FaceLoad",
+    "lookup",
+]
 
 T = TypeVar("T")
 
@@ -67,7 +76,7 @@ class Elements:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Section:
+class ElementSection:
     """What elements are made of.
 
     Attributes
@@ -85,7 +94,7 @@ class Section:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pressure:
+class FaceLoad:
     """Pressure on elements.
 
     Attributes
@@ -114,7 +123,7 @@ class Deck:
     elements : tuple of Elements
     node_sets, element_sets : mapping
         ``INSTANCE.SET`` or ``SET``, in capitals -> numbers, increasing.
-    sections : tuple of Section
+    sections : tuple of ElementSection
     materials : mapping
         Name -> its elastic and hyperelastic blocks by keyword.
     amplitudes : mapping
@@ -123,7 +132,7 @@ class Deck:
     paced_by : ndarray
         ``(n, 3)`` number of the amplitude in ``pace_names``.
     pace_names : tuple of str
-    pressures : tuple of Pressure
+    pressures : tuple of FaceLoad
     period : float
         s, of the step.
     """
@@ -132,13 +141,13 @@ class Deck:
     elements: tuple[Elements, ...]
     node_sets: Mapping[str, IntArray]
     element_sets: Mapping[str, IntArray]
-    sections: tuple[Section, ...]
+    sections: tuple[ElementSection, ...]
     materials: Mapping[str, Mapping[str, Block]]
     amplitudes: Mapping[str, Amplitude]
     displacement: FloatArray
     paced_by: IntArray
     pace_names: tuple[str, ...]
-    pressures: tuple[Pressure, ...]
+    pressures: tuple[FaceLoad, ...]
     period: float
 
     def node_set(self, name: str) -> IntArray:

@@ -26,8 +26,8 @@ from mvest.valve.io.abaqus.deck import (
     Amplitude,
     Deck,
     Elements,
-    Pressure,
-    Section,
+    ElementSection,
+    FaceLoad,
     lookup,
 )
 from mvest.valve.io.abaqus.keywords import Block, blocks_of
@@ -72,7 +72,7 @@ class _Reading:
         self.labels: dict[str, dict[str, list[tuple[IntArray, int]]]] = {"NSET": {}, "ELSET": {}}
         self.sorted: dict[tuple[str, str], tuple[IntArray, IntArray]] = {}
         self.sets: dict[str, dict[str, IntArray]] = {"NSET": {}, "ELSET": {}}
-        self.sections: list[Section] = []
+        self.sections: list[ElementSection] = []
         self.surfaces: dict[str, list[tuple[IntArray, str]]] = {}
         self.materials: dict[str, dict[str, Block]] = {}
         self.material: dict[str, Block] | None = None
@@ -245,7 +245,7 @@ class _Reading:
             what = "thickness" if shell else "cross section"
             raise InputError(f"{block}: {what} {size:g}, expected > 0")
         members = self._named("ELSET", block, block.option("ELSET"), self.instance)
-        self.sections.append(Section(members, block.option("MATERIAL"), size))
+        self.sections.append(ElementSection(members, block.option("MATERIAL"), size))
 
     def _add_surface(self, block: Block) -> None:
         if block.options.get("TYPE", "ELEMENT").upper() != "ELEMENT":
@@ -302,7 +302,7 @@ class _Reading:
                 paced_by[nodes, first:last] = names.index(amplitude)
         return displacement, paced_by, tuple(names)
 
-    def _pressures(self, block: Block) -> list[Pressure]:
+    def _pressures(self, block: Block) -> list[FaceLoad]:
         """Loads on surfaces push into their face, those on elements along their normals."""
         found = []
         amplitude = block.options.get("AMPLITUDE", "").upper()
@@ -311,13 +311,13 @@ class _Reading:
                 raise InputError(f"{block}: {one_line(','.join(row), 40)}, expected pressure P")
             value = float(block.checked([row[2]])[0])
             if block.keyword == "DLOAD":
-                found.append(Pressure(self._named("ELSET", block, row[0], ""), -value, amplitude))
+                found.append(FaceLoad(self._named("ELSET", block, row[0], ""), -value, amplitude))
                 continue
             for members, face in lookup(self.surfaces, row[0], f"{block}: surface"):
                 if face not in ("SPOS", "SNEG"):
                     raise InputError(f"{block}: face {one_line(face, 20)!r}, expected SPOS or SNEG")
                 sign = 1.0 if face == "SPOS" else -1.0
-                found.append(Pressure(members, sign * value, amplitude))
+                found.append(FaceLoad(members, sign * value, amplitude))
         return found
 
 

@@ -28,7 +28,7 @@ from mvest.valve.anatomy.chord_network import ChordPaths, trace_cables
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
-from mvest.valve.io.abaqus.deck import TRUSSES, Deck, Section
+from mvest.valve.io.abaqus.deck import TRUSSES, Deck, ElementSection
 from mvest.valve.io.abaqus.deck_file import read_deck
 from mvest.valve.io.abaqus.leaflet_mesh import LeafletMesh, SetNames, leaflet_mesh, shell_numbers
 from mvest.valve.io.abaqus.truss_stiffness import truss_stiffness
@@ -73,7 +73,7 @@ class Recording:
         vertices of ``surface``.
     cable_family : ndarray
         ``(c,)`` number of the section of each cable's end at the leaflet.
-    cable_sections : tuple of Section
+    cable_sections : tuple of ElementSection
     deck : Deck
     pressure : float
         MPa on the ventricular face at the end.
@@ -90,7 +90,7 @@ class Recording:
     papillary_tips: FloatArray
     cables: ChordPaths
     cable_family: IntArray
-    cable_sections: tuple[Section, ...]
+    cable_sections: tuple[ElementSection, ...]
     deck: Deck
     pressure: float
     pressure_share: FloatArray
@@ -298,7 +298,7 @@ class _Trusses:
 
     edges: IntArray
     section: IntArray
-    sections: tuple[Section, ...]
+    sections: tuple[ElementSection, ...]
 
     @classmethod
     def of(cls, deck: Deck) -> _Trusses:
@@ -325,7 +325,7 @@ class _Trusses:
         return held
 
     def section_at(self, insertion: IntArray) -> IntArray:
-        """Section ``(c,)`` of the truss, the first in the deck, that ends at each node."""
+        """ElementSection ``(c,)`` of the truss, the first in the deck, that ends at each node."""
         nodes, first = np.unique(self.edges.ravel(), return_index=True)
         return self.section[first // 2][np.searchsorted(nodes, insertion)]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from mvest.errors import InputError
 from mvest.reading.text import one_line
-from mvest.valve.io.abaqus.deck import Section
+from mvest.valve.io.abaqus.deck import ElementSection
 from mvest.valve.io.abaqus.keywords import Block
 
 __all__ = ["secant_modulus", "truss_stiffness"]
@@ -16,7 +16,7 @@ MAX_STRAIN = 0.1
 
 
 def truss_stiffness(
-    section: Section, materials: Mapping[str, Mapping[str, Block]], strain: float
+    section: ElementSection, materials: Mapping[str, Mapping[str, Block]], strain: float
 ) -> float:
     """Secant stiffness (N for mm and MPa) of a truss: force over ``strain``.
 
