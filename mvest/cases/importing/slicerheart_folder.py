@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -187,11 +187,9 @@ def _leaflets(
         file = files[fitting[0]]
         with refusing(file, "leaflet"):
             surface = _model(file, notes)
-            if surface.lines or any(len(polygon) != 3 for polygon in surface.polygons):
-                raise GeometryError("holds lines or polygons; expected triangles and strips only")
-            if not surface.polygons:
-                raise GeometryError("no triangles; expected a surface")
-        chosen.append((surface.points, np.array(surface.polygons, dtype=np.int64)))
+            if surface.lines or not len(surface.triangles):
+                raise GeometryError("holds lines or no triangles; expected a surface")
+        chosen.append((surface.points, surface.triangles))
     return (chosen[0], chosen[1]), notes
 
 
@@ -202,10 +200,7 @@ def _model(file: Path, notes: list[str]) -> PolyDataFile:
     if space is None:
         notes.append(f"{file.name}: names no axes in its header, so R, A, S are assumed")
     check_finite(model.points)
-    points = model.points * TO_LPS[space[1] if space else "RAS"]
-    return PolyDataFile(
-        model.title, points, model.lines, model.polygons, model.point_data, model.polygon_data
-    )
+    return replace(model, points=model.points * TO_LPS[space[1] if space else "RAS"])
 
 
 def _rows(folder: Path, beside: Path, name: str) -> tuple[Path, dict[str, list[str]]] | None:

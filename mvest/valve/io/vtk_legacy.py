@@ -31,6 +31,8 @@ _TYPES = {
 _COMPONENTS = {"normals": 3, "vectors": 3, "tensors": 9, "tensors6": 6, "global_ids": 1}
 _CELLS = ("vertices", "lines", "polygons", "triangle_strips")
 """In the order in which cell data count them."""
+FLAT = 0.02
+"""Of the size of a polygon: how far its corners may lie from one plane."""
 _MAX_LINE = 4096
 """Bytes of a line that is no list of numbers."""
 
@@ -45,18 +47,20 @@ class PolyDataFile:
         The second line, in which 3D Slicer names the axes (``SPACE=LPS``).
     points : (n, 3)
         In the unit of the file.
-    lines, polygons : tuple of (k,) arrays
-        Points of each. Strips are among the polygons, as the triangles that they stand for.
-    point_data, polygon_data
-        Named arrays with a row for each point or polygon.
+    lines : tuple of (k,) arrays
+        Points of each.
+    triangles : (m, 3)
+        Also those of strips, and of polygons that are flat and convex, as a clipped triangle is.
+    point_data, cell_data
+        Named arrays with a row for each point or triangle.
     """
 
     title: str
     points: FloatArray
     lines: tuple[IntArray, ...]
-    polygons: tuple[IntArray, ...]
+    triangles: IntArray
     point_data: dict[str, NDArray[np.generic]]
-    polygon_data: dict[str, NDArray[np.generic]]
+    cell_data: dict[str, NDArray[np.generic]]
 
 
 def read_vtk(path: Path) -> SurfaceFile:
@@ -65,19 +69,13 @@ def read_vtk(path: Path) -> SurfaceFile:
     Raises
     ------
     InputError, GeometryError
-        As `read_polydata`; lines, or polygons other than triangles and strips.
+        As `read_polydata`, or lines.
     """
     with refusing(path, "VTK file"):
         file = read_polydata(path)
         if file.lines:
             raise InputError("holds lines; expected triangles only")
-        for number, polygon in enumerate(file.polygons):
-            if len(polygon) != 3:
-                raise InputError(
-                    f"polygon {number} has {len(polygon)} corners; triangulate the surface first"
-                )
-        triangles = np.array(file.polygons, dtype=np.int64).reshape(-1, 3)
-        return SurfaceFile(file.points, triangles, file.point_data, file.polygon_data)
+        return SurfaceFile(file.points, file.triangles, file.point_data, file.cell_data)
 
 
 def read_polydata(path: Path) -> PolyDataFile:
@@ -86,7 +84,8 @@ def read_polydata(path: Path) -> PolyDataFile:
     Raises
     ------
     InputError, GeometryError
-        Damaged, another data set than POLYDATA, vertices by themselves, arrays of bits.
+        Damaged, another data set than POLYDATA, vertices by themselves, arrays of bits, polygons
+        that are not flat and convex.
     """
     with refusing(path, "VTK file"):
         return _Parser(read_bytes(path, MAX_SURFACE)).file()
@@ -127,15 +126,22 @@ class _Parser:
         for cell in cells:
             if len(cell) and not 0 <= cell.min() <= cell.max() < len(self.points):
                 raise GeometryError("cells name points that do not exist")
-        triangles = [_of_strip(strip) for strip in strips]
+        parts = [_of_polygon(polygon, self.points) for polygon in polygons]
+        parts += [_of_strip(strip) for strip in strips]
+        bad = next((k for k, part in enumerate(parts) if part is None), None)
+        if bad is not None:
+            raise InputError(
+                f"polygon {bad} has {len(polygons[bad])} corners and is not flat and convex; "
+                "triangulate the surface first"
+            )
         rows = np.repeat(
-            np.arange(len(lines), len(cells)), [1] * len(polygons) + [len(t) for t in triangles]
+            np.arange(len(lines), len(cells)), [0 if part is None else len(part) for part in parts]
         )
         return PolyDataFile(
             self.title,
             self.points,
             tuple(lines),
-            (*polygons, *(corner for triangle in triangles for corner in triangle)),
+            np.array([corner for part in parts if part for corner in part]).reshape(-1, 3),
             self.data["point_data"],
             {name: values[rows] for name, values in self.data["cell_data"].items()},
         )
@@ -328,6 +334,24 @@ class _Parser:
     def _skip_metadata(self) -> None:
         while self.at < len(self.content) and self._raw_line().strip():
             pass
+
+
+def _of_polygon(polygon: IntArray, points: FloatArray) -> list[IntArray] | None:
+    """Triangles of a polygon from its first corner; None of one that is not flat and convex."""
+    if len(polygon) == 3:
+        return [polygon]
+    if len(polygon) < 3:
+        return None
+    corner = points[polygon]
+    along = np.roll(corner, -1, axis=0) - corner
+    turns = np.cross(np.roll(along, 1, axis=0), along)
+    normal = np.cross(corner - corner[0], np.roll(corner, -1, axis=0) - corner[0]).sum(axis=0)
+    size = float(np.linalg.norm(normal))
+    if size > 0:
+        height = np.abs((corner - corner[0]) @ normal) / size
+        if not (height.max() <= FLAT * np.sqrt(size) and (turns @ normal).min() >= -FLAT * size**2):
+            return None
+    return [polygon[[0, k, k + 1]] for k in range(1, len(polygon) - 1)]
 
 
 def _of_strip(strip: IntArray) -> list[IntArray]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role
 
@@ -109,16 +110,92 @@ def write_fcsv(path, points, axes="LPS"):
     path.write_text("\n".join([*head, *rows]) + "\n")
 
 
-def batch_export(folder: Path, case, scene="P001", **how) -> Path:
-    """What ValveBatchExport writes of a case with the flags -vls, -acc and -lc."""
+def segmented_leaflets(frame, voxel_mm):
+    """Both leaflets as SlicerHeart's LeafletModel makes them.
+
+    Labels of voxels, their smoothed closed surface, a loop of 30 points round the leaflet, and the
+    side of it that is nearer to the atrium.
+    """
+    points = in_lps(frame.vertices)
+    low = points.min(axis=0) - 4
+    size = np.ceil((points.max(axis=0) + 4 - low) / voxel_mm).astype(int) + 1
+    centres = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1)
+    centres = low + voxel_mm * centres.reshape(-1, 3)
+    share = np.array([(i, j) for i in range(9) for j in range(9 - i)]) / 8
+    depth = []
+    for label, thickness in enumerate(THICKNESS.values()):
+        a, b, c = points[frame.triangles[frame.region == label]].transpose(1, 0, 2)
+        dense = np.concatenate([a + (b - a) * u + (c - a) * v for u, v in share])
+        reach = cKDTree(dense).query(centres, distance_upper_bound=3)[0]
+        depth.append(reach / (thickness / 2))
+    labels = np.where(np.min(depth, axis=0) <= 1, 1 + np.argmin(depth, axis=0), 0)
+    image = vtk.vtkImageData()
+    image.SetDimensions(*map(int, size))
+    image.SetSpacing(voxel_mm, voxel_mm, voxel_mm)
+    image.SetOrigin(*low)
+    flat = np.ascontiguousarray(labels.reshape(size).ravel(order="F"), dtype=np.int16)
+    image.GetPointData().SetScalars(numpy_to_vtk(flat, deep=1))
+    above = in_lps(frame.annulus).mean(axis=0)
+    above = above + 30 * (above - in_lps(frame.papillary_tips).mean(axis=0)) / 25
+    return [atrial_side(image, label, frame, points, above) for label in range(2)]
+
+
+def atrial_side(image, label, frame, points, above):
+    faces = vtk.vtkDiscreteFlyingEdges3D()
+    faces.GenerateValues(1, label + 1, label + 1)
+    smooth = vtk.vtkWindowedSincPolyDataFilter()
+    smooth.SetPassBand(0.01)
+    smooth.BoundarySmoothingOff()
+    smooth.NonManifoldSmoothingOn()
+    smooth.NormalizeCoordinatesOn()
+    largest = vtk.vtkPolyDataConnectivityFilter()
+    largest.SetExtractionModeToLargestRegion()
+    edges = vtk.vtkFeatureEdges()
+    edges.NonManifoldEdgesOff()
+    edges.FeatureEdgesOff()
+    rim = run(polydata(points, frame.triangles[frame.region == label]), edges, vtk.vtkStripper())
+    curve = vtk_to_numpy(rim.GetPoints().GetData())[
+        vtk_to_numpy(rim.GetLines().GetConnectivityArray())
+    ]
+    length = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(curve, axis=0), axis=1)])
+    at = np.linspace(0, length[-1], 30, endpoint=False)
+    marks = vtk.vtkPoints()
+    for mark in np.stack([np.interp(at, length, axis) for axis in curve.T], axis=1):
+        marks.InsertNextPoint(*mark)
+    loop = vtk.vtkSelectPolyData()
+    loop.SetLoop(marks)
+    loop.GenerateSelectionScalarsOn()
+    loop.SetSelectionModeToLargestRegion()
+    # SlicerHeart takes the greedy search, which ends at an error message on some loops.
+    loop.SetEdgeSearchModeToDijkstra()
+    clip = vtk.vtkClipPolyData()
+    clip.InsideOutOn()
+    clip.GenerateClippedOutputOn()
+    run(image, faces, smooth, largest, loop, clip)
+    sides = [
+        run(side, vtk.vtkCleanPolyData()) for side in (clip.GetOutput(), clip.GetClippedOutput())
+    ]
+    near = [
+        np.linalg.norm(vtk_to_numpy(side.GetPoints().GetData()) - above, axis=1).mean()
+        for side in sides
+    ]
+    return sides[int(np.argmin(near))]
+
+
+def batch_export(folder: Path, case, scene="P001", *, voxel_mm=None, **how) -> Path:
+    """What ValveBatchExport writes of a case with the flags -vls, -acc and -lc.
+
+    With ``voxel_mm`` leaflets are cut out of a segmentation, see `segmented_leaflets`.
+    """
     folder.mkdir(parents=True)
     contour, marks = [], []
     seen = [frame for frame in case.frames if frame.role in (Role.REFERENCE, Role.CLOSED)]
     for number, frame in enumerate(seen):
         phase, index = PHASES[frame.name], str(3 + 9 * number)
         stem = f"{scene}_mitral_frame_{index}_{phase}"
+        whole = None if voxel_mm is None else segmented_leaflets(frame, voxel_mm)
         for label, name in enumerate(case.surface.region_names):
-            model = atrial_leaflet(frame, label, THICKNESS[name])
+            model = whole[label] if whole else atrial_leaflet(frame, label, THICKNESS[name])
             write_model(folder / f"{stem}_atrial_mitral_{name}_leaflet.vtk", model, **how)
         ring = in_lps(frame.annulus)
         points = np.concatenate([ring + (np.roll(ring, -1, axis=0) - ring) * t for t in (0, 0.5)])

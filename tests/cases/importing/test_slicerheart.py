@@ -89,6 +89,19 @@ def test_it_is_a_case_that_can_be_written_and_read(case, tmp_path):
     assert again.derived == case.derived
 
 
+@pytest.mark.slow
+def test_leaflets_cut_out_of_a_segmentation_come_within_half_a_voxel(tmp_path):
+    # Quads where triangles were clipped, slivers and rims that curl, as SlicerHeart's have.
+    folder = batch_export(tmp_path / "P001", TRUTH, voxel_mm=0.5)
+    found = import_slicerheart(folder, OPTIONS)
+    truth = {frame.role: frame for frame in TRUTH.frames}
+    for frame in found.frames:
+        true = truth[frame.role]
+        back = closest_points(in_lps(true.vertices), frame.vertices, frame.triangles).distance
+        assert np.sqrt(np.mean(back**2)) < 0.25
+        assert np.quantile(away(frame, true), 0.9) < 0.5
+
+
 def test_one_phase_is_an_anatomy(folder):
     for file in folder.glob("*_MS_*"):
         file.unlink()

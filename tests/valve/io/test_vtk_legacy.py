@@ -100,10 +100,24 @@ def test_lines_are_read_as_lines_and_are_no_surface(tmp_path, version, kind):
         read_surface(path)
 
 
-def test_polygons_are_refused_by_name(tmp_path):
-    path = written(tmp_path / "a.vtk", output(vtk.vtkPlaneSource()))
-    with pytest.raises(InputError, match="polygon 0 has 4 corners; triangulate"):
-        read_surface(path)
+def test_flat_polygons_are_cut_up_and_others_refused_by_name(tmp_path):
+    source = vtk.vtkPlaneSource()
+    source.SetResolution(2, 1)
+    plane = output(source)
+    plane.GetCellData().AddArray(named("region", np.array([3, 5], dtype=np.int32)))
+    read = read_surface(written(tmp_path / "a.vtk", plane))
+    assert len(read.triangles) == 4
+    assert read.cell_data["region"].tolist() == [3, 3, 5, 5]
+    edges = np.diff(read.vertices[read.triangles], axis=1)
+    areas = 0.5 * np.cross(edges[:, 0], edges[:, 1])
+    # All face the way that the square does, and fill it.
+    assert areas[:, 2] == pytest.approx(0.25)
+    plane.GetPoints().SetPoint(4, 0.0, 0.5, 0.3)
+    with pytest.raises(InputError, match="polygon 0 has 4 corners and is not flat and convex"):
+        read_surface(written(tmp_path / "a.vtk", plane))
+    plane.GetPoints().SetPoint(4, -0.4, -0.4, 0.0)
+    with pytest.raises(InputError, match="not flat and convex; triangulate"):
+        read_surface(written(tmp_path / "a.vtk", plane))
 
 
 def test_other_data_sets_and_missing_points_are_refused(tmp_path):
