@@ -31,6 +31,7 @@ COMMANDS = {
     "import": "a case folder from what another program wrote: import NAME SOURCE CASE",
     "export": "a case or a result for another program: export NAME SOURCE TARGET",
     "tables": "every table and figure of results/ anew, from the records that are kept there",
+    "table": "all estimates of a folder as one table for statistics: table outputs estimates.csv",
     "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
     "collect": "what became of the jobs of a sweep that others ran",
     "dashboard": "MLflow's pages, on the comparison of the last sweep",
@@ -74,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser = Parser("mvest tables", description=COMMANDS[command])
             parser.add_argument("folder", nargs="?", default="results", metavar="FOLDER")
             return tables([parser.parse_args(rest).folder])
+        case "table":
+            return _table(rest)
         case "worker":
             return _worker(rest)
         case "collect":
@@ -96,6 +99,22 @@ def _help() -> str:
     about = "Leaflet stiffness of a mitral valve, from how the valve is seen to close."
     lines = [f"  mvest {name:<10} {text}" for name, text in COMMANDS.items()]
     return "\n".join([about, "", *lines, "", "mvest COMMAND --help says more of each."])
+
+
+def _table(rest: list[str]) -> int:
+    """Write all estimates of a folder as one table, and what its columns mean."""
+    from experiments.runner.estimate_table import write_estimates
+
+    parser = Parser("mvest table", description=COMMANDS["table"])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
+    parser.add_argument("target", type=Path, metavar="FILE", help="NAME.csv or NAME.parquet")
+    parsed = parser.parse_args(rest)
+    try:
+        print(*write_estimates(parsed.folder, parsed.target), sep="\n")
+    except MvestError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 def _worker(rest: list[str]) -> int:

@@ -28,7 +28,7 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.provenance import config_hash
 from mvest.valve.anatomy.template import TemplateParameters
 
-__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register"]
+__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register", "without_places"]
 
 AS_BEFORE: dict[str, Any] = {
     "check_runs": 0,
@@ -253,6 +253,15 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
         if inner and kept.get(part) is not None:
             kept[part] = {key: value for key, value in kept[part].items() if key != inner}
     return config_hash(with_contents(_settings(kept.get("study")), _without_as_before(kept)))
+
+
+def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration as it is written and given away: no name of a file or folder of its user.
+
+    What a setting reads has its SHA-256 in the place of its name; where results lie is left out.
+    """
+    kept = {str(key): value for key, value in values.items() if key != "paths"}
+    return dict(with_contents(_settings(kept.get("study")), kept))
 
 
 def _without_as_before(part: Mapping[str, Any]) -> dict[str, Any]:

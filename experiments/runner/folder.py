@@ -14,6 +14,7 @@ from typing import Any
 
 from filelock import FileLock
 
+from experiments.common.config import without_places
 from experiments.common.record import (
     SCHEMA,
     Outcome,
@@ -219,6 +220,6 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
         Outcome(findings=None, status="failed", reason=reason),
         started,
     )
-    write_json(request.folder / CONFIG, request.values)
+    write_json(request.folder / CONFIG, without_places(request.values))
     write_record(request.folder / RESULT, record)
     return read_mapping(request.folder / RESULT)

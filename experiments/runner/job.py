@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.common.config import hash_of
+from experiments.common.config import hash_of, without_places
 from experiments.common.record import Record, record_from, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Study, load_study, study_names
@@ -119,7 +119,7 @@ def compute(request: Request) -> None:
             reason = "a file or folder that the settings name was changed before the job ended"
             outcome = replace(outcome, status="failed", reason=reason)
         record = stamp(values, request.config_hash, outcome, started)
-        write_json(folder / CONFIG, values)
+        write_json(folder / CONFIG, without_places(values))
         write_record(folder / RESULT, record)
     try:
         _write_out(study, request, record)

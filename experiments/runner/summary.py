@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean, median
-from typing import TYPE_CHECKING, Any
 
-from experiments.common.estimates import SeedRun
-from experiments.runner.comparison import short_names
+from experiments.runner.estimate_table import sweep_table
 from experiments.runner.tracking import Store, telling
 from experiments.sweeps.collected import Sweep, check_sweep
 from mvest.files import write_atomically
 from mvest.provenance import require_sealed
 from mvest.reading.json_file import read_mapping
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-__all__ = ["IS_SWEEP", "SWEEP", "TABLE", "log_summary", "table"]
+__all__ = ["IS_SWEEP", "SWEEP", "TABLE", "log_summary"]
 
 SWEEP, TABLE = "sweep.json", "jobs.parquet"
 """Files in a sweep's folder: its results, and all its jobs as a table."""
@@ -50,7 +44,7 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
         whole = [run for run in before if run.info.status == "FINISHED"]
         if whole and whole[0].data.tags.get("result_hash") == result_hash:
             return
-    write_atomically(folder / TABLE, table(sweep).to_parquet())
+    write_atomically(folder / TABLE, sweep_table(sweep).to_parquet())
     tags = {
         "kind": IS_SWEEP,
         "sweep_id": sweep_id,
@@ -72,50 +66,6 @@ def log_summary(store: Store, folder: Path, sweep_id: str) -> None:
         store.client.set_terminated(run_id, "FINISHED")
         for run in before:
             store.client.delete_run(run.info.run_id)
-
-
-def table(sweep: Sweep) -> DataFrame:
-    """All jobs of a sweep, a row for each of their seeds; one without numbers for a lost job."""
-    from pandas import DataFrame
-    from pandas.api.types import is_object_dtype
-
-    frame = DataFrame(list(_rows(sweep)))
-    # What is varied may be a number in one job and a list in another; a column has one type.
-    for name in filter(lambda name: is_object_dtype(frame[name]), frame):
-        frame[name] = [value if value is None else str(value) for value in frame[name]]
-    return frame
-
-
-def _rows(sweep: Sweep) -> Iterator[dict[str, Any]]:
-    names = short_names(sweep.parameters)
-    unknown = [None] * len(names)
-    costs = {cost.hash: cost for cost in sweep.cost}
-    for job in sweep.jobs:
-        cost = costs[job.hash]
-        for run in job.runs or (SeedRun(seed=job.seed, status=job.status, reason=job.reason),):
-            yield {
-                "hash": job.hash,
-                "row": job.row,
-                "seed": run.seed,
-                "status": run.status,
-                "reason": run.reason,
-                **{f"factor.{name}": value for name, value in job.factors.items()},
-                **{
-                    f"{what}.{name}": value
-                    for what, values in (
-                        ("estimate", run.estimate),
-                        ("std", run.std),
-                        ("relative_error", run.relative_error),
-                    )
-                    for name, value in zip(names, values or unknown, strict=True)
-                },
-                "nis": run.nis,
-                "iterations": run.iterations,
-                "forward_solves": run.forward_solves,
-                "seconds": run.seconds,
-                "seconds_of_job": cost.seconds_total,
-                "overhead_of_job": cost.overhead,
-            }
 
 
 def _totals(sweep: Sweep) -> dict[str, float]:

@@ -132,9 +132,9 @@ def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValv
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = _frames(settings, curve, held, valve, rows)
     texts = CaseTexts(
-        settings.name or Path(file).name.partition(".")[0],
+        settings.name or _called(volume),
         settings.description,
-        settings.source or volume.source,
+        settings.source or _called(volume),
         settings.licence,
         settings.simulated,
     )
@@ -177,7 +177,7 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         # Of an earlier run.
         shutil.rmtree(place, ignore_errors=True)
     images.mkdir(parents=True)
-    name, line = detected.case.name, f"volume {detected.volume.sha256[:12]}"
+    name, line = detected.case.name, _called(detected.volume)
     drawn = {
         "montage": (
             montage_figure(
@@ -212,7 +212,7 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         files=(f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"),
         model=detected.model,
         volume=VolumeAbout(
-            volume.source,
+            _called(volume),
             volume.sha256,
             volume.modality.value,
             volume.frames.shape,
@@ -226,12 +226,17 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
     )
 
 
+def _called(volume: VolumeSequence) -> str:
+    """A volume by its content: files are often called after a patient."""
+    return f"volume {volume.sha256[:12]}"
+
+
 def _sentences(detected: DetectedValve) -> tuple[str, ...]:
     volume, valve = detected.volume, detected.valve
     confidence = valve.frame_confidence
     size = " x ".join(map(str, volume.frames.shape[1:]))
     return (
-        f"{volume.source}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
+        f"{_called(volume)}: {len(volume.times)} frames of {size} voxels, {volume.modality.value}.",
         f"Valve detected with a confidence of {confidence.min():.2f} to {confidence.max():.2f} "
         f"(open frame {detected.frames.open}: {confidence[detected.frames.open]:.2f}, closed frame "
         f"{detected.frames.closed}: {confidence[detected.frames.closed]:.2f}).",

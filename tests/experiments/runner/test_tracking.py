@@ -509,12 +509,18 @@ def test_a_sweep_is_one_run_with_a_table_of_all_jobs(tmp_path, monkeypatch) -> N
     }  # fmt: skip
     kept = Path(unquote(urlsplit(whole.info.artifact_uri).path))
     table = read_parquet(kept / "jobs.parquet")
-    assert list(table["hash"]) == ["a" * 16] * 2 + ["b" * 16] * 2 + ["c" * 16]
-    assert list(table["status"]) == ["converged", "failed"] * 2 + ["failed"]
-    assert list(table["reason"][3:]) == ["it buckled", "killed by signal 9"]
-    assert list(table["estimate.anterior"].dropna()) == [6.0, 6.0]
-    assert list(table["factor.noise"]) == [0.0, 0.0, 0.5, 0.5, 1.0]
-    assert list(table["factor.R"][1:3]) == ["[0.1, 0.2]", "0.01"], "numbers and lists are texts"
+    # Two moduli of each of the seeds 1 and 2 of two jobs, and of the lost one.
+    assert list(table["job"]) == ["a" * 16] * 4 + ["b" * 16] * 4 + ["c" * 16] * 2
+    assert list(table["status"]) == ["converged", "converged", "failed", "failed"] * 2 + [
+        "failed",
+        "failed",
+    ]
+    assert list(table["reason"][7:9]) == ["it buckled", "killed by signal 9"]
+    assert list(table["parameter"][:2]) == NAMES
+    assert list(table["estimate"].dropna()) == [6.0, 2.0] * 2
+    assert list(table["relative_error"].dropna()) == [-0.04, 0.02] * 2
+    assert set(table["unit"]) == {"MPa"}
+    assert json.loads(table["factors"][4]) == {"noise": 0.5, "R": 0.01}
     assert (kept / "sweep.json").read_text() == (plan.folder / "sweep.json").read_text()
 
     # Once for each state of the sweep.

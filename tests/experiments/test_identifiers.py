@@ -1,0 +1,133 @@
+"""No name, number or date of a patient gets out of what is read into what is written."""
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+from experiments.common.cases.report import write_case_run
+from experiments.common.config import hash_of, without_places
+from experiments.common.record import stamp, write_record
+from experiments.common.schema import build
+from experiments.common.study import Job
+from experiments.studies.case.settings import Settings
+from experiments.studies.case.study import run_own_case
+from mvest.imaging.reading.reader import read_volume
+from mvest.imaging.volume import Modality
+from mvest.provenance import write_json
+from tests.experiments.common.test_config import composed, plain
+from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
+from tests.imaging.reading import test_nifti, test_philips
+from tests.imaging.reading import volumes as v
+from tests.made_up_closure import use
+
+NAME, NUMBER, DATE = "DOE^JANE", "MRN0815", "19700131"
+SECRETS = (NAME, "DOE_JANE", NUMBER, DATE)
+
+
+def philips(folder: Path) -> Path:
+    data = test_philips.dataset()
+    data.PatientName, data.PatientID = NAME, NUMBER
+    data.PatientBirthDate = data.StudyDate = DATE
+    return test_philips.save(folder / "a.dcm", data)
+
+
+def nrrd(folder: Path) -> Path:
+    extra = f"# {NAME}\nPatientID:={NUMBER}\nPatientName:={NAME}\nStudyDate:={DATE}\n"
+    text = v.nrrd_text(v.nrrd_fields() | {"content": f'"{NAME}"'}, extra)
+    (folder / "a.nrrd").write_bytes(text + v.nrrd_voxels())
+    return folder / "a.nrrd"
+
+
+def nifti(folder: Path) -> Path:
+    image = test_nifti.image(v.frames())
+    image.header["descrip"], image.header["db_name"] = NAME, NUMBER
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", DATE.encode()))
+    nibabel.save(image, folder / "a.nii")
+    return folder / "a.nii"
+
+
+@pytest.mark.parametrize("made", [philips, nrrd, nifti])
+def test_readers_keep_no_text_of_a_header(tmp_path: Path, made: Callable[[Path], Path]) -> None:
+    file = made(tmp_path)
+    content = file.read_bytes()
+    assert NAME.encode() in content
+    assert NUMBER.encode() in content
+    modality = None if made is philips else Modality.ULTRASOUND
+    unit = "s" if made is nrrd else None
+    volume = read_volume(file, modality=modality, time_unit=unit)
+    kept = {field.name: getattr(volume, field.name) for field in fields(volume)}
+    assert not [secret for secret in SECRETS if secret in repr(kept)]
+    assert kept["source"] == file.name
+    # What is kept as text at all.
+    assert {name for name, value in kept.items() if isinstance(value, str)} == {"source", "sha256"}
+    assert np.ptp(volume.frames[0]) > 0
+
+
+def own_observation(folder: Path) -> list[str]:
+    """A program, which the user names as it is to be kept, beside an observation of a patient."""
+    (folder.parent.parent / "program").mkdir()
+    words = own_program(folder.parent.parent / "program")
+    observed = folder / f"{DATE}.csv"
+    observed.write_bytes((folder.parent.parent / "program" / "observed.csv").read_bytes())
+    return [f"external.observation={observed}" if "observation=" in w else w for w in words]
+
+
+def leaks(folder: Path) -> list[tuple[str, str]]:
+    """Files of a run, and what each of them says that it should not."""
+    kept = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    # What was shown on the terminal is kept as it was shown.
+    return [
+        (path.name, secret)
+        for path, content in kept.items()
+        for secret in SECRETS
+        if secret.encode() in content and path.name != "log.txt"
+    ]
+
+
+def test_no_name_of_a_file_is_in_a_run_or_its_store(tmp_path: Path, monkeypatch) -> None:
+    patient = tmp_path / "DOE_JANE" / NUMBER
+    patient.mkdir(parents=True)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    words = [*own_observation(patient), "hydra.run.dir=out", "publish=false"]
+    assert typed(monkeypatch, *words) == 0
+    names = {path.name for path in (tmp_path / "here").rglob("*")}
+    assert names >= {"config.json", "result.json", "mlflow.db"}
+    assert leaks(tmp_path / "here") == []
+
+
+def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypatch) -> None:
+    patient = tmp_path / "DOE_JANE" / NUMBER
+    patient.mkdir(parents=True)
+    use(monkeypatch)
+    out = tmp_path / "out"
+    out.mkdir()
+    values = plain(composed(*own_case(patient), f"paths.outputs={out}"))
+    outcome = run_own_case(Job(values, build(Settings, values), out))
+    record = stamp(values, hash_of(values), outcome, 0.0)
+    write_json(out / "config.json", without_places(values))
+    write_record(out / "result.json", record)
+    names = {path.name for path in write_case_run(out, record)}
+    assert "report.html" in names
+    assert leaks(out) == []
+    assert "DOE_JANE" in json.dumps(values)
+
+
+def test_what_a_configuration_says_of_files_is_their_content(tmp_path: Path) -> None:
+    place = tmp_path / "DOE_JANE"
+    place.mkdir()
+    words = own_volume(place)
+    assert "DOE_JANE" in words[1]
+    values = {
+        "study": "volume", "volume": words[1].partition("=")[2], "paths": {"outputs": str(place)},
+        "imaged": {"name": "valve 7", "pressure_curve": words[2].partition("=")[2]},
+    }  # fmt: skip
+    kept = without_places(values)
+    assert "DOE_JANE" not in json.dumps(kept)
+    assert "sha256" in json.dumps(kept["volume"])
+    assert kept["imaged"]["name"] == "valve 7"
