@@ -7,7 +7,26 @@ from dataclasses import dataclass
 
 from experiments.common.findings import Vector
 
-__all__ = ["Estimated", "Findings", "Problem", "Repeats", "SurrogateFit"]
+__all__ = ["Estimated", "Findings", "OwnCheck", "Problem", "Repeats", "SurrogateFit"]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCheck:
+    """What a filter says of its own approximation (`mvest.estimation.check`).
+
+    ``value`` is how far apart the two are that it ``compared``, and ``limit`` how far they may be
+    where the intervals mean what they say; ``extra_runs`` of the model were made for it.
+    """
+
+    compared: str
+    value: float
+    limit: float
+    extra_runs: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the filter believes its own posterior."""
+        return self.value <= self.limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,7 +35,7 @@ class Estimated:
 
     Estimate and the ends of its 95 % interval are in units of the parameters, ``log_mean`` and
     ``log_std`` of their logarithms, and so is the skewness of the draws, None without draws. CPU
-    seconds are in all, and of the model.
+    seconds are in all, and of the model. ``check`` is what the filter says of itself.
     """
 
     converged: bool
@@ -32,6 +51,7 @@ class Estimated:
     low: Vector
     high: Vector
     skewness: Vector | None = None
+    check: OwnCheck | None = None
 
     def interval(self, k: int) -> tuple[float, float]:
         """Ends of the interval of one unknown."""

@@ -23,6 +23,7 @@ from experiments.common.study import Job, Section, Study
 from experiments.studies.filters.findings import (
     Estimated,
     Findings,
+    OwnCheck,
     Problem,
     Repeats,
     SurrogateFit,
@@ -192,7 +193,13 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated
         low=vector(low),
         high=vector(high),
         skewness=None if draws is None else vector(scipy.stats.skew(draws, axis=0)),
+        check=_own_check(estimate),
     )
+
+
+def _own_check(estimate: Estimate) -> OwnCheck | None:
+    made = estimate.check
+    return made and OwnCheck(made.compared, made.value, made.limit, made.extra_runs)
 
 
 def _repeats(

@@ -247,6 +247,7 @@ STUDY = Study(
     write_run=write_twin_run,
     checks=_checks,
     require=require_twin,
+    keeps_failures=True,
     sections=(
         Section(
             "table1",

@@ -152,6 +152,7 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
         "~filters.methods.paper",
         "~filters.methods.perturbed",
         "~filters.methods.smoother",
+        "~filters.methods.importance",
         "filters.problems.moduli.noise_mm=0.05",
         "filters.methods.ensemble.ensemble.members=6",
         f"filters.methods.monte_carlo.monte_carlo.sampler={SHORT}",
@@ -171,6 +172,9 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     assert list(found) == ["extended", "iterated", "unscented", "ensemble", "monte_carlo"]
     # What each costs is what the model was run: 2; 6 members and the estimate.
     assert found["extended"].forward_solves == 2
+    check = found["iterated"].check
+    assert check is not None
+    assert check.holds
     assert found["ensemble"].forward_solves == 7
     assert all(0 < row.model_seconds <= row.seconds for row in found.values())
     # Little is asked of so few draws: it is recorded that they are not enough.

@@ -10,11 +10,17 @@ from experiments.common.record import Record
 from experiments.studies.filters.findings import (
     Estimated,
     Findings,
+    OwnCheck,
     Problem,
     Repeats,
     SurrogateFit,
 )
-from experiments.studies.filters.report import filters_figure, filters_words, write_filters
+from experiments.studies.filters.report import (
+    filters_figure,
+    filters_table,
+    filters_words,
+    write_filters,
+)
 from mvest.reporting.style import BAD, GOOD
 from tests.experiments.studies.made_up import made_up
 
@@ -66,8 +72,23 @@ def row(text: str, start: str) -> str:
 def test_error_width_coverage_and_cost_of_a_filter() -> None:
     text = filters_words(study(0.0, 0.44))
     # 4 of 5 MPa: -20 %; 0.44/0.4 = 1.10; each end 0.02 farther out, 5 % of 0.4.
-    expected = "| iterated extended | -20.0 | 1.10 | -5 / +5 | 94 % | 10.0 | 7 | 3 | converged |"
-    assert row(text, "| iterated extended | -20") == expected
+    expected = "| iterated extended | -20.0 | 1.10 | -5 / +5 | 94 % | 10.0 | 7 | 3 |"
+    assert row(text, "| iterated extended | -20") == f"{expected} none | converged |"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(0.1, "0.1 of 0.25"), (0.25, "0.25 of 0.25"), (0.3, "0.3 of 0.25: **fails**")],
+)
+def test_what_a_filter_says_of_itself(value, said) -> None:
+    one = study(0.0, 0.44)
+    (problem,) = one.findings.problems
+    check = OwnCheck("a distance", value, 0.25, 2)
+    filters = {**problem.filters, "iterated": replace(problem.filters["iterated"], check=check)}
+    one = replace(one, findings=Findings((replace(problem, filters=filters),), 6.0))
+    line = row(filters_words(one), "| iterated extended | -20")
+    assert line.endswith(f"| 7 | 3 | {said} | converged |")
+    assert filters_table(one.findings)["check_runs"].dropna().tolist() == [2.0]
 
 
 @pytest.mark.parametrize(
