@@ -13,6 +13,7 @@ from typing import Any
 
 __all__ = [
     "MISSING",
+    "ended",
     "latex_rows",
     "latex_text",
     "markdown_rows",
@@ -55,6 +56,11 @@ LATEX = str.maketrans(
         "\r": " ",
     }
 )
+
+
+def ended(text: str) -> str:
+    """Text as a sentence: with its own mark at the end, or a full stop."""
+    return text if text.endswith((".", "?", "!")) else f"{text}."
 
 
 def shown_text(text: str, longest: int | None = None) -> str:

@@ -13,7 +13,7 @@ from experiments.common.record import Record
 from mvest.files import write_atomically
 from mvest.problem.verdict import NONE
 from mvest.reporting.case.findings import CaseFindings, FrameDistances, UnknownRow
-from mvest.reporting.markup import MISSING, number
+from mvest.reporting.markup import MISSING, ended, number
 
 __all__ = [
     "case_text",
@@ -32,7 +32,7 @@ def case_text(record: Record[Findings]) -> str:
     if verdict is None:
         return estimation_text(title, case.unknowns, case.distances)
     lines = [f"{case.about.name}: {verdict.trust.upper()} ({len(verdict.passed)} checks passed)"]
-    lines += [f"  {ground.text}. Next: {ground.advice}" for ground in verdict.grounds]
+    lines += [f"  {ended(ground.text)} Next: {ground.advice}" for ground in verdict.grounds]
     if verdict.trust == NONE:
         lines.append(f"  No modulus is stated; the run ended: {record.reason}")
         return estimation_text("\n".join(lines), (), case.distances)

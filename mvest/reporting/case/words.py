@@ -22,7 +22,7 @@ from mvest.reporting.case.findings import (
 from mvest.reporting.case.information import columns_of
 from mvest.reporting.expectation import alike_words
 from mvest.reporting.findings import Innovation, Spread
-from mvest.reporting.markup import MISSING, number
+from mvest.reporting.markup import MISSING, ended, number
 
 __all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "error_rows",
            "frame_rows", "identifiability_words", "image_error_words", "innovation_words",
@@ -68,7 +68,7 @@ def answer(case: CaseFindings) -> str:
     """The result in one sentence; of what is not to be believed there is no number."""
     verdict = case.verdict
     if verdict is not None and verdict.trust == NONE:
-        return f"No stiffness can be stated: {verdict.grounds[0].text}."
+        return ended(f"No stiffness can be stated: {verdict.grounds[0].text}")
     if not case.moduli:
         return f"No stiffness was estimated: {case.reason or 'the run gives no reason'}."
     fibre = [m for m in case.moduli if m.name == "E_f"] or case.moduli
@@ -90,9 +90,8 @@ def verdict_words(case: CaseFindings) -> tuple[str, list[str], list[str]]:
         NONE: "No stiffness is to be taken from this run.",
     }
     against = [
-        ground.text[:1].upper()
-        + ground.text[1:]
-        + (f". Next: {ground.advice}." if ground.advice else ".")
+        ended(ground.text[:1].upper() + ground.text[1:])
+        + (f" Next: {ended(ground.advice)}" if ground.advice else "")
         for ground in verdict.grounds
     ]
     unseen = [f"{name} ({UNASKED})" if name == ONE_STATE else name for name in verdict.missing]

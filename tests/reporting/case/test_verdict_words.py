@@ -25,6 +25,10 @@ def test_no_number_is_stated_of_what_is_not_to_be_believed(case):
     assert head == "No stiffness is to be taken from this run."
     assert against[0] == "The fitted valve leaves 121 mm² free. Next: check the chordae."
     assert missing == []
+    asked = replace(LEAKS, text="3 mm off: do its vertices correspond?")
+    judged = replace(case, verdict=Verdict(NONE, (asked,), ()))
+    assert answer(judged) == "No stiffness can be stated: 3 mm off: do its vertices correspond?"
+    assert verdict_words(judged)[1][0].endswith("correspond? Next: check the chordae.")
 
 
 def test_a_doubt_stands_before_the_numbers(case):
