@@ -44,7 +44,9 @@ DISTANCE_MAP = "viridis"
 DPI = 200
 
 LONGEST_TEXT, LONGEST_LINE = 160, 400
-"""Characters of a text in a figure, and of the line at its foot."""
+"""Characters of a line of a text in a figure, and of the line at its foot."""
+MAX_LINES = 6
+"""Of a text in a figure."""
 KEPT = 20
 """Characters of a longer one that are shown, so that something is left of the figure."""
 TICK = re.compile(r"\$\\mathdefault\{[−-]?[\d.]*(?:\\times)?[\d.]*(?:\^\{[−-]?[\d.]+\})?\}\$")
@@ -168,5 +170,7 @@ def _printed(text: str) -> str:
     """Text that matplotlib prints as it stands: what is between dollars is mathematics to it."""
     if TICK.fullmatch(text):
         return text
-    cut = text if len(text) <= LONGEST_TEXT else f"{text[:KEPT]}…"
+    lines = text.split("\n")
+    fits = len(lines) <= MAX_LINES and max(map(len, lines)) <= LONGEST_TEXT
+    cut = text if fits else f"{text[:KEPT]}…"
     return re.sub(r"\\?\$", r"\\$", shown_text(cut).replace("\t", " "))

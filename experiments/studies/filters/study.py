@@ -199,7 +199,9 @@ def _estimate(problem: ComparedProblem, filter_: Filter, seed: int) -> Estimated
 
 def _own_check(estimate: Estimate) -> OwnCheck | None:
     made = estimate.check
-    return made and OwnCheck(made.compared, made.value, made.limit, made.extra_runs)
+    if made is None:
+        return None
+    return OwnCheck(made.compared, made.value, made.limit, made.extra_runs)
 
 
 def _repeats(
