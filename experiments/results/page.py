@@ -55,6 +55,7 @@ OTHERS = (
         "Thin shells",
         validation=True,
     ),
+    Section("febio", title="The same in FEBio", validation=True),
     Section("benchmark", {"benchmark": "Where the time goes."}, "How fast", validation=True),
 )
 """What no study made."""

@@ -47,12 +47,15 @@ class Prescribed:
         In full; zeros hold the nodes.
     curve : (c, 2)
         Times and shares of it.
+    axes : tuple of str
+        Coordinates that are prescribed.
     """
 
     name: str
     nodes: IntArray
     displacement: FloatArray
     curve: FloatArray
+    axes: tuple[str, ...] = AXES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +172,7 @@ class Control:
     step, smallest, largest : float
         s, the first time step and the bounds within which FEBio chooses the others.
     dynamic : bool
-        With inertia (Newmark's rule with beta = gamma = 1) or static.
+        With inertia (the generalised alpha rule at its most dissipative) or static.
     quasi_newton : int
         BFGS updates between two new tangents; 0 for Newton's method.
     displacement, energy, residual : float
@@ -189,7 +192,7 @@ class Control:
     displacement: float = 1e-6
     energy: float = 1e-10
     residual: float = 0.0
-    retries: int = 20
+    retries: int = 10
     line_search: float = 0.9
 
 
@@ -318,6 +321,8 @@ class _Writer:
         stepper = _add(at, "time_stepper", type="default")
         _add(stepper, "max_retries", str(control.retries))
         _add(stepper, "opt_iter", "15")
+        _add(stepper, "aggressiveness", "1")
+        _add(stepper, "cutback", 0.5)
         _add(stepper, "dtmin", control.smallest)
         _add(stepper, "dtmax", control.largest)
         solver = _add(at, "solver", type="solid")
@@ -325,17 +330,13 @@ class _Writer:
         _add(solver, "equation_scheme", "staggered")
         _add(solver, "optimize_bw", "0")
         _add(solver, "lstol", control.line_search)
-        _add(solver, "max_refs", "40")
+        _add(solver, "max_refs", "25")
         _add(solver, "diverge_reform", "1")
         _add(solver, "min_residual", 1e-16)
         _add(solver, "dtol", control.displacement)
         _add(solver, "etol", control.energy)
         _add(solver, "rtol", control.residual)
-        # Newmark's rule. With beta = gamma a viscous stress has an exact tangent in FEBio, and 1
-        # damps most; any rhoi below -1 lets these numbers be stated.
-        _add(solver, "rhoi", "-2")
-        for name in ("alpha", "beta", "gamma"):
-            _add(solver, name, "1")
+        _add(solver, "rhoi", "0")
         method = _add(solver, "qn_method", type="BFGS")
         _add(method, "max_ups", str(control.quasi_newton))
 
@@ -343,23 +344,12 @@ class _Writer:
         materials = _add(self.root, "Material")
         names = self.document.mesh.solid.region_names
         for k, (name, law) in enumerate(zip(names, self.document.laws, strict=True), start=1):
-            if not any(law.viscosity):
-                material = _add(materials, "material", id=str(k), name=name, type=law.name)
-                _add(material, "density", self.document.density)
-                self._parameters(material, name, law)
-                continue
-            mixture = _add(materials, "material", id=str(k), name=name, type="solid mixture")
-            _add(mixture, "density", self.document.density)
-            self._parameters(_add(mixture, "solid", type=law.name), name, law)
-            viscous = _add(mixture, "solid", type="Newtonian viscous solid")
-            _add(viscous, "kappa", law.viscosity[0])
-            _add(viscous, "mu", law.viscosity[1])
-
-    def _parameters(self, at: Xml.Element, region: str, law: FebLaw) -> None:
-        for tag, value in law.parameters.items():
-            _add(at, tag, value)
-        if law.directed == "fiber":
-            _add(at, "fiber", f"fibre_{region}", type="map")
+            material = _add(materials, "material", id=str(k), name=name, type=law.name)
+            _add(material, "density", self.document.density)
+            for tag, value in law.parameters.items():
+                _add(material, tag, value)
+            if law.directed == "fiber":
+                _add(material, "fiber", f"fibre_{name}", type="map")
 
     def _mesh(self) -> None:
         document, mesh = self.document, self.document.mesh
@@ -450,10 +440,10 @@ class _Writer:
             if not group.displacement.any():
                 fixed = _add(at, "bc", type="zero displacement", node_set=group.name)
                 for axis in AXES:
-                    _add(fixed, f"{axis}_dof", "1")
+                    _add(fixed, f"{axis}_dof", "1" if axis in group.axes else "0")
                 continue
             curve = self._curve(group.curve)
-            for axis in AXES:
+            for axis in group.axes:
                 moved = _add(at, "bc", type="prescribed displacement", node_set=group.name)
                 _add(moved, "dof", axis)
                 _add(moved, "value", f"{group.name}_{axis}", lc=curve, type="map")

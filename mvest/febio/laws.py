@@ -18,14 +18,18 @@ hyperelastic`` with the same exponential; the stretch of its fibres is then the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.law.moduli import TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue
+from mvest.typing import FloatArray, IntArray
 
-__all__ = ["LAWS", "FebLaw", "febio_law"]
+__all__ = ["LAWS", "FebLaw", "OrthotropicElastic", "febio_law"]
 
 LAWS = ("orthotropic", "neo-hookean")
 
@@ -42,18 +46,15 @@ class FebLaw:
         Tag -> value.
     directed : str
         What carries the direction of the fibre: ``mat_axis`` or ``fiber``.
-    viscosity : tuple of float
-        Bulk and shear viscosity, MPa s, of a Newtonian solid beside it; both 0 for none.
     """
 
     name: str
     parameters: Mapping[str, float | str]
     directed: str
-    viscosity: tuple[float, float] = (0.0, 0.0)
 
 
 def febio_law(
-    tissue: TransverselyIsotropic | ExponentialTissue, kind: str = "orthotropic", beta: float = 0.0
+    tissue: TransverselyIsotropic | ExponentialTissue, kind: str = "orthotropic"
 ) -> FebLaw:
     """The material of FEBio for the tissue of one region.
 
@@ -62,9 +63,6 @@ def febio_law(
     tissue : TransverselyIsotropic or ExponentialTissue
     kind : str
         One of `LAWS`, for the linear law.
-    beta : float
-        s, stiffness-proportional damping: becomes the viscosity of an isotropic Newtonian solid,
-        beta times the bulk modulus and the shear modulus of planes along the fibre.
 
     Raises
     ------
@@ -79,17 +77,11 @@ def febio_law(
         energy = f"{tissue.c0!r}*(exp({exponent})-1)+{tissue.mu / 2!r}*(I1-3)"
         # Pressure model 3 is kappa / 4 (J^2 - 1 - 2 ln J), as here.
         parameters: dict[str, float | str] = {"k": tissue.kappa, "pressure_model": 3, "W": energy}
-        viscous = beta * tissue.viscous
-        return FebLaw(
-            "uncoupled trans-iso hyperelastic", parameters, "fiber", (viscous / 3, viscous / 2)
-        )
-    c = tissue.stiffness
-    bulk = float(c[:3, :3].sum()) / 9
-    viscosity = (beta * bulk, beta * tissue.G)
+        return FebLaw("uncoupled trans-iso hyperelastic", parameters, "fiber")
     if kind == "neo-hookean":
         names = {"Ep": tissue.E_p, "Ez": tissue.E_f, "vz": tissue.nu_fp, "vp": tissue.nu_pp,
                  "gz": tissue.G}  # fmt: skip
-        return FebLaw("neo-Hookean transiso", names, "mat_axis", viscosity)
+        return FebLaw("neo-Hookean transiso", names, "mat_axis")
     across = tissue.E_p / (2 * (1 + tissue.nu_pp))
     # v31 / E3 is the compliance that v13 / E1 is.
     names = {
@@ -97,4 +89,57 @@ def febio_law(
         "G12": tissue.G, "G23": across, "G31": tissue.G,
         "v12": tissue.nu_fp, "v23": tissue.nu_pp, "v31": tissue.nu_fp * tissue.E_p / tissue.E_f,
     }  # fmt: skip
-    return FebLaw("orthotropic elastic", names, "mat_axis", viscosity)
+    return FebLaw("orthotropic elastic", names, "mat_axis")
+
+
+class OrthotropicElastic:
+    """FEBio's ``orthotropic elastic`` as a law of this project: ``S = C : E``.
+
+    With it the two differ in element and contact alone. It knows no parameters.
+
+    Parameters
+    ----------
+    materials : sequence of TransverselyIsotropic
+        One per region.
+    """
+
+    kinds: tuple[str, ...] = ()
+
+    def __init__(self, materials: Sequence[TransverselyIsotropic]) -> None:
+        self._stiffness = np.array([m.stiffness for m in materials])
+
+    def strain(self, green: FloatArray) -> FloatArray:
+        """The Green-Lagrange strain itself."""
+        return green
+
+    def response(
+        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
+        c = self._stiffness[region]
+        tangent = np.repeat((1 + rate) * c[:, None], green.shape[1], axis=1)
+        return np.einsum("eij,eqj->eqi", c, (1 + rate) * green - rate * previous), tangent
+
+    def partial_stress(
+        self,
+        parameter: Parameter,
+        green: FloatArray,
+        region: IntArray,
+        previous: FloatArray,
+        rate: float,
+        *,
+        which: int,
+        stress: FloatArray,
+    ) -> FloatArray:
+        """InputError: there is no parameter."""
+        raise InputError(f"parameter {parameter.name!r}: this law has none")
+
+    def history_stress(
+        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
+    ) -> FloatArray:
+        """Change of the stress for a change of the previous strain."""
+        return -rate * np.einsum("eij,eqj->eqi", self._stiffness[region], d_previous)
+
+    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
+        """The change of the strain itself."""
+        return d_green

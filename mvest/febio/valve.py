@@ -46,7 +46,8 @@ class FebSettings:
     Attributes
     ----------
     law : str
-        Of the linear tissue: ``orthotropic`` or ``neo-hookean`` (:mod:`mvest.febio.laws`).
+        Of the linear tissue: ``neo-hookean``, which is nearer where the tissue is compressed and
+        keeps elements from turning over, or ``orthotropic`` (:mod:`mvest.febio.laws`).
     contact : str
         ``potential``: FEBio's contact potential between the atrial faces; ``sliding``: its
         ``sliding-elastic`` between the leaflets; ``none``.
@@ -58,24 +59,29 @@ class FebSettings:
     penalty : float
         Of sliding contact, on what FEBio works out.
     dynamic : bool
-        With inertia, and with damping by mass and by a viscous solid; otherwise static.
+        With inertia and damping by mass, to the end of the protocol; otherwise static, to the end
+        of its ramp.
+    density_factor : float
+        On the density of a dynamic run: heavier leaflets take larger steps of time, and come to
+        rest where lighter ones do.
     steps : int
         Time steps over the ramp to begin with; FEBio changes them.
     quasi_newton : int
-        BFGS updates between two tangents.
+        BFGS updates between two tangents; FEBio's tangent of ``neo-hookean`` is not exact.
     tolerance : float
         Of displacements, relative; that of the energy is its square.
     """
 
-    law: str = "orthotropic"
+    law: str = "neo-hookean"
     contact: str = "potential"
     contact_gap_mm: float = 0.6
     contact_reach_mm: float = 1.6
     penalty: float = 1.0
-    dynamic: bool = False
+    dynamic: bool = True
+    density_factor: float = 1000.0
     steps: int = 30
-    quasi_newton: int = 0
-    tolerance: float = 1e-4
+    quasi_newton: int = 10
+    tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
         if self.contact not in CONTACTS:
@@ -91,7 +97,7 @@ class FebSettings:
             raise InputError(
                 f"steps = {self.steps}, quasi_newton = {self.quasi_newton}; expected >= 1 and >= 0"
             )
-        for name in ("penalty", "tolerance"):
+        for name in ("penalty", "tolerance", "density_factor"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected > 0")
 
@@ -136,7 +142,7 @@ def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) ->
             end,
             step,
             1e-4 * step,
-            max(step, 0.1 * end),
+            step,
             settings.dynamic,
             settings.quasi_newton,
             settings.tolerance,
@@ -155,7 +161,7 @@ def valve_document(model: ClosureModel, m: FloatArray, settings: FebSettings) ->
             _chord_forces(system, tips, ends),
         ),
         _contact(mesh, model, settings),
-        mechanics.density,
+        mechanics.density * settings.density_factor,
         mechanics.damping.alpha,
         tuple(f"{part}: here {ours}; in this file {theirs}." for part, ours, theirs in
               differences(model, settings)),
@@ -196,14 +202,13 @@ def _law(
     mechanics: MechanicsSettings, values: dict[str, float], region: str, settings: FebSettings
 ) -> FebLaw:
     tissue = mechanics.tissue[region]
-    beta = values.get("damping", mechanics.damping.beta) if settings.dynamic else 0.0
     own = {
         kind: values[f"{kind}.{region}"] for kind in tissue.kinds if f"{kind}.{region}" in values
     }
     if tissue.law == "exponential":
-        return febio_law(tissue.coefficients(own), settings.law, beta)
+        return febio_law(tissue.coefficients(own), settings.law)
     moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
-    return febio_law(moduli.material, settings.law, beta)
+    return febio_law(moduli.material, settings.law)
 
 
 def _chord_forces(system: System, tips: FloatArray, ends: FloatArray) -> list[FloatArray]:
@@ -308,8 +313,8 @@ def differences(model: ClosureModel, settings: FebSettings) -> list[tuple[str, s
             f"implicit Euler with damping {damping.alpha:g} 1/s of mass and {damping.beta:g} s of "
             "the Biot strain's stiffness"
             + (", then an equilibrium" if mechanics.protocol.equilibrium else ""),
-            f"Newmark's rule (beta = gamma = 1), damping {damping.alpha:g} 1/s of mass, and a "
-            "Newtonian solid beside the tissue"
+            f"the generalised alpha rule (rho 0), density times {settings.density_factor:g}, "
+            f"damping {damping.alpha:g} 1/s of mass alone"
             if settings.dynamic
             else "a static equilibrium at each time",
         )

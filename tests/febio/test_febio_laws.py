@@ -85,14 +85,6 @@ def test_the_exponential_is_the_same_where_the_volume_is():
     np.testing.assert_allclose(stress_by_differences(energy, c), ours, rtol=1e-5, atol=1e-7)
 
 
-def test_damping_becomes_a_viscosity():
-    law = febio_law(A, beta=0.1)
-    assert law.viscosity[1] == pytest.approx(0.1 * A.G)
-    # Uniform volume change: stress C : I / 3 over the strain.
-    assert law.viscosity[0] == pytest.approx(0.1 * A.stiffness[:3, :3].sum() / 9)
-    assert febio_law(A).viscosity == (0.0, 0.0)
-
-
 def test_an_unknown_law_is_refused():
     with pytest.raises(InputError, match="orthotropic, neo-hookean"):
         febio_law(A, "mooney")

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
-from mvest.febio.laws import febio_law
+from mvest.febio.laws import OrthotropicElastic, febio_law
 from mvest.febio.mesh import febio_mesh
 from mvest.febio.program import febio_program, read_positions, run_febio
 from mvest.mechanics.body import simulate_body
@@ -26,31 +26,6 @@ def program():
         return febio_program()
     except ConfigurationError as error:
         pytest.skip(str(error))
-
-
-class GreenLaw:
-    """``S = C : E``: what FEBio's ``orthotropic elastic`` is."""
-
-    kinds = ()
-
-    def __init__(self, material):
-        self.stiffness = material.stiffness
-
-    def strain(self, green):
-        return green
-
-    def response(self, green, region, previous, rate):
-        tangent = np.broadcast_to((1 + rate) * self.stiffness, (*green.shape, 6)).copy()
-        return ((1 + rate) * green - rate * previous) @ self.stiffness, tangent
-
-    def partial_stress(self, parameter, green, region, previous, rate, *, which, stress):
-        raise InputError("no parameters")
-
-    def history_stress(self, green, region, d_previous, rate):
-        return -rate * d_previous @ self.stiffness
-
-    def strain_change(self, green, d_green):
-        return d_green
 
 
 def sheet(kind):
@@ -94,7 +69,7 @@ def theirs(mesh, fibre, rim, kind, folder):
 @pytest.mark.parametrize(("kind", "difference"), [("tet4", 1e-10), ("tet10", 2e-8)])
 def test_a_sheet_is_the_same_where_element_and_law_are(kind, difference, program, tmp_path):
     mesh, fibre, rim = sheet(kind)
-    law = GreenLaw(MATERIAL)
+    law = OrthotropicElastic([MATERIAL])
     assert isinstance(law, Law)
     here = ours(mesh, fibre, rim, law)
     there = theirs(mesh, fibre, rim, "orthotropic", tmp_path)

@@ -49,7 +49,9 @@ class FebioOptions:
         Bricks around the valve and along the leaflets.
     edge_length : float
         mm, of tetrahedra.
-    law, contact, contact_gap_mm, contact_reach_mm, penalty, dynamic, steps, quasi_newton, tolerance
+    law, contact, contact_gap_mm, contact_reach_mm, penalty
+        As in `mvest.febio.valve.FebSettings`.
+    dynamic, density_factor, steps, quasi_newton, tolerance
         As in `mvest.febio.valve.FebSettings`.
     """
 
@@ -63,15 +65,16 @@ class FebioOptions:
     columns: int = 24
     rows: int = 4
     edge_length: float = 2.5
-    law: str = "orthotropic"
+    law: str = "neo-hookean"
     contact: str = "potential"
     contact_gap_mm: float = 0.6
     contact_reach_mm: float = 1.6
     penalty: float = 1.0
-    dynamic: bool = False
+    dynamic: bool = True
+    density_factor: float = 1000.0
     steps: int = 30
-    quasi_newton: int = 0
-    tolerance: float = 1e-4
+    quasi_newton: int = 10
+    tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
         if self.mesh not in ("structured", "tetwild"):
@@ -88,6 +91,7 @@ class FebioOptions:
             self.contact_reach_mm,
             self.penalty,
             self.dynamic,
+            self.density_factor,
             self.steps,
             self.quasi_newton,
             self.tolerance,
