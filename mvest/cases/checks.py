@@ -23,7 +23,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_checks import check_surface
-from mvest.valve.geometry.triangles import area_vectors, surface_edges
+from mvest.valve.geometry.triangles import surface_edges
 
 __all__ = [
     "at",
@@ -194,10 +194,12 @@ def check_normals(
 ) -> None:
     """Raise unless the triangles face the ventricle.
 
-    The vector area of all triangles is that of the annulus less that of the smaller orifice, so its
-    side does not depend on how the leaflets lie.
+    The annulus runs as the triangles at it do, so its vector area has their side, however the
+    leaflets lie and however wide the orifice is. Edges within the surface are run along both ways.
     """
-    area = area_vectors(vertices, triangles).sum(axis=0)
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    start, end = np.moveaxis(vertices[edges[np.isin(edges, annulus).all(axis=1)]], 1, 0)
+    area = np.cross(start, end).sum(axis=0)
     towards = tips.mean(axis=0) - vertices[annulus].mean(axis=0)
     if area @ towards <= 0:
         raise GeometryError(
