@@ -12,5 +12,7 @@ from .scenario import Clip as Clip
 from .scenario import Scenario as Scenario
 from .scenario import model_under as model_under
 from .stress import PeakStress as PeakStress
+from .stress import contact_pressure as contact_pressure
+from .stress import nodal_stress as nodal_stress
 from .stress import peak_stress as peak_stress
 from .stress import principal_cauchy as principal_cauchy

@@ -17,7 +17,7 @@ from mvest.errors import InputError
 from mvest.mechanics.system import Parameter, System
 from mvest.typing import FloatArray
 
-__all__ = ["PeakStress", "peak_stress", "principal_cauchy"]
+__all__ = ["PeakStress", "contact_pressure", "nodal_stress", "peak_stress", "principal_cauchy"]
 
 _PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
 """Of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""
@@ -93,6 +93,40 @@ def peak_stress(
         own = mesh.region == number
         peaks[name] = _peaks(values[own].ravel(), solid.volumes[own].ravel())
     return peaks
+
+
+def nodal_stress(system: System, x: FloatArray) -> FloatArray:
+    """First principal Cauchy stress ``(n,)`` (MPa) at the nodes, means of their elements by volume.
+
+    Parameters
+    ----------
+    system : System
+        Set to its parameters.
+    x : ndarray
+        ``(n, 3)`` mm nodal positions.
+    """
+    solid = system.solid
+    state = solid.evaluate(x, solid.initial_strain(), 0.0)
+    values = principal_cauchy(state.green, state.stress)
+    weight = solid.volumes.sum(axis=1)
+    mean = (values * solid.volumes).sum(axis=1) / weight
+    nodes, count = solid.mesh.elements, solid.mesh.elements.shape[1]
+    total = np.bincount(nodes.ravel(), np.repeat(weight, count), len(x))
+    stress = np.bincount(nodes.ravel(), np.repeat(mean * weight, count), len(x))
+    return np.asarray(stress / np.maximum(total, np.finfo(float).tiny), dtype=np.float64)
+
+
+def contact_pressure(system: System, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where the midsurface is sampled for contact ``(k, 3)`` (mm, at rest), and the pressure there.
+
+    The pressure ``(k,)`` (MPa) is the force on a point over its area; empty without contact.
+    """
+    contact = system.contact
+    if contact is None:
+        return np.zeros((0, 3)), np.zeros(0)
+    y = contact.points(x)
+    force = np.linalg.norm(contact.forces(contact.search(y), y), axis=1)
+    return contact.rest, force / contact.areas
 
 
 def _peaks(values: FloatArray, volumes: FloatArray) -> PeakStress:

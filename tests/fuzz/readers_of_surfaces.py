@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 
 from mvest.cases.folder import read_case
+from mvest.cases.importing.slicerheart_folder import read_batch
 from mvest.cases.surface_files import read_regions
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.io.leaflet_surfaces import read_leaflets, read_surface, write_leaflets
@@ -170,6 +171,23 @@ def legacy_vtk(folder: Path, version: str, *, binary: bool) -> Path:
     return folder / "a.vtk"
 
 
+def slicerheart(folder: Path, damaged: str) -> Path:
+    """A folder of SlicerHeart with one phase, of which a file is damaged."""
+    for leaflet in ("anterior", "posterior"):
+        file = legacy_vtk(folder, "4.2", binary=False)
+        file.rename(folder / f"A_mitral_frame_1_MD_atrial_{leaflet}_leaflet.vtk")
+    points = [f"A,MD,1,mitral,{k}.25,-2.50,3.75,{'ALC' if k == 2 else ''}" for k in range(9)]
+    head = "AnnulusContourX,AnnulusContourY,AnnulusContourZ,AnnulusContourLabel"
+    (folder / "AnnulusContourPoints.csv").write_text(
+        f"Filename,Phase,FrameNumber,Valve,{head}\n" + "\n".join(points) + "\n"
+    )
+    (folder / "ValveLandmarkPoints.csv").write_text(
+        "Filename,Phase,Valve,FrameNumber,LandmarkLabel,LandmarkR,LandmarkA,LandmarkS\n"
+        "A,MD,mitral,1,A,1.00,2.00,3.00\nA,MD,mitral,1,PMC,-1.50,2.00,3.00\n"
+    )
+    return folder / damaged
+
+
 def leaflets(path: Path) -> Path:
     names = ("anterior", "posterior")
     fibre = np.tile([1.0, 0.0, 0.0], (5, 1))
@@ -219,6 +237,14 @@ READERS = (
             lambda folder, v=version, b=binary: legacy_vtk(folder, v, binary=b)
             for version in ("4.2", "5.1")
             for binary in (False, True)
+        ),
+    ),
+    Reader(
+        "slicerheart",
+        lambda path: read_batch(path.parent, None),
+        tuple(
+            lambda folder, name=name: slicerheart(folder, name)
+            for name in ("AnnulusContourPoints.csv", "ValveLandmarkPoints.csv")
         ),
     ),
     Reader(

@@ -1,6 +1,7 @@
 """Peak stress against stresses that are known by hand."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,15 @@ import pytest
 from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Parameter, System
-from mvest.scenarios.stress import _peaks, peak_stress, principal_cauchy
+from mvest.scenarios.stress import (
+    _peaks,
+    contact_pressure,
+    nodal_stress,
+    peak_stress,
+    principal_cauchy,
+)
 from tests.mechanics.bodies import MATERIALS, block, rotation
+from tests.mechanics.forces.test_contact import pair
 
 E, NU, STRAIN = 2.0, 0.3, 0.08
 SIZE = (4.0, 3.0, 2.0)
@@ -46,12 +54,25 @@ def test_a_box_under_a_uniform_load_carries_load_over_current_area(element_type)
     peak = peak_stress(system, x)["tissue"]
     for value in (peak.p95, peak.p99, peak.largest):
         assert value == pytest.approx(load / area, rel=1e-9)
+    assert nodal_stress(system, x) == pytest.approx(np.full(len(x), load / area), rel=1e-9)
     # The load is what the box's end carries: the internal forces of its nodes add up to it.
     state = system.solid.evaluate(x, system.solid.initial_strain(), 0.0)
     forces = np.zeros_like(x)
     np.add.at(forces, mesh.elements, system.solid.forces(state))
     end = mesh.nodes[:, 0] > SIZE[0] - 1e-9
     assert np.linalg.norm(forces[end].sum(axis=0)) == pytest.approx(load, rel=1e-9)
+
+
+def test_contact_pressure_is_force_over_area():
+    # The potential of the two points at 1.2 mm pushes both apart with the same force.
+    contact, pairs, y = pair(1.2)
+    system = SimpleNamespace(contact=contact)
+    rest, pressure = contact_pressure(system, y)
+    force = np.linalg.norm(contact.forces(pairs, y)[0])
+    assert pressure == pytest.approx([force / contact.areas[0], force / contact.areas[1], 0.0])
+    assert force > 0
+    assert np.array_equal(rest, contact.rest)
+    assert len(contact_pressure(SimpleNamespace(contact=None), y)[1]) == 0
 
 
 def test_percentiles_are_of_the_volume_and_not_of_points():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from experiments.common.anatomy import anatomy_of
 from experiments.common.build import closure_model
@@ -25,6 +26,7 @@ from mvest.closure.measures import measure_steps
 from mvest.closure.model import ClosureModel, ClosureResult
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.scenarios.measures import contact_reach
+from mvest.scenarios.stress import contact_pressure, nodal_stress
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.mesh.embedding import embed
@@ -59,15 +61,23 @@ def run_closure(job: Job[Settings]) -> Outcome[Findings]:
 def _write_fields(
     path: Path, model: ClosureModel, result: ClosureResult, normals: FloatArray
 ) -> None:
-    """What the picture shows of each stored step: thick leaflets, chordae and papillary tips."""
+    """Each stored step: thick leaflets with stress and contact pressure (MPa), chordae, tips."""
     valve, simulation = model.valve, result.simulation
     surface = thicken(valve.surface, normals)
     faces = embed(model.mesh, surface.vertices)
     loading = boundary_loading(result.system, valve, model.contact_valve, model.settings)
     cables = result.system.cables
     assert cables is not None
+    system = result.system
+    pressed = [contact_pressure(system, x) for x in simulation.frames]
+    # The samples are finer than the surface, whose two faces lie over the same ones.
+    at_face = np.tile(cKDTree(pressed[0][0]).query(valve.surface.vertices)[1], 2)
     np.savez_compressed(
         path,
+        stress=np.stack([faces(nodal_stress(system, x)) for x in simulation.frames]).astype(
+            np.float32
+        ),
+        contact_pressure=np.stack([values[at_face] for _, values in pressed]).astype(np.float32),
         frames=np.stack([faces(x) for x in simulation.frames]).astype(np.float32),
         times=simulation.times,
         triangles=surface.triangles.astype(np.int32),

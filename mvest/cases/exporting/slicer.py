@@ -20,6 +20,8 @@ from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing.slicer import segment_name, write_segmentation
 from mvest.imaging.writing.voxels import voxelise_leaflets
+from mvest.reading.bounded import refusing
+from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.stretch import principal_stretches
@@ -65,7 +67,9 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     were seen; of a run also ``fitted`` and ``generic``, with displacement, stretches against the
     open valve, and distance from what was seen, as far as the run stored it. Of each frame there
     are ``NAME.seg.nrrd`` with the segments mitral_anterior_leaflet and mitral_posterior_leaflet,
-    and ``NAME.mrk.json`` with SlicerHeart's labels, the annulus and the papillary tips.
+    and ``NAME.mrk.json`` with SlicerHeart's labels, the annulus and the papillary tips. Of a
+    closure (``experiment=closure``) it is ``closing``: thick leaflets at every stored time, with
+    first principal stress and contact pressure.
 
     Parameters
     ----------
@@ -85,6 +89,8 @@ def export_slicer(source: Path, target: Path, options: SlicerOptions) -> Path:
     if (source / CASE_FILE).is_file():
         case = read_case(source)
         return write_atomically(target, lambda part: _write_case(part, case, options))
+    if (source / FIELDS).is_file() and "times" in read_npz(source / FIELDS):
+        return write_atomically(target, lambda part: _write_closing(part, source / FIELDS))
     if (source / FIELDS).is_file():
         fields = read_case_fields(source / FIELDS, turned=False)
         return write_atomically(target, lambda part: _write_run(part, fields, options))
@@ -156,6 +162,25 @@ def _write_run(folder: Path, fields: CaseFields, options: SlicerOptions) -> None
         _write_voxels(
             stem, shape, fields.triangles, fields.region, thickness, names, options.voxel_mm
         )
+
+
+def _write_closing(folder: Path, file: Path) -> None:
+    """The thick leaflets of a closure over time, with stress and contact pressure."""
+    folder.mkdir()
+    with refusing(file, "fields of a closure"):
+        arrays = read_npz(file)
+        shapes = np.asarray(arrays["frames"], dtype=np.float64)
+        triangles = np.asarray(arrays["triangles"], dtype=np.int64)
+        region = np.asarray(arrays["region"], dtype=np.int64)
+        states = []
+        for k, points in enumerate(shapes):
+            data = {"displacement_mm": points - shapes[0]}
+            for name in ("stress", "contact_pressure"):
+                if name in arrays:
+                    data[f"{name}_MPa"] = np.asarray(arrays[name][k], dtype=np.float64)
+            cells = region_arrays(region, REGIONS[: int(region.max()) + 1])
+            states.append(SurfaceFile(points, triangles, dict(data), cells))
+        write_surface_series(folder / "closing.pvd", arrays["times"].tolist(), states)
 
 
 def _against(

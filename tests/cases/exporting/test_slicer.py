@@ -13,6 +13,7 @@ from mvest.cases.exporting.slicer import SlicerOptions, export_slicer
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.valve.geometry.stretch import principal_stretches
+from mvest.valve.geometry.thickening import thicken
 from tests.cases.folders import template_case
 
 vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
@@ -152,6 +153,30 @@ def test_a_run_is_written_with_its_distances(tmp_path):
     assert last["stretch_largest"].max() == pytest.approx(1.2, abs=1e-3)
     assert (out / "open.seg.nrrd").is_file()
     assert (out / "closed.mrk.json").is_file()
+
+
+def test_a_closure_is_written_with_stress_and_contact_pressure(tmp_path):
+    surface = thicken(CASE.surface)
+    times = np.array([0.0, 0.02, 0.05])
+    frames = surface.vertices + np.array([0.0, 1.0, 2.0])[:, None, None] * [0, 0, 1]
+    stress = np.outer(times, np.ones(len(surface.vertices)))
+    (tmp_path / "run").mkdir()
+    np.savez(
+        tmp_path / "run" / "fields.npz",
+        times=times,
+        frames=frames,
+        triangles=surface.triangles,
+        region=surface.region,
+        stress=stress,
+        contact_pressure=2 * stress,
+    )
+    out = export_slicer(tmp_path / "run", tmp_path / "out", SlicerOptions())
+    entries = ET.parse(out / "closing.pvd").findall("Collection/DataSet")
+    assert [float(entry.get("timestep")) for entry in entries] == times.tolist()
+    last = arrays_of(read(out / "closing_0002.vtp").GetPointData())
+    assert (last["stress_MPa"] == 0.05).all()
+    assert (last["contact_pressure_MPa"] == 0.1).all()
+    assert last["displacement_mm"] == pytest.approx(np.full_like(frames[0], 2.0) * [0, 0, 1])
 
 
 def test_stretches_are_those_of_a_known_deformation():
