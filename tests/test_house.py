@@ -132,6 +132,7 @@ IMPORT_NAME = {
     "pillow": ("PIL",),
     "pynrrd": ("nrrd",),
     "pyyaml": ("yaml",),
+    "scikit-image": ("skimage",),
     "scikit-fem": ("skfem",),
     "simpleitk": ("SimpleITK",),
 }

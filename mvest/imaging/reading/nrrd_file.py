@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, Stated
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray
 
-__all__ = ["MODALITY_KEY", "read_nrrd"]
+__all__ = ["MODALITY_KEY", "Segment", "read_nrrd", "segment_names"]
 
 NAMES = FieldNames("sizes", "space directions", "space directions", "space origin", "data")
 MODALITY_KEY = "mvest.modality"
@@ -62,8 +63,12 @@ KINDS_OF_FRAMES = ("list", "time", "range", "domain", *UNSTATED)
 SYNONYMS = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}
 
 
-def read_nrrd(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
+def read_nrrd(
+    path: Path, max_bytes: int, *, labels: bool = False
+) -> tuple[StatedVolume, tuple[Path, ...]]:
     """Read a NRRD file of three or four axes, with the files that it consists of.
+
+    Files whose voxels are labels are refused unless `labels` are wanted.
 
     Raises
     ------
@@ -79,10 +84,57 @@ def read_nrrd(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...
     dtype = _voxel_type(header)
     check_size(path, "sizes", [frames, *of_space], dtype.itemsize, max_bytes)
     times = StatedTimes(None, "", "dimension") if axis is None else _times(header, axis, frames)
-    modality = _modality(header)
+    modality = _modality(header, labels)
     voxels, files = _voxels(header, dtype, sizes)
     voxels = voxels[np.newaxis] if axis is None else np.moveaxis(voxels, axis, 0)
     return StatedVolume(voxels, steps, origin, times, modality, NAMES), files
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A segment of a ``.seg.nrrd`` file, as 3D Slicer writes it.
+
+    Attributes
+    ----------
+    name, tags : str
+    label : int
+        Value of its voxels.
+    layer : int
+        Number of the frame that holds them.
+    """
+
+    name: str
+    tags: str
+    label: int
+    layer: int
+
+
+def segment_names(path: Path) -> tuple[Segment, ...]:
+    """The segments that a file names (keys ``SegmentN_Name`` and so on); none of other formats.
+
+    Raises
+    ------
+    InputError
+        A damaged header, or a label or layer that is no whole number.
+    """
+    with path.open("rb") as file:
+        if file.read(4) != b"NRRD":
+            return ()
+    fields = _header(path).fields
+    segments = []
+    for key in fields:
+        if not (match := re.fullmatch(r"Segment(\d{1,4})_Name", key)):
+            continue
+        number = {}
+        for field, missing in (("LabelValue", str(int(match[1]) + 1)), ("Layer", "0")):
+            full = f"Segment{match[1]}_{field}"
+            value = str(fields.get(full, missing))
+            if not re.fullmatch(r"\d{1,6}", value, re.ASCII):
+                raise fault(path, full, repr(value), "a whole number")
+            number[field] = int(value)
+        tags = str(fields.get(f"Segment{match[1]}_Tags", ""))
+        segments.append(Segment(str(fields[key]), tags, number["LabelValue"], number["Layer"]))
+    return tuple(segments)
 
 
 def _header(path: Path) -> Header:
@@ -226,9 +278,11 @@ def _numbers(path: Path, field: str, words: list[str]) -> FloatArray:
         raise fault(path, field, error, "numbers") from error
 
 
-def _modality(header: Header) -> Modality | None:
-    """What the voxels are, if the file says; they must not be labels."""
+def _modality(header: Header, labels: bool) -> Modality | None:
+    """What the voxels are, if the file says; they must not be labels unless these are wanted."""
     path, fields = header.path, header.fields
+    if labels:
+        return None
     node = fields.get("DataNodeClassName", "vtkMRMLScalarVolumeNode")
     if node != "vtkMRMLScalarVolumeNode":
         raise fault(path, "DataNodeClassName", repr(node), "vtkMRMLScalarVolumeNode")

@@ -29,6 +29,7 @@ def read_volume(
     frame_interval_s: float | None = None,
     time_unit: str | None = None,
     max_bytes: int = MAX_BYTES,
+    labels: bool = False,
 ) -> VolumeSequence:
     """Read a volume over time; what the file is, its content says, not its name.
 
@@ -49,6 +50,8 @@ def read_volume(
         ``"s"`` or ``"ms"``, for files that state times without a unit.
     max_bytes
         Of all frames, decoded; reading them takes up to three times as much memory for a while.
+    labels
+        Whether the voxels are wanted as labels: a segmentation is no image and refused otherwise.
 
     Raises
     ------
@@ -72,17 +75,17 @@ def read_volume(
         raise InputError(f"{source}: no such file")
     # What overflows is refused with the numbers that are no finite ones.
     with np.errstate(all="ignore"), refusing(source, "volume"):
-        stated, files = _stated(source, max_bytes)
+        stated, files = _stated(source, max_bytes, labels)
         sha256 = _sha256(files)
         return checked_sequence(source, stated, sha256, modality, frame_interval_s, time_unit)
 
 
-def _stated(path: Path, max_bytes: int) -> tuple[StatedVolume, tuple[Path, ...]]:
+def _stated(path: Path, max_bytes: int, labels: bool) -> tuple[StatedVolume, tuple[Path, ...]]:
     """What the file states, and the files that it consists of."""
     with path.open("rb") as file:
         head = file.read(1024)
     if head.startswith(b"NRRD"):
-        return read_nrrd(path, max_bytes)
+        return read_nrrd(path, max_bytes, labels=labels)
     if is_nifti(path):
         return read_nifti(path, max_bytes)
     if is_dicom(head):

@@ -1,0 +1,365 @@
+"""Two thick leaflets on a grid, as signed distances, and the closed surface that both have.
+
+Where two leaflets meet they are either one piece of tissue, at a commissure, or only in contact,
+and a segmentation shows both alike. In an open valve they meet at the commissures alone, and how
+far down from the annulus they do is a length that a valve keeps. So in a closed one they are cut
+apart wherever they meet farther from the annulus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.special import erf
+from skimage import measure
+
+from mvest.errors import GeometryError
+from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.anatomy.valve import vertex_normals
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.triangles import surface_edges
+
+__all__ = [
+    "LeafletFields",
+    "ThickLeaflets",
+    "fields_of_masks",
+    "inside_surfaces",
+    "thick_leaflets",
+]
+
+# skimage states no types.
+marching_cubes: Any = measure.marching_cubes
+MARGIN_MM = 3.0
+STEP_MM = 0.4
+"""mm, of the grid on which a surface is drawn."""
+CUT_STEPS = 2.0
+"""Width of the cut between leaflets in contact, in steps of the grid; closed again afterwards."""
+CUT_REACH_MM = 2.0
+"""From where leaflets meet, how far the cut between them goes on."""
+LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
+"""Of a voxel, by which leaflets are made thicker until they have no more holes than an orifice."""
+ON_GRID = 0.02
+"""Of a step: the least distance that a point of the grid has from the surface."""
+MAX_VOXELS = 4 * 10**7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeafletFields:
+    """Signed distances to the leaflets, positive inside, on a grid.
+
+    Attributes
+    ----------
+    distance : (2, I, J, K) mm
+        To the anterior and to the posterior leaflet alone.
+    union : (I, J, K) mm
+        To both together.
+    step : float
+        mm between neighbouring points of the grid.
+    blur_mm : float
+        Standard deviation of the smoothing that the distances went through.
+    voxel_mm : float
+        Size of the voxels that they come from, 0 for surfaces.
+    """
+
+    distance: FloatArray
+    union: FloatArray
+    step: float
+    blur_mm: float
+    voxel_mm: float
+
+    def between(self, points: FloatArray) -> FloatArray:
+        """Signed distance ``(k,)`` mm from where the leaflets meet, positive in the anterior one.
+
+        Points ``(k, 3)`` are mm from the first point of the grid.
+        """
+        half = 0.5 * (self.distance[0] - self.distance[1])
+        at = (points / self.step).T
+        return np.asarray(ndimage.map_coordinates(half, at, order=1, mode="nearest"))
+
+    def label(self, points: FloatArray) -> IntArray:
+        """The nearer leaflet ``(k,)`` of points ``(k, 3)`` mm, 0 anterior and 1 posterior."""
+        return (self.between(points) < 0).astype(np.int64)
+
+    def true_thickness(self, thickness: FloatArray) -> FloatArray:
+        """What tissue of a thickness seen in the smoothed distances has.
+
+        The distance ``a - |x|`` from the middle of a sheet of thickness 2 a, smoothed by a normal
+        distribution, is zero where the mean of ``|x + blur z|`` is a.
+        """
+        if self.blur_mm == 0:
+            return thickness
+        x = 0.5 * thickness
+        ratio = x / (np.sqrt(2) * self.blur_mm)
+        mean = x * erf(ratio) + self.blur_mm * np.sqrt(2 / np.pi) * np.exp(-(ratio**2))
+        return np.asarray(2 * mean)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThickLeaflets:
+    """The closed surface of two leaflets.
+
+    Attributes
+    ----------
+    vertices, triangles
+        ``(n, 3)`` mm from the first point of the grid, and ``(m, 3)``.
+    seams : (2,) mm
+        How far down from the annulus the leaflets are one piece, on the side of each tip.
+    contact_mm2 : float
+        Area over which the leaflets were cut apart.
+    grown_mm : float
+        By which all walls lie too far out, since the leaflets had holes otherwise.
+    pieces : int
+        Loose pieces that were left out.
+    """
+
+    vertices: FloatArray
+    triangles: IntArray
+    seams: FloatArray
+    contact_mm2: float
+    grown_mm: float
+    pieces: int
+
+
+def fields_of_masks(
+    masks: tuple[BoolArray, BoolArray], spacing: FloatArray, blur: float
+) -> tuple[LeafletFields, FloatArray]:
+    """Signed distances to two sets of voxels.
+
+    Parameters
+    ----------
+    masks
+        ``(I, J, K)`` each, the voxels of the anterior and of the posterior leaflet.
+    spacing
+        ``(3,)`` mm.
+    blur
+        Standard deviation of the smoothing in voxels.
+
+    Returns
+    -------
+    LeafletFields
+        On a finer grid about the leaflets.
+    ndarray
+        ``(3,)`` where its first point lies, in voxels.
+
+    Raises
+    ------
+    GeometryError
+        A leaflet without voxels, or leaflets too large for the grid.
+    """
+    for name, mask in zip(("anterior", "posterior"), masks, strict=True):
+        if not mask.any():
+            raise GeometryError(f"no voxel of the {name} leaflet")
+    voxel = float(np.prod(spacing) ** (1 / 3))
+    both = masks[0] | masks[1]
+    box = ndimage.find_objects(both.astype(np.int8))[0]
+    pad = np.ceil(MARGIN_MM / spacing).astype(int)
+    low = np.array([part.start for part in box]) - pad
+    high = np.array([part.stop for part in box]) + pad
+    step = min(STEP_MM, voxel)
+    shape = np.ceil((high - 1 - low) * spacing / step).astype(int) + 1
+    if np.prod(shape.astype(float)) > MAX_VOXELS:
+        size = " x ".join(f"{extent:.0f}" for extent in (high - low) * spacing)
+        raise GeometryError(f"leaflets of {size} mm, expected those of one valve alone")
+    at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")) * step
+    at /= spacing[:, None, None, None]
+
+    def distance(mask: BoolArray) -> FloatArray:
+        part = np.zeros(high - low, dtype=np.bool_)
+        inside = tuple(
+            slice(b.start - start, b.stop - start) for b, start in zip(box, low, strict=True)
+        )
+        part[inside] = mask[box]
+        inner = ndimage.distance_transform_edt(part, sampling=spacing)
+        outer = ndimage.distance_transform_edt(~part, sampling=spacing)
+        # From a centre to the wall of its voxel it is half a voxel less than to the next centre.
+        signed = np.where(part, inner - 0.5 * voxel, 0.5 * voxel - outer)
+        fine = ndimage.map_coordinates(signed, at, order=1, mode="nearest")
+        return np.asarray(ndimage.gaussian_filter(fine, blur * voxel / step))
+
+    fields = LeafletFields(
+        np.stack([distance(mask) for mask in masks]),
+        distance(both),
+        step,
+        blur * voxel,
+        voxel,
+    )
+    return fields, low.astype(np.float64)
+
+
+def inside_surfaces(
+    surfaces: Sequence[tuple[FloatArray, IntArray]], step_mm: float
+) -> tuple[list[BoolArray], FloatArray]:
+    """Which points of one grid lie inside each of some closed surfaces.
+
+    Near a surface the side follows from its normal at the closest point; what that encloses is
+    inside, too.
+
+    Parameters
+    ----------
+    surfaces
+        Vertices ``(n, 3)`` mm and triangles ``(m, 3)``, normals outwards.
+    step_mm
+        Between neighbouring points.
+
+    Returns
+    -------
+    masks
+        ``(I, J, K)`` for each surface.
+    origin
+        ``(3,)`` mm, the first point.
+    """
+    points = np.concatenate([vertices for vertices, _ in surfaces])
+    low = points.min(axis=0) - MARGIN_MM
+    shape = np.ceil((points.max(axis=0) + MARGIN_MM - low) / step_mm).astype(int) + 1
+    if np.prod(shape.astype(float)) > MAX_VOXELS:
+        size = " x ".join(f"{extent:.0f}" for extent in np.ptp(points, axis=0))
+        raise GeometryError(f"leaflets of {size} mm, expected those of one valve, in mm")
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
+    grid = grid.reshape(-1, 3) * step_mm + low
+    masks = []
+    for vertices, triangles in surfaces:
+        corner = vertices[triangles]
+        longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
+        near, _ = cKDTree(vertices).query(grid, distance_upper_bound=longest + 2 * step_mm)
+        close = np.flatnonzero(np.isfinite(near))
+        nearest = closest_points(grid[close], vertices, triangles)
+        foot = nearest.interpolate(vertices, triangles)
+        normal = nearest.interpolate(vertex_normals(vertices, triangles), triangles)
+        inside = np.zeros(len(grid), dtype=np.bool_)
+        inside[close] = np.einsum("ij,ij->i", grid[close] - foot, normal) < 0
+        masks.append(np.asarray(ndimage.binary_fill_holes(inside.reshape(shape))))
+    return masks, low
+
+
+def thick_leaflets(
+    fields: LeafletFields, tips: FloatArray, seams: FloatArray | None = None
+) -> ThickLeaflets:
+    """The surface of both leaflets, one piece at the commissures and cut apart in contact.
+
+    Parameters
+    ----------
+    fields
+    tips
+        ``(2, 3)`` papillary tips, mm from the first point of the grid.
+    seams
+        ``(2,)`` mm, how far down from the annulus the leaflets are one piece, on the side of each
+        tip, such as `ThickLeaflets.seams` of an open valve. Without it, wherever they meet.
+
+    Raises
+    ------
+    GeometryError
+        The leaflets do not meet, or have no orifice or more holes, whichever way they are drawn.
+    """
+    meet, half = _meet(fields)
+    if not meet.any():
+        raise GeometryError("the leaflets meet nowhere, expected at two commissures")
+    contact, lengths = _contact(fields, meet, tips, seams)
+    cut = 0.5 * CUT_STEPS * fields.step
+    said = ""
+    for level in LEVELS:
+        grown = level * fields.voxel_mm
+        together = fields.union + grown
+        if contact.any():
+            together = np.where(contact, np.minimum(together, np.abs(half) - cut), together)
+        # No corner at a point of the grid, where triangles would have no area.
+        close = np.abs(together) < ON_GRID * fields.step
+        together = np.where(close, np.copysign(ON_GRID * fields.step, together), together)
+        vertices, faces, _, _ = marching_cubes(together, 0.0, spacing=(fields.step,) * 3)
+        triangles = faces.astype(np.int64)[:, ::-1]
+        vertices, triangles, pieces = _largest(vertices.astype(np.float64), triangles)
+        euler = len(vertices) - len(surface_edges(triangles)) + len(triangles)
+        if euler == 0:
+            break
+        said = said or f"Euler number {euler}"
+    else:
+        raise GeometryError(
+            f"leaflets with {said}, expected 0, one orifice: fill the holes of the leaflets, join "
+            "them at the commissures, and part them elsewhere where they are open"
+        )
+    area = 0.0
+    if contact.any():
+        vertices, area = _closed_again(fields, vertices, contact, half, cut)
+    return ThickLeaflets(vertices, triangles, lengths, area, grown, pieces)
+
+
+def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:
+    """Points of the grid where the leaflets meet, and half the difference of their distances."""
+    half = 0.5 * (fields.distance[0] - fields.distance[1])
+    near = np.minimum(*fields.distance) > -fields.voxel_mm - fields.step
+    return (np.abs(half) <= fields.step) & (fields.union > 0) & near, half
+
+
+def _contact(
+    fields: LeafletFields, meet: BoolArray, tips: FloatArray, seams: FloatArray | None
+) -> tuple[BoolArray, FloatArray]:
+    """Points of the grid near to where leaflets are in contact, and the lengths of both seams.
+
+    A seam begins where the leaflets meet farthest up and out to the side of its papillary tip.
+    """
+    where = np.argwhere(meet) * fields.step
+    tissue = np.argwhere(fields.union > 0).mean(axis=0) * fields.step
+    up = tissue - tips.mean(axis=0)
+    up /= np.linalg.norm(up)
+    side = tips[0] - tips[1]
+    side -= (side @ up) * up
+    side /= np.linalg.norm(side)
+    far = np.full(len(where), np.inf)
+    lengths = np.zeros(2)
+    outward = (where - where.mean(axis=0)) @ side
+    for k, sign in enumerate((1.0, -1.0)):
+        beginning = where[np.argmax(where @ up + sign * outward)]
+        distance = np.linalg.norm(where - beginning, axis=1)
+        own = sign * outward > 0
+        if not own.any():
+            raise GeometryError("the leaflets meet on one side alone, expected at two commissures")
+        lengths[k] = distance[own].max() if seams is None else seams[k]
+        far = np.where(own, distance - lengths[k], far)
+    touching = np.zeros(meet.shape, dtype=np.bool_)
+    touching[meet] = far > 0
+    if not touching.any():
+        return touching, lengths
+    away, nearest = ndimage.distance_transform_edt(~meet, return_indices=True)
+    return touching[tuple(nearest)] & (away * fields.step <= CUT_REACH_MM), lengths
+
+
+def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
+    edges = surface_edges(triangles)
+    n = len(vertices)
+    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
+    pieces, piece = connected_components(graph, directed=False)
+    kept = np.bincount(piece).argmax()
+    used, inverse = np.unique(triangles[piece[triangles[:, 0]] == kept], return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3), int(pieces) - 1
+
+
+def _closed_again(
+    fields: LeafletFields,
+    vertices: FloatArray,
+    contact: NDArray[np.bool_],
+    half: FloatArray,
+    cut: float,
+) -> tuple[FloatArray, float]:
+    """Vertices on both faces of a cut moved to its middle, and the area of the cut in mm²."""
+    at = (vertices / fields.step).T
+    value = ndimage.map_coordinates(half, at, order=1)
+    inside = ndimage.map_coordinates(contact.astype(np.float64), at, order=1) > 0.5
+    face = inside & (np.abs(np.abs(value) - cut) < 0.5 * fields.step)
+    gradient = np.stack(
+        [
+            ndimage.map_coordinates(np.gradient(half, fields.step, axis=k), at[:, face], order=1)
+            for k in range(3)
+        ],
+        axis=1,
+    )
+    squared = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25)
+    moved = vertices.copy()
+    moved[face] -= (value[face] / squared)[:, None] * gradient
+    return moved, float(contact[np.abs(half) <= 0.5 * fields.step].sum()) * fields.step**2
