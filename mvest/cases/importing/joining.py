@@ -38,6 +38,8 @@ CORNER, SETTLED, DENSE = 3.0, 0.15, 0.2
 way; spacing of the points among which the nearest is taken."""
 OPENING = 0.4
 """mm more than at the corner, from which on two boundaries are free edges that part."""
+RIM_ROUNDS = 2
+"""Of smoothing an edge: over one of its triangles' edges."""
 MAX_SEAM = 0.25
 """Of a free edge, from commissure to commissure: how far it may run beside the other one."""
 
@@ -339,9 +341,26 @@ def drawn_anew(
     grid = band_grid(columns, 1 + max(4, round(along / edge_mm)))
     # The grid's angle runs against that of the chart; both have the anterior leaflet in 0 to 180.
     vertices = chart.position(np.mod(180.0 - grid.phi, 360.0), grid.s)
+    vertices = _smooth_rims(vertices.reshape(-1, columns, 3)).reshape(-1, 3)
     between = np.mod(grid.phi, 180.0) == 0
     by = np.where(between, sum(offset_mm) / 2, np.where(grid.phi < 180, *offset_mm))
     if any(offset_mm):
         normals = smooth_vertex_normals(vertices, grid.triangles)
         vertices = vertices + by[:, None] * normals
     return RegionSurface(vertices, grid.triangles, grid.region, {})
+
+
+def _smooth_rims(rows: FloatArray) -> FloatArray:
+    """Rows ``(r, k, 3)`` with the first and the last curve smoothed, and those beside them less.
+
+    Where a surface was clipped its edge is as rough as its triangles, and where the free edges
+    part it has a kink that no leaflet of that thickness has.
+    """
+    result = rows.copy()
+    for end, inwards in ((0, 1), (len(rows) - 1, -1)):
+        curve = rows[end]
+        for _ in range(RIM_ROUNDS):
+            curve = 0.5 * curve + 0.25 * (np.roll(curve, 1, axis=0) + np.roll(curve, -1, axis=0))
+        for k in range(min(3, len(rows) // 2)):
+            result[end + inwards * k] += (1 - k / 3) * (curve - rows[end])
+    return result

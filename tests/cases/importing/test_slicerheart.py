@@ -11,6 +11,8 @@ from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerh
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.mesh.given import GivenValve
 from tests.cases.folders import template_case
 
 pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")
@@ -60,6 +62,12 @@ def test_both_phases_are_the_true_midsurfaces(case):
     assert case.frame(Role.REFERENCE).papillary_tips == pytest.approx(
         in_lps(tips[np.argsort(tips[:, 0])]), abs=1e-6
     )
+
+
+def test_the_valve_can_be_thickened_wherever_it_is_sampled(case):
+    # Where the free edges part a kink would make the thick leaflets pass through themselves.
+    given = GivenValve(case.valve)
+    thicken(given.valve(80, 21).surface, given.normals(80, 21))
 
 
 def test_leaflets_keep_their_names_and_areas(case):
