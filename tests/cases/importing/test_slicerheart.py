@@ -12,6 +12,7 @@ from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.thickening import thicken
+from mvest.valve.geometry.triangles import areas
 from mvest.valve.mesh.given import GivenValve
 from tests.cases.folders import template_case
 
@@ -108,6 +109,9 @@ def test_leaflets_cut_out_of_a_segmentation_come_within_half_a_voxel(tmp_path):
         back = closest_points(in_lps(true.vertices), frame.vertices, frame.triangles).distance
         assert np.sqrt(np.mean(back**2)) < 0.25
         assert np.quantile(away(frame, true), 0.9) < 0.5
+        # Half of each rim is on the side that was cut out, and would add a twelfth.
+        area = [areas(f.vertices, f.triangles).sum() for f in (frame, true)]
+        assert area[0] == pytest.approx(area[1], rel=0.05)
 
 
 def test_one_phase_is_an_anatomy(folder):
