@@ -8,9 +8,18 @@ import yaml
 
 from mvest.cases.folder import read_case
 from mvest.cases.importing.slicerheart_folder import read_batch
+from mvest.cases.importing.solid import SolidOptions, import_solid
 from mvest.cases.surface_files import read_regions
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.io.leaflet_surfaces import read_leaflets, read_surface, write_leaflets
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.io.leaflet_surfaces import (
+    read_leaflets,
+    read_surface,
+    write_leaflets,
+    write_surface,
+)
 from mvest.valve.io.solid_meshes import read_solid, write_solid
 from tests.cases.folders import plain_folder
 from tests.fuzz.trial import Reader
@@ -208,7 +217,19 @@ def case(folder: Path) -> Path:
     return folder / "open.vtp"
 
 
+def thick(folder: Path) -> Path:
+    surface = thicken(Template(TemplateParameters()).valve(24, 6).surface)
+    write_surface(folder / "a.stl", surface.vertices, surface.triangles)
+    return folder / "a.stl"
+
+
+def thick_leaflets(path: Path) -> object:
+    tips = (-16.0, -0.24, -25.0, 16.0, -0.24, -25.0)
+    return import_solid(path, SolidOptions(units="mm", tips=tips, edge_mm=4.0))
+
+
 READERS = (
+    Reader("import.solid", thick_leaflets, (thick,)),
     Reader("case.surface", lambda path: read_case(path.parent), (case,)),
     Reader("surface.stl", read_surface, (text_stl, binary_stl)),
     Reader("surface.stl-merged", lambda path: read_regions(path, {1: "both"}), (text_stl,)),

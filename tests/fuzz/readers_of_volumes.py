@@ -7,7 +7,10 @@ import nibabel
 import numpy as np
 import SimpleITK
 
+from mvest.cases.importing.labels import LabelsOptions, import_labels
+from mvest.errors import GeometryError
 from mvest.imaging.markups import read_fcsv, read_markups
+from mvest.imaging.reading.nrrd_file import segment_names
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality
 from tests.fuzz.trial import Reader
@@ -112,7 +115,35 @@ def markups(folder: Path) -> Path:
     return path
 
 
+def seg_nrrd(folder: Path) -> Path:
+    """Two leaflets as 3D Slicer names its segments."""
+    fields = nrrd_fields(0) | {
+        "Segment0_Name=": "mitral_anterior_leaflet",
+        "Segment0_LabelValue=": "1",
+        "Segment0_Layer=": "0",
+        "Segment0_Tags=": "TerminologyEntry:a~sh-leaflet-mv-a~b|",
+        "Segment1_Name=": "mitral_posterior_leaflet",
+        "Segment1_LabelValue=": "2",
+    }
+    return v.write_nrrd(folder / "a.seg.nrrd", fields, nrrd_voxels(0))
+
+
+def segmentation(path: Path) -> object:
+    volume = read_volume(path, modality=Modality.CT, labels=True)
+    return volume, segment_names(path)
+
+
+def label_map(path: Path) -> object:
+    """Labels of leaflets: none of the made-up voxels is a valve, so that a map is refused."""
+    try:
+        return import_labels(path, LabelsOptions(tips=(0.0, 9.0, -20.0, 0.0, -9.0, -20.0)))
+    except GeometryError as fault:
+        return fault
+
+
 READERS = (
+    Reader("volume.segmentation", segmentation, (seg_nrrd,)),
+    Reader("import.labels", label_map, (seg_nrrd,)),
     Reader("volume.nrrd", any_volume, (nrrd, nrrd_gzip, nrrd_detached)),
     Reader("volume.nrrd-data", lambda path: any_volume(path.parent / "a.nhdr"), (nrrd_data_file,)),
     Reader(

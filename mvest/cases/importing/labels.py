@@ -22,6 +22,7 @@ from mvest.errors import InputError, MvestError
 from mvest.imaging.reading.nrrd_file import segment_names
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import fields_of_masks, thick_leaflets
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
@@ -32,8 +33,6 @@ TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
 """Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
 PLAIN = {"anterior": 1, "posterior": 2}
 """Labels of a map that names none."""
-FRAME_S = 1.0
-"""s between frames of a file that states none; only their numbers are used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +132,7 @@ def import_labels(source: Path, options: LabelsOptions) -> ValveCase:
     if options.seam_mm is not None:
         seams = np.array(options.seam_mm, dtype=np.float64)
     for path, frame, role, own in maps:
-        volume = read_volume(path, modality=Modality.CT, frame_interval_s=FRAME_S, labels=True)
+        volume = read_volume(path, modality=Modality.CT, labels=True)
         masks = _masks(path, volume, frame, options, derived)
         try:
             surface, seams = _surface(volume, masks, own, seams, options, derived)
@@ -171,13 +170,15 @@ def _masks(
             if not chosen and given is None:
                 chosen = [s for s in segments if region in s.name.lower()]
             if len(chosen) != 1:
-                names = ", ".join(s.name for s in segments) or "none"
+                names = one_line(", ".join(s.name for s in segments) or "none", 80)
                 raise InputError(
-                    f"{path}: {len(chosen)} segments of the {region} leaflet among {names[:80]}; "
+                    f"{path}: {len(chosen)} segments of the {region} leaflet among {names}; "
                     f"give {region}=NAME or its number"
                 )
             label, layer = chosen[0].label, chosen[0].layer or frame
-            derived.append(f"{region} leaflet: segment {chosen[0].name}, label {label}")
+            derived.append(
+                f"{region} leaflet: segment {one_line(chosen[0].name, 80)}, label {label}"
+            )
         else:
             derived.append(f"{region} leaflet: label {label}, as the file names none")
         if not 0 <= layer < len(volume.frames):

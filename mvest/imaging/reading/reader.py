@@ -52,6 +52,7 @@ def read_volume(
         Of all frames, decoded; reading them takes up to three times as much memory for a while.
     labels
         Whether the voxels are wanted as labels: a segmentation is no image and refused otherwise.
+        Frames (or layers) without times are then taken to be a second apart.
 
     Raises
     ------
@@ -77,6 +78,8 @@ def read_volume(
     with np.errstate(all="ignore"), refusing(source, "volume"):
         stated, files = _stated(source, max_bytes, labels)
         sha256 = _sha256(files)
+        if labels and stated.times.values is None:
+            frame_interval_s = 1.0
         return checked_sequence(source, stated, sha256, modality, frame_interval_s, time_unit)
 
 
