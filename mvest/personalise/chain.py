@@ -76,6 +76,12 @@ BETTER = 5.0
 ROUGH = 0.05
 """Relative tolerance of an estimate about which the geometry is linearised."""
 
+KNOWN = "what is considered"
+"""Name of all columns whose size is not learned."""
+
+LEARNED = 4
+"""Iterates at which errors are learned beside what is considered, from an estimate without it."""
+
 OnStep = Callable[[float, int], None]
 
 
@@ -318,7 +324,7 @@ class _Chain:
         inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
         if self._held:
             return SchmidtFilter(inner, self._held)
-        return replace(inner, start=start)
+        return inner if start is None else replace(inner, start=start, max_learned=LEARNED)
 
     @property
     def _kinds(self) -> tuple[str, ...]:
@@ -442,18 +448,22 @@ class _Chain:
         stated : bool
             See `plain_observation`.
         """
-        family, count = self.single_errors, len(self.considered)
-        scales: FloatArray = np.ones(count)
+        family = self.single_errors
+        scales: dict[str, float] = {}
         if family is None:
             observation = self.plain_observation(stated=stated)
             base = observation_noise(observation.R, len(observation.y))
         else:
             log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
-            base = family.without_columns().at(log[: len(log) - count])
-            scales = np.exp(log[len(log) - count :])
+            first = len(family.names) - len(family.columns)
+            base = family.without_columns().at(log[:first])
+            scales = {
+                own.name: float(np.exp(one))
+                for own, one in zip(family.columns, log[first:], strict=True)
+            }
         columns = [
-            considered * scale * own.columns
-            for scale, own in zip(scales, self.considered, strict=True)
+            considered * scales.get(own.name, 1.0) * own.columns
+            for own in self.considered
             if own.name not in without
         ]
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
@@ -491,7 +501,7 @@ class _Chain:
     def single_errors(self) -> NoiseFamily | None:
         """What is believed of the errors of single observations, where they are learned.
 
-        Those of the considered geometry are added.
+        What is considered is added; all of it whose size is known at once, which saves quantities.
         """
         if self.settings.errors is None:
             return None
@@ -502,7 +512,11 @@ class _Chain:
                 self.length(),
                 self.case.surface.vertices,
             )
-        return replace(self._family, columns=self.considered)
+        learned = [own for own in self.considered if own.factor > 1.0]
+        known = [own.columns for own in self.considered if own.factor == 1.0]
+        if known:
+            learned.append(ErrorColumns(KNOWN, np.concatenate(known, axis=1)))
+        return replace(self._family, columns=tuple(learned))
 
     def length(self, *, stated: bool = False) -> float:
         """Over how many mm errors are alike: as the case states, always so if ``stated``.
