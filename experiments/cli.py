@@ -28,6 +28,7 @@ COMMANDS = {
     "run": "an experiment with Hydra's overrides, -m for a sweep: run experiment=table1 seed=2",
     "own-valve": "moduli of a valve from a case folder",
     "volume": "moduli of a valve from a volume over time (NRRD, MetaImage, NIfTI, Philips DICOM)",
+    "simulate": "a simulated echo volume and the truth in it: simulate volume OUT.seq.nrrd",
     "import": "a case folder from what another program wrote: import NAME SOURCE CASE",
     "export": "a case or a result for another program: export NAME SOURCE TARGET",
     "tables": "every table and figure of results/ anew, from the records that are kept there",
@@ -62,6 +63,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _application(_one_file("own-valve", "FOLDER", "own_valve", "case", rest))
         case "volume":
             return _application(_one_file("volume", "FILE", "volume", "volume", rest))
+        case "simulate":
+            from experiments.simulated_volume import simulate_command
+
+            return simulate_command(rest)
         case "import":
             from experiments.doors import import_command
 

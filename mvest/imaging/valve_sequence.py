@@ -10,7 +10,13 @@ from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
-__all__ = ["ValveSequence"]
+__all__ = ["MIN_CONFIDENCE", "ValveSequence"]
+
+MIN_CONFIDENCE = 0.6
+"""Confidence from which on a frame shows a valve, wherever that is decided or drawn.
+
+A volume is accepted if its best frame reaches it; frames of a case are chosen among those that do.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

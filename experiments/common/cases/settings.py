@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from experiments.common.schema import InputFile, Reads, contents
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalise.considered_geometry import ConsideredGeometry
@@ -81,8 +82,8 @@ class ImagedSettings:
     pressure_curve: InputFile = None  # .csv time,pressure (s, mmHg, the times of the volume)
     held_out: tuple[Any, ...] = ()  # [frame, mmHg]: closed frames not shown
     thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
-    valve_confidence: float = 0.6  # of the best frame; below it there is no valve (0: show it)
-    min_confidence: float = 0.6  # of the frames that are chosen
+    # Of the best frame, below which there is no valve, and of the frames that are chosen.
+    min_confidence: float = MIN_CONFIDENCE
     error_samples: int = 20  # at most, with which the valve is closed anew
     name: str | None = None  # null: the name of the file
     description: str = ""

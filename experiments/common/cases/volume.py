@@ -27,7 +27,7 @@ from mvest.cases.pressure_curve import PressureCurve
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.tracking import NoValveError, TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import (
     default_model,
     load_model,
@@ -49,12 +49,21 @@ Values = Mapping[str, Any]
 IMAGES, CASE = "images", "case"
 """Folders of what the image step writes, and of the case."""
 
+STAND_IN_MMHG = 100.0
+"""Of a case without a pressure, which is checked and neither written nor estimated."""
+
+NO_PRESSURE = (
+    "No pressure is given, so no case is written; an estimate will need imaged.pressure_mmHg or "
+    "imaged.pressure_curve, the transmitral pressure on the closed valve."
+)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedValve:
     """The valve that the image step detected in a volume, with the measures of every frame.
 
-    Of the detection model there is what is known of it, as plain data.
+    Of the detection model there is what is known of it, as plain data. Where no pressure is stated
+    the case has a stand-in for it, and is there to be checked only.
     """
 
     volume: VolumeSequence
@@ -63,6 +72,8 @@ class DetectedValve:
     frames: CaseFrames
     case: ValveCase
     model: dict[str, Any]
+    pressure_stated: bool
+    min_confidence: float
 
 
 def run_volume(
@@ -73,14 +84,25 @@ def run_volume(
     folder: Path,
 ) -> Outcome[Findings]:
     """Find the valve in the configured volume and personalise it."""
-    step = write_image_step(detect_in_volume(file, settings), folder)
+    step = write_image_step(detect_in_volume(file, settings, folder), folder)
     for sentence in step.sentences:
         print(sentence, file=sys.stderr)
     return run_case(values, personal, read_case(folder / CASE), folder, step)
 
 
-def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValve:
+def detect_in_volume(
+    file: str | None, settings: ImagedSettings, folder: Path, *, estimate: bool = True
+) -> DetectedValve:
     """The valve in the configured volume, and the case that it makes.
+
+    Where no valve is accepted, the best candidate is drawn in the folder.
+
+    Parameters
+    ----------
+    file, settings
+    folder : Path
+    estimate : bool
+        Is the case to be estimated, so that a pressure must be given?
 
     Raises
     ------
@@ -92,7 +114,7 @@ def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValv
     # What is asked for, before anything that takes long.
     by_hand = _landmarks(_pairs("landmarks", settings.landmarks, str))
     held = _pairs("held_out", settings.held_out, float)
-    curve = _pressure_curve(settings)
+    curve = _pressure_curve(settings, needed=estimate)
     thickness = _thickness(settings.thickness_mm)
     volume = read_volume(
         Path(file),
@@ -120,15 +142,24 @@ def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValv
             f"imaged.thickness_mm is of {', '.join(thickness)}; the model finds the leaflets "
             f"{', '.join(model.shape.layout.region_names)}"
         )
-    tracking = TrackingSettings(min_confidence=settings.valve_confidence)
+    tracking = TrackingSettings(min_confidence=settings.min_confidence)
     with PartBar("valve in the frames", len(volume.times), "frame") as bar:
-        valve = detect_valve(
-            volume,
-            model,
-            tracking,
-            landmarks=by_hand,
-            progress=lambda _done, _all: bar.step(),
-        )
+        try:
+            valve = detect_valve(
+                volume,
+                model,
+                tracking,
+                landmarks=by_hand,
+                progress=lambda _done, _all: bar.step(),
+            )
+        except NoValveError as nothing:
+            if nothing.candidate is None:
+                raise
+            drawn = _draw_candidate(volume, nothing.candidate, settings.min_confidence, folder)
+            raise NoValveError(
+                f"{nothing}; the best candidate, not accepted, is drawn in {drawn}",
+                nothing.candidate,
+            ) from nothing
     rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
     frames = _frames(settings, curve, held, valve, rows)
     texts = CaseTexts(
@@ -160,7 +191,8 @@ def detect_in_volume(file: str | None, settings: ImagedSettings) -> DetectedValv
         ),
     )
     about = {"sha256": model.sha256, "trained_on": model.trained_on}
-    return DetectedValve(volume, valve, rows, frames, case, about)
+    stated = not (settings.pressure_mmHg is None and curve is None)
+    return DetectedValve(volume, valve, rows, frames, case, about, stated, settings.min_confidence)
 
 
 def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
@@ -181,12 +213,16 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
     drawn = {
         "montage": (
             montage_figure(
-                detected.volume, detected.valve, title=name, closed=detected.frames.closed
+                detected.volume,
+                detected.valve,
+                title=name,
+                closed=detected.frames.closed,
+                low_confidence=detected.min_confidence,
             ),
             "The valve as it was detected, drawn on the volume.",
         ),
         "measures_over_time": (
-            measures_figure(detected.rows, title=name),
+            measures_figure(detected.rows, title=name, low_confidence=detected.min_confidence),
             "Measures of the valve over time. Hollow: frames of low confidence.",
         ),
     }
@@ -203,13 +239,16 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         float(detected.case.surface.thickness.mean()),
         [detected.frames.open, detected.frames.closed],
     )
-    write_case(case, detected.case)
+    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series"]
+    if detected.pressure_stated:
+        write_case(case, detected.case)
+        files.append(f"{CASE}/case.yaml")
     volume, uncertainty = detected.volume, detected.case.uncertainty
     return ImageStep(
         pictures=pictures,
         sentences=_sentences(detected),
         frames=tuple(dict(row) for row in detected.rows),
-        files=(f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series", f"{CASE}/case.yaml"),
+        files=tuple(files),
         model=detected.model,
         volume=VolumeAbout(
             _called(volume),
@@ -224,6 +263,22 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         std_mm=uncertainty.typical_mm,
         correlation_length_mm=uncertainty.correlation_length_mm,
     )
+
+
+def _draw_candidate(
+    volume: VolumeSequence, candidate: ValveSequence, min_confidence: float, folder: Path
+) -> Path:
+    """Draw what was not accepted, marked as such."""
+    from mvest.reporting.figures import save_figure_with
+    from mvest.reporting.images.montage import montage_figure
+
+    folder.mkdir(parents=True, exist_ok=True)
+    name = _called(volume)
+    figure = montage_figure(
+        volume, candidate, title=name, low_confidence=min_confidence, accepted=False
+    )
+    save_figure_with(folder / "candidate", figure, name)
+    return folder / "candidate.png"
 
 
 def _called(volume: VolumeSequence) -> str:
@@ -244,6 +299,7 @@ def _sentences(detected: DetectedValve) -> tuple[str, ...]:
         f"{detected.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
         f"{detected.case.uncertainty.correlation_length_mm:.0f} mm.",
         *(f"Derived: {sentence}." for sentence in detected.case.derived),
+        *(() if detected.pressure_stated else (NO_PRESSURE,)),
     )
 
 
@@ -264,9 +320,10 @@ def _thickness(given: Sequence[float]) -> dict[str, float] | None:
     return dict(zip(names, given, strict=True)) if given else None
 
 
-def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
-    """The configured curve, or None where the pressure in the closed frame is given."""
-    if (settings.pressure_mmHg is None) == (settings.pressure_curve is None):
+def _pressure_curve(settings: ImagedSettings, *, needed: bool) -> PressureCurve | None:
+    """The configured curve, or None where the pressure in the closed frame is given, or none."""
+    given = (settings.pressure_mmHg is not None) + (settings.pressure_curve is not None)
+    if given > 1 or (needed and not given):
         raise ConfigurationError(
             "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
             "pressure on the closed valve"
@@ -327,11 +384,10 @@ def _frames(
         if closed is None or not 0 <= closed < count:
             raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
         pressure = curve(float(valve.times[closed]))
-    assert pressure is not None
     return choose_frames(
         valve,
         rows,
-        pressure,
+        STAND_IN_MMHG if pressure is None else pressure,
         open_=settings.open_frame,
         closed=closed,
         held_out=held,

@@ -26,7 +26,8 @@ def run_own_volume(job: Job[Settings]) -> Outcome[Findings]:
 
 def check_volume(values: Mapping[str, Any], folder: Path) -> str:
     """Find, measure and draw the valve without simulating anything, and say so."""
-    detected = detect_in_volume(values["volume"], build(ImagedSettings, values["imaged"]))
+    settings = build(ImagedSettings, values["imaged"])
+    detected = detect_in_volume(values["volume"], settings, folder, estimate=False)
     step = write_image_step(detected, folder)
     return "\n".join([*step.sentences, f"In order; drawn in {folder / 'montage.png'}"])
 

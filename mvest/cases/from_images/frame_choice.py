@@ -10,7 +10,7 @@ import numpy as np
 from mvest.cases.checks import CLOSING_PRESSURE
 from mvest.cases.from_images.measures import Row, closed_frame
 from mvest.errors import InputError
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 
 __all__ = ["CaseFrames", "choose_frames"]
 
@@ -62,7 +62,7 @@ def choose_frames(
     open_: int | None = None,
     closed: int | None = None,
     held_out: Mapping[int, float] | None = None,
-    min_confidence: float = 0.6,
+    min_confidence: float = MIN_CONFIDENCE,
 ) -> CaseFrames:
     """Choose the frames that were not stated.
 

@@ -16,6 +16,7 @@ from mvest.imaging.detection.shape_start import MODES
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -77,7 +78,17 @@ volumes unlike those of training, the rating alone prefers a wrong pose in every
 
 
 class NoValveError(InputError):
-    """A volume shows no valve that the detectors believe in."""
+    """A volume shows no valve that the detectors believe in.
+
+    Attributes
+    ----------
+    candidate : ValveSequence or None
+        The best there is, which was not accepted; None where there is not even a place to look at.
+    """
+
+    def __init__(self, message: str, candidate: ValveSequence | None = None) -> None:
+        super().__init__(message)
+        self.candidate = candidate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,7 +33,7 @@ from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.smoothing import smooth_in_time
 from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import BoolArray, FloatArray
 
@@ -76,7 +76,7 @@ class TrackingSettings:
     speed_mm_s: float = 60.0
     still_mm: float = 2.0
     smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
-    min_confidence: float = 0.6
+    min_confidence: float = MIN_CONFIDENCE
     fit: FitSettings = field(default_factory=FitSettings)
 
 
@@ -103,7 +103,7 @@ def detect_valve(
     Raises
     ------
     NoValveError
-        If no frame shows a valve with some confidence.
+        If no frame shows a valve with some confidence; it holds the best candidate.
     InputError
         If a frame holds no image, or landmarks name no frame or point that there is.
     """
@@ -117,13 +117,6 @@ def detect_valve(
         if progress is not None:
             progress(k + 1, len(frames))
     confidence = np.array([valve.confidence for valve in valves])
-    by_eye = any(len(points) >= POSE_LANDMARKS for points in by_hand.values())
-    if confidence.max() < chosen.min_confidence and not by_eye:
-        raise NoValveError(
-            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
-            f"of {confidence.max():.2f}, expected at least {chosen.min_confidence:g} (a mitral "
-            "valve whole within the field of view, or landmarks placed by hand)"
-        )
     sure = np.stack([valve.vertex_confidence for valve in valves])
     vertices, tips = smooth_in_time(
         np.asarray(volume.times),
@@ -137,7 +130,7 @@ def detect_valve(
     for k, points in by_hand.items():
         vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, chosen.fit)
     accuracy, layout = model.accuracy, model.shape.layout
-    return ValveSequence(
+    valve = ValveSequence(
         layout,
         np.asarray(volume.times),
         vertices,
@@ -147,6 +140,15 @@ def detect_valve(
         np.full(layout.size, np.nan) if accuracy is None else accuracy.std_mm,
         np.nan if accuracy is None else accuracy.correlation_length_mm,
     )
+    by_eye = any(len(points) >= POSE_LANDMARKS for points in by_hand.values())
+    if confidence.max() < chosen.min_confidence and not by_eye:
+        raise NoValveError(
+            f"{volume.source}: no valve found; the best of {len(frames)} frames has a confidence "
+            f"of {confidence.max():.2f}, expected at least {chosen.min_confidence:g} (a mitral "
+            "valve whole within the field of view, or landmarks placed by hand)",
+            valve,
+        )
+    return valve
 
 
 def _held(

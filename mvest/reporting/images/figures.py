@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.reporting.style import (
     COLOURS,
     GREY,
@@ -87,7 +88,9 @@ _OVER_TIME = (
 )
 
 
-def measures_figure(rows: Sequence[Row], *, title: str, low_confidence: float = 0.5) -> Figure:
+def measures_figure(
+    rows: Sequence[Row], *, title: str, low_confidence: float = MIN_CONFIDENCE
+) -> Figure:
     """Measures of a valve over time.
 
     Parameters

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from mvest.errors import InputError
-from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.reporting.figures import LEAFLET_COLOURS
 from mvest.reporting.images.planes import (
@@ -28,13 +28,11 @@ from mvest.reporting.images.planes import (
 from mvest.reporting.style import headline
 from mvest.typing import FloatArray
 
-__all__ = ["LEAFLETS", "LOW_CONFIDENCE", "chosen_frames", "montage_figure"]
+__all__ = ["LEAFLETS", "chosen_frames", "montage_figure"]
 
 LEAFLETS = LEAFLET_COLOURS[:2]
 """Of the anterior and the posterior leaflet."""
 TIP, ANNULUS = "#F0E442", "white"
-LOW_CONFIDENCE = 0.5
-"""Below this a frame is marked."""
 REACH_MM = 3.0
 """Up to which distance from a plane annulus points and papillary tips are drawn in it."""
 SCALE_MM = 10.0
@@ -87,7 +85,8 @@ def montage_figure(
     title: str,
     closed: int | None = None,
     most: int = 6,
-    low_confidence: float = LOW_CONFIDENCE,
+    low_confidence: float = MIN_CONFIDENCE,
+    accepted: bool = True,
 ) -> Figure:
     """Frames in rows, the planes of `valve_planes` in columns, with what the valve cuts drawn on.
 
@@ -106,6 +105,8 @@ def montage_figure(
         Rows.
     low_confidence : float
         Frames below this are marked in words.
+    accepted : bool
+        False for the best candidate of a volume in which no valve was found: the head says so.
 
     Raises
     ------
@@ -155,6 +156,8 @@ def montage_figure(
             if row == 0:
                 _scale_bar(axes, extents[name])
             _mark(axes, valve, frame, low_confidence)
+    if not accepted:
+        title = f"NO VALVE FOUND; best candidate, not accepted: {title}"
     headline(figure, title, _note(valve, low_confidence))
     figure.legend(
         handles=_keys(valve), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False

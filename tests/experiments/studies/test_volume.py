@@ -157,7 +157,6 @@ def test_landmarks_placed_by_hand_are_handed_on(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "pressure", "message"),
     [
-        ((), False, "imaged.pressure_mmHg or imaged.pressure_curve"),
         (("imaged.pressure_curve=curve.csv",), True, "expected one of them"),
         (("imaged.pressure_mmHg=16",), False, "16.0 mmHg on the closed valve"),
         (("imaged.closed_frame=9",), True, "closed frame 9, expected one of 0 to 3"),
@@ -214,10 +213,42 @@ def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume,
 
 def test_what_is_missing_is_said_before_the_volume_is_searched(run):
     # The search takes a second for every frame.
-    status, _, err = run("check=true", pressure=False)
+    status, _, err = run(pressure=False)
     assert status == 2
     assert "imaged.pressure_mmHg or imaged.pressure_curve" in err
     assert run.told == []
+
+
+def test_a_check_without_a_pressure_draws_and_says_what_the_estimate_needs(run, tmp_path):
+    status, out, err = run("check=true", pressure=False)
+    assert status == 0, err
+    (folder,) = (tmp_path / "outputs" / "volume").iterdir()
+    assert (folder / "montage.png").is_file()
+    assert (folder / "images" / "measures.csv").is_file()
+    # A case with a pressure that nobody stated must not lie there to be estimated.
+    assert not (folder / "case").exists()
+    assert "an estimate will need imaged.pressure_mmHg" in out
+
+
+def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp_path):
+    def nothing(*arguments, **more):
+        raise NoValveError("no valve found; 0.31, expected at least 0.6", sequence())
+
+    titles = []
+
+    def titled(figure, title, note):
+        titles.append(title)
+
+    monkeypatch.setattr("experiments.common.cases.volume.detect_valve", nothing)
+    monkeypatch.setattr("mvest.reporting.images.montage.headline", titled)
+    status, _, err = run("check=true")
+    assert status == 2
+    (drawn,) = (tmp_path / "outputs" / "volume").glob("*/candidate.png")
+    assert "0.31, expected at least 0.6" in err
+    assert f"not accepted, is drawn in {drawn}" in err
+    (title,) = titles
+    assert title.startswith("NO VALVE FOUND; best candidate, not accepted: volume ")
+    assert not list((tmp_path / "outputs" / "volume").glob("*/case"))
 
 
 def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypatch):
@@ -228,7 +259,7 @@ def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypa
         return sequence()
 
     monkeypatch.setattr("experiments.common.cases.volume.detect_valve", detect)
-    assert run("check=true", "imaged.valve_confidence=0.1")[0] == 0
+    assert run("check=true", "imaged.min_confidence=0.1")[0] == 0
     assert asked == [0.1]
 
 

@@ -117,6 +117,9 @@ def test_detectors_that_believe_in_nothing_find_no_valve(shape, truths):
     assert "made up.nrrd" in message
     assert "0.0" in message
     assert "\n" not in message
+    candidate = told.value.candidate
+    assert candidate.frame_confidence.max() < 0.6
+    assert len(candidate.times) == len(volume().times)
     detect_valve(volume(), oracle_model(shape, truths, best=0.05, seen=0.05),
                  replace(TOLD, min_confidence=0.01))  # fmt: skip
 

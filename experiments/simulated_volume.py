@@ -1,0 +1,189 @@
+"""``mvest simulate volume``: a simulated echo volume over time and, beside it, what is true."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import typing
+from argparse import RawDescriptionHelpFormatter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from experiments.common.anatomy import template_of
+from experiments.common.build import mechanics_of
+from experiments.common.config import plain, register
+from experiments.common.places import CONF
+from experiments.common.progress import PartBar, announce_compilation
+from experiments.common.schema import build, schema
+from experiments.console import Parser
+from mvest.cases.from_images.files import write_landmarks, write_surfaces
+from mvest.errors import ConfigurationError, MvestError
+from mvest.files import write_atomically
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.volume import VolumeSequence
+from mvest.imaging.writing.slicer import checked_path, write_sequence_nrrd
+from mvest.simulation.motion.closing import MotionSettings, close_in_motion
+
+__all__ = ["SimulatedVolumeOptions", "simulate_command", "write_simulated_volume"]
+
+SUFFIX = ".seq.nrrd"
+
+CONFIGURED = ("valve", "mechanics")
+"""Groups of the configuration that say what valve is closed, and how."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedVolumeOptions:
+    """What is imaged, and how.
+
+    Attributes
+    ----------
+    moduli : tuple of float
+        MPa, along the fibres of the anterior and the posterior leaflet.
+    frames : int
+        From the open to the closed valve, both included.
+    seed : int
+        Of the pose of the probe, the heart around the valve, speckle and noise.
+    distance_mm, tilt_deg : (float, float)
+        Ranges of the distance from the probe to the valve, and of the angle of the valve's axis to
+        the line of sight.
+    acquisition : Acquisition
+        The scanner: acquisition.voxel_mm=1, acquisition.gain_db=6 and others.
+    """
+
+    moduli: tuple[float, float] = (6.23, 2.09)
+    frames: int = 4
+    seed: int = 3
+    distance_mm: tuple[float, float] = (35.0, 75.0)
+    tilt_deg: tuple[float, float] = (0.0, 25.0)
+    acquisition: Acquisition = field(default_factory=Acquisition)
+
+
+def simulate_command(given: Sequence[str]) -> int:
+    """``mvest simulate volume OUT.seq.nrrd [NAME=VALUE ...]``; exit status."""
+    about = (SimulatedVolumeOptions.__doc__ or "").partition("\n")[2]
+    parser = Parser(
+        "mvest simulate",
+        description=f"{__doc__}\n\nvalve=NAME and mechanics... as in `mvest run`, and:\n{about}",
+        formatter_class=RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=["volume"])
+    parser.add_argument("target", type=Path, metavar="OUT", help=f"ends in {SUFFIX}")
+    parser.add_argument("options", nargs="*", metavar="NAME=VALUE")
+    parsed = parser.parse_intermixed_args(list(given))
+    try:
+        for word in parsed.options:
+            if "=" not in word:
+                raise ConfigurationError(f"{word}: expected NAME=VALUE")
+        began = time.monotonic()
+        volume, truth = write_simulated_volume(parsed.target, parsed.options)
+    except (MvestError, HydraException, OSError) as error:
+        print(f"error: {str(error).partition(chr(10))[0]}", file=sys.stderr)
+        return 2
+    print(
+        f"wrote {volume}: a simulated volume, of nobody, in {time.monotonic() - began:.1f} s\n"
+        f"what is true in it: {truth}\nnext: mvest volume {volume} --check"
+    )
+    return 0
+
+
+def write_simulated_volume(target: Path, words: Sequence[str]) -> tuple[Path, Path]:
+    """Simulate a volume as words NAME=VALUE say and write it; the paths of volume and truth.
+
+    Beside ``NAME.seq.nrrd``, the folder ``NAME_truth`` has ``truth.json``, the surfaces of all
+    frames and the landmarks of the open and the closed one. No estimate reads it.
+
+    Raises
+    ------
+    MvestError
+        An unknown name, a value that is inadmissible, or a valve that does not close.
+    HydraException
+        A word of the configuration that is not understood.
+    """
+    checked_path(target, SUFFIX)
+    configured = [word for word in words if word.partition("=")[0].split(".")[0] in CONFIGURED]
+    options = _options([word for word in words if word not in configured])
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        values = plain(compose("config", ["experiment=imaging", *configured]))
+    template, mechanics = template_of(values), mechanics_of(values)
+    moduli = dict(zip(("E_f.anterior", "E_f.posterior"), options.moduli, strict=True))
+    motion = MotionSettings(frames=options.frames, held_pressure=(), held_relaxation=())
+    probe = draw_probe(
+        np.random.default_rng([options.seed, 2]),
+        options.acquisition,
+        distance_mm=options.distance_mm,
+        tilt_deg=options.tilt_deg,
+    )
+    announce_compilation("the simulation")
+    with PartBar("closure of the valve", 1, "closure") as bar:
+        valve = close_in_motion("simulated", template, moduli, motion, mechanics)
+        bar.step()
+    seen = []
+    with PartBar("echo of the frames", options.frames, "frame") as bar:
+        for frame in range(options.frames):
+            seen.append(
+                simulate_volume(valve, options.acquisition, probe, options.seed, frames=[frame])
+            )
+            bar.step()
+    first = seen[0]
+    volume = VolumeSequence(
+        np.concatenate([one.frames for one in seen]),
+        first.spacing,
+        first.direction,
+        first.origin,
+        valve.times,
+        first.modality,
+        f"simulated, seed {options.seed}",
+    )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    truth = target.with_name(target.name.removesuffix(SUFFIX) + "_truth")
+    truth.mkdir(exist_ok=True)
+    true = true_sequence(valve, probe)
+    said: dict[str, Any] = {
+        "simulated": True,
+        "command": " ".join(["mvest simulate volume", target.name, *words]),
+        "moduli_MPa": moduli,
+        "pressure_mmHg": mechanics.protocol.pressure_mmHg,
+        "open_frame": 0,
+        "closed_frame": options.frames - 1,
+        "times_s": valve.times.tolist(),
+        "seed": options.seed,
+    }
+    write_surfaces(truth, true)
+    for frame in (0, options.frames - 1):
+        write_landmarks(truth / f"valve_{frame:04d}.mrk.json", true, frame)
+    write_atomically(truth / "truth.json", json.dumps(said, indent=1) + "\n")
+    return write_sequence_nrrd(target, volume), truth
+
+
+def _options(words: Sequence[str]) -> SimulatedVolumeOptions:
+    defaults = OmegaConf.structured(schema(SimulatedVolumeOptions))
+    try:
+        merged = OmegaConf.merge(defaults, OmegaConf.from_dotlist(list(words)))
+    except OmegaConfBaseException as error:
+        raise ConfigurationError(
+            f"simulate: {str(error).partition(chr(10))[0]}; known are valve, mechanics, "
+            f"{', '.join(map(str, defaults))}"
+        ) from error
+    values = typing.cast("dict[str, Any]", OmegaConf.to_container(merged))
+    for name in ("moduli", "distance_mm", "tilt_deg"):
+        if len(values[name]) != 2:
+            raise ConfigurationError(f"simulate: {name} = {values[name]}, expected two numbers")
+    if not min(values["moduli"]) > 0 or values["seed"] < 0:
+        raise ConfigurationError(
+            f"simulate: moduli {values['moduli']} MPa and seed {values['seed']}, expected "
+            "moduli > 0 and a seed >= 0"
+        )
+    return build(SimulatedVolumeOptions, values)

@@ -1,0 +1,63 @@
+"""The volume to try, and the command that makes such volumes."""
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import cli, simulated_volume
+from mvest.imaging.detection.tracking import detect_valve
+from mvest.imaging.detection.trained_model import default_model
+from mvest.imaging.reading.reader import read_volume
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.valve.io.leaflet_surfaces import read_surface
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+TRUTH = EXAMPLES / "volume_truth"
+
+
+def test_the_valve_in_the_sample_is_where_the_truth_beside_it_says():
+    volume = read_volume(EXAMPLES / "volume.seq.nrrd")
+    valve = detect_valve(volume, default_model())
+    assert (EXAMPLES / "volume.seq.nrrd").stat().st_size < 1 << 20
+    said = json.loads((TRUTH / "truth.json").read_text())
+    assert said["simulated"] is True
+    np.testing.assert_allclose(volume.times, said["times_s"], atol=1e-6)
+    for frame in (said["open_frame"], said["closed_frame"]):
+        true = read_surface(TRUTH / f"valve_{frame:04d}.vtp").vertices
+        gap = np.linalg.norm(valve.vertices[frame][:, None] - true[None, ::4], axis=2)
+        assert gap.min(axis=0).mean() < 2.0
+
+
+def test_the_command_beside_the_sample_is_one_that_is_understood():
+    words = shlex.split(json.loads((TRUTH / "truth.json").read_text())["command"])
+    assert words[:4] == ["mvest", "simulate", "volume", "volume.seq.nrrd"]
+    options = simulated_volume._options(words[4:])
+    shape = read_volume(EXAMPLES / "volume.seq.nrrd").frames.shape
+    assert (options.frames, *options.acquisition.shape) == shape
+    assert isinstance(options.acquisition, Acquisition)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["out.nrrd"], "out.nrrd"),
+        (["out.seq.nrrd", "speed=3"], "known are valve, mechanics, moduli"),
+        (["out.seq.nrrd", "moduli=[1]"], "expected two numbers"),
+        (["out.seq.nrrd", "moduli=[0,2]"], "moduli > 0"),
+        (["out.seq.nrrd", "acquisition.voxel_mm=0"], "voxel_mm = 0"),
+        (["out.seq.nrrd", "valve=aortic"], "aortic"),
+        (["out.seq.nrrd", "fast"], "expected NAME=VALUE"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said_in_one_line(
+    words, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["simulate", "volume", *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
