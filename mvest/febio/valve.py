@@ -74,8 +74,8 @@ class FebSettings:
 
     law: str = "neo-hookean"
     contact: str = "potential"
-    contact_gap_mm: float = 0.6
-    contact_reach_mm: float = 1.6
+    contact_gap_mm: float = 1.0
+    contact_reach_mm: float = 1.65
     penalty: float = 1.0
     dynamic: bool = True
     density_factor: float = 1000.0

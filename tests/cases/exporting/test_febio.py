@@ -159,9 +159,9 @@ def test_contact_presses_as_its_reference_pressure(root):
     step = 0.004
     plane = np.arange(-outer, outer, step)
     u, v = np.meshgrid(plane, plane)
-    r = np.sqrt(u**2 + v**2 + 0.6**2)
+    r = np.sqrt(u**2 + v**2 + 1.0)
     force = np.where(r < inner, kc / r**p - c2, np.where(r < outer, c1 * (r - outer) ** 2, 0.0))
-    pressure = 2 * np.sum(force * 0.6 / r) * step**2
+    pressure = 2 * np.sum(force * 1.0 / r) * step**2
     assert pressure == pytest.approx(0.016, rel=2e-3)
 
 
