@@ -40,7 +40,7 @@ OPENING = 0.4
 """mm more than at the corner, from which on two boundaries are free edges that part."""
 CURL_AT, CURLED = (0.0, 0.6, 1.5, 2.5), 0.85
 """mm from an edge: a side that curls round a rim runs otherwise within the first two than between
-the last two; cosine of the angle, of 64 degrees in a segmentation and 7 in a surface that ends."""
+the last two, by 32 degrees or more; a surface that ends there by less than 10."""
 RIM_ROUNDS = 2
 """Of smoothing an edge: over one of its triangles' edges."""
 MAX_SEAM = 0.25

@@ -189,7 +189,7 @@ def _placed(
     if not options.midsurface:
         derived.append(
             "midsurface: the atrial surfaces moved to the ventricle by half the thickness "
-            f"({offset[0]:g} and {offset[1]:g} mm); what curls round a rim is left out"
+            f"({offset[0]:g} and {offset[1]:g} mm); edges that curl by over 30 degrees left out"
         )
     seams = None
     for seen, role in chosen:
