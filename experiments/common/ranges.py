@@ -156,7 +156,8 @@ RANGES = (
         0, 1, "", "shares of a whole",
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
-        "marginal_s *confidence dropout rate *_relaxation held_pressure missing outliers *_off",
+        "closed_depth marginal_s *confidence dropout rate *_relaxation held_pressure missing "
+        "outliers *_off",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
     Range(-1e12, 1e12, "", "variances, in the units of any model squared", "P0 Q R linear_P0"),

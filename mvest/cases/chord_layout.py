@@ -129,11 +129,16 @@ def _weighted(vertices: FloatArray, corners: IntArray, weights: FloatArray) -> F
     return result
 
 
-def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArray) -> FloatArray:
+def assumed_closure(
+    open_valve: LeafletBand,
+    annulus: FloatArray,
+    tips: FloatArray,
+    closed_depth: float = CLOSED_DEPTH,
+) -> FloatArray:
     """Where the vertices of a valve may be once it is closed, if only its open shape is known.
 
     The free edges of the two leaflets meet half-way between where they are, point by point of equal
-    share between the commissures, at `CLOSED_DEPTH` of their depth below the annulus; the leaflets
+    share between the commissures, at ``closed_depth`` of their depth below the annulus; leaflets
     follow in proportion to their coordinate s. It is not how the valve closes, but says how long
     chordae must be to let it.
 
@@ -144,6 +149,8 @@ def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArr
         ``(k, 3)`` mm, in loop order.
     tips
         ``(t, 3)`` mm, on the side of the ventricle.
+    closed_depth
+        Of the free edge below the annulus, closed over open.
 
     Returns
     -------
@@ -156,7 +163,7 @@ def assumed_closure(open_valve: LeafletBand, annulus: FloatArray, tips: FloatArr
     centre, normal = annulus.mean(axis=0), loop_vector_area(annulus)
     down = normal / np.linalg.norm(normal) * np.sign((tips.mean(axis=0) - centre) @ normal)
     depth = (goal - centre) @ down
-    move = goal - (1 - CLOSED_DEPTH) * depth[:, None] * down - here
+    move = goal - (1 - closed_depth) * depth[:, None] * down - here
     coordinates = open_valve.coordinates
     along = [np.interp(coordinates.theta, theta, each, period=2 * np.pi) for each in move.T]
     return np.asarray(open_valve.vertices + coordinates.s[:, None] * np.stack(along, axis=1))
