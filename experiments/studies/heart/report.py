@@ -185,7 +185,8 @@ def _closures(found: Findings) -> list[str]:
     pressure = found.closures[0].closed.pressure_mmhg
     lines = [
         f"| closed under {pressure:.0f} mmHg | annulus shortens by "
-        "| edges' depth, closed over open | orifice (mm²) | largest ball that passes (mm) | coaptation in the middle (mm) "
+        "| edges' depth, closed over open | orifice (mm²) | largest ball that passes (mm) "
+        "| coaptation in the middle (mm) "
         "| largest strain of a chord | smallest determinant of F |",
         "|---|---|---|---|---|---|---|---|",
     ]

@@ -84,14 +84,14 @@ def run_heart(job: Job[Settings]) -> Outcome[Findings]:
         "annulus_contraction": values["valve"]["annulus_contraction"],
         "closed_depth": heart.options.closed_depth,
     }
-    closures = [_closed("as in gate and twins", usual, model, closure)]
+    closures = [_closed("as in gate and twins", usual, values, model, closure)]
     for number, (name, changes) in enumerate(heart.closures.items()):
         asked_for = usual | changes
         options = replace(heart.options, closed_depth=asked_for["closed_depth"])
         other = import_reference_heart(files[0].parent, options)
         there = _on_case(job.values, other, job.folder / f"{CASE}_{number}")
         there["valve"]["annulus_contraction"] = asked_for["annulus_contraction"]
-        closures.append(_closed(name, asked_for, *_close(there, truth, name)))
+        closures.append(_closed(name, asked_for, there, *_close(there, truth, name)))
     gate = run_gate(
         lambda each: closure_model(values, each),
         truth,
@@ -218,7 +218,11 @@ def _close(values: Values, truth: Any, name: str) -> tuple[ClosureModel, Closure
 
 
 def _closed(
-    name: str, assumed: Mapping[str, float], model: ClosureModel, result: ClosureResult
+    name: str,
+    assumed: Mapping[str, float],
+    values: Values,
+    model: ClosureModel,
+    result: ClosureResult,
 ) -> Closed:
     """The open and the closed state of a closure, measured."""
     contact = model.settings.contact
@@ -226,7 +230,9 @@ def _closed(
     distance = 0.5 * thickness * (contact.reference_distance + contact.activation_distance)
     steps = result.simulation
     ends = replace(steps, times=steps.times[[0, -1]], frames=steps.frames[[0, -1]])
-    first, last = measure_steps(model, replace(result, simulation=ends), distance)
+    observed = values["observation"]
+    normals = anatomy_of(values).normals(observed["columns"], observed["rows"])
+    first, last = measure_steps(model, replace(result, simulation=ends), distance, normals)
     return Closed(
         name,
         assumed["annulus_contraction"],

@@ -67,7 +67,7 @@ class ReferenceHeartOptions:
         enough.
     """
 
-    smoothing_mm: float = 3.0
+    smoothing_mm: float = 4.0
     min_thickness_mm: float = 0.3
     max_thickness_mm: float = 3.0
     closed_depth: float = 0.5
