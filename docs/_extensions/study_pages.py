@@ -194,7 +194,7 @@ def index_of(pages: list[Page]) -> str:
         "Each page holds what a study asks, the command that repeats it, and its tables and "
         "figures as they lie in `results/`, with the commit and the configuration they came from. "
         "All of them on one page: <a href='../report.html'>report.html</a>. Everything is "
-        "simulated, except where a donor valve is named.",
+        "simulated, except where a donor valve or the shape of a reference heart is named.",
     ]
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]

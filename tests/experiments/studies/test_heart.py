@@ -25,8 +25,8 @@ SMALL = [
     "observation.columns=40",
     "observation.rows=10",
     "heart.gate=[perturbed start]",
-    "heart.closures={annulus still: {annulus_contraction: 0.0}}",
-    "~heart.twins.tet10 on a pytetwild mesh",
+    # Its own elements, which are closed faster.
+    "heart.twins={tet10 on a pytetwild mesh: {source: structured, element: hex18}}",
     "tracking.enabled=false",
 ]
 
@@ -57,13 +57,13 @@ def test_moduli_that_were_put_in_come_back(tmp_path, monkeypatch):
     for mesh in found.meshes:
         tissue = sizes["tissue enclosed by the surface of the source"]
         assert mesh.volume_mm3 == pytest.approx(tissue, rel=0.1)
-    used, still = found.closures
+    used, still, _ = found.closures
     assert (used.annulus_contraction, still.annulus_contraction) == (0.08, 0.0)
     assert used.closed.orifice_mm2 < 0.2 * used.opened.orifice_mm2
     assert "time step / 32, every step converged" in found.left_out
     assert [asked.name for asked in found.gate[:2]] == ["reference", "perturbed start"]
-    (twin,) = found.twins
-    np.testing.assert_allclose(twin.error_percent, 0.0, atol=0.5)
+    for twin in found.twins:
+        np.testing.assert_allclose(twin.error_percent, 0.0, atol=0.5)
     words = heart_words(record)
     assert found.claim in words
     assert CITATION in words
