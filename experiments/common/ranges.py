@@ -156,7 +156,7 @@ RANGES = (
         0, 1, "", "shares of a whole",
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
-        "closed_depth marginal_s *confidence dropout rate *_relaxation held_pressure missing "
+        "closed_depth closures.* marginal_s *confidence dropout rate *_relaxation held_pressure missing "
         "outliers *_off",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
