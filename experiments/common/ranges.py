@@ -156,16 +156,16 @@ RANGES = (
         0, 1, "", "shares of a whole",
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
-        "closed_depth closures.* marginal_s *confidence dropout rate *_relaxation held_pressure missing "
-        "outliers *_off",
+        "closed_depth closures.* marginal_s *confidence dropout rate *_relaxation held_pressure "
+        "missing outliers *_off",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
     Range(-1e12, 1e12, "", "variances, in the units of any model squared", "P0 Q R linear_P0"),
     Range(
         -1e12, 1e12, "", "parameters, in the units of any model; those of this one are also in "
         "the ranges of what they are",
-        "truth.values filter.initial methods.*.initial problems.*.truth problems.*.initial "
-        "prior_std external.floor",
+        "heart.twins.* truth.values filter.initial methods.*.initial problems.*.truth "
+        "problems.*.initial prior_std external.floor",
     ),
     Range(
         -10, 10, "", "of logarithms, or of standard normal numbers",
