@@ -158,8 +158,8 @@ def segmented_case(
             )
         document = {
             "version": 1,
-            "name": source.name.partition(".")[0] or "segmentation",
-            "source": source.name,
+            # Names of files may be those of patients.
+            "name": "segmented valve",
             "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
             "regions": list(REGIONS),
             "thickness": {"point_data": "thickness"},

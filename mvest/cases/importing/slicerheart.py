@@ -140,7 +140,7 @@ def import_slicerheart(source: Path, options: SlicerheartOptions) -> ValveCase:
     try:
         chosen = _chosen(source, options, derived)
         phases = _placed(chosen, options, derived)
-        case = _as_case(source, phases, options, derived)
+        case = _as_case(phases, options, derived)
     except MvestError as fault:
         words = str(fault)
         start = "" if words.startswith(str(source)) else f"{source}: "
@@ -322,12 +322,12 @@ def _rms(points: FloatArray, edges: FloatArray) -> float:
 
 
 def _as_case(
-    source: Path, phases: Sequence[_Phase], options: SlicerheartOptions, derived: list[str]
+    phases: Sequence[_Phase], options: SlicerheartOptions, derived: list[str]
 ) -> ValveCase:
     """Write the frames as a folder and read it: the checks and rules of every case."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        document = _document(source, folder, phases, options, derived)
+        document = _document(folder, phases, options, derived)
         text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
         (folder / CASE_FILE).write_text(text, encoding="utf-8")
         try:
@@ -338,7 +338,6 @@ def _as_case(
 
 
 def _document(
-    source: Path,
     folder: Path,
     phases: Sequence[_Phase],
     options: SlicerheartOptions,
@@ -374,7 +373,7 @@ def _document(
         )
     return {
         "version": 1,
-        "name": options.scene or source.resolve().name,
+        "name": "valve from SlicerHeart",  # names of files and scenes may be those of patients
         "source": "SlicerHeart",
         "units": {"length": "mm", "pressure": "mmHg", "time": "s"},
         "regions": list(REGIONS),

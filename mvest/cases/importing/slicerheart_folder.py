@@ -198,7 +198,7 @@ def _model(file: Path, notes: list[str]) -> PolyDataFile:
     model = read_polydata(file)
     space = _SPACE.search(model.title)
     if space is None:
-        notes.append(f"{file.name}: names no axes in its header, so R, A, S are assumed")
+        notes.append("a surface names no axes in its header, so R, A, S are assumed")
     check_finite(model.points)
     return replace(model, points=model.points * TO_LPS[space[1] if space else "RAS"])
 
