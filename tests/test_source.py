@@ -240,7 +240,7 @@ def test_a_process_has_the_code_with_which_it_began(code):
 
 def test_only_what_is_ours_has_a_key():
     assert source_key(build, build.build_mesh) == source_key(build, build.build_mesh)
-    assert source_key(build.build_mesh) != source_key(build.template_of)
+    assert source_key(build.build_mesh) != source_key(build.closure_model)
     with pytest.raises(InputError, match="pathlib is no module of mvest or experiments"):
         source_key(Path)
 

@@ -18,6 +18,7 @@ from experiments.common.study import load_settings, study_names
 from experiments.run import main
 from experiments.studies.donor.settings import DonorSettings
 from experiments.studies.donor.study import build_donor
+from mvest.cases.importing.reference_heart import PARTS
 from mvest.cases.writer import write_case
 from mvest.external import write_points
 from mvest.imaging.volume import Modality, VolumeSequence
@@ -88,6 +89,10 @@ def placed(name: str, folder: Path) -> tuple[object, Path]:
             file = folder / f"{folder.name}{ending}"
             file.write_text("1")
         return str(folder), file
+    if name == "heart.source":
+        for part in PARTS:
+            (folder / part).write_text("1")
+        return str(folder), folder / PARTS[0]
     listed = {"imaged.landmarks": [[2, str(file)]], "external.inputs": [str(file)]}
     listed["external.command"] = [sys.executable, f"--mesh={file}"]
     return listed.get(name, str(file)), file
