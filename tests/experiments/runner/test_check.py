@@ -35,7 +35,8 @@ def test_a_mesh_beyond_the_memory_of_a_job_is_not_built(
     tmp_path, monkeypatch, capsys, setting, named
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("experiments.common.anatomy.structured_mesh", lambda *_: pytest.fail("built"))
+    meshed = "experiments.common.anatomy.structured_mesh"
+    monkeypatch.setattr(meshed, lambda *_: pytest.fail("built"))
     line = ["experiments.run", "experiment=debug", "memory_limit_gb=2", *setting]
     monkeypatch.setattr(sys, "argv", line)
     assert main() == 2
