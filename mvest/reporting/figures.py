@@ -43,6 +43,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
 DPI = 200
 
+PNG_LEVEL = 4
+"""Of compression: files 4 % larger than at the usual 6, in half the time."""
+
 LONGEST_TEXT, LONGEST_LINE = 160, 400
 """Characters of a line of a text in a figure, and of the line at its foot."""
 MAX_LINES = 6
@@ -136,14 +139,17 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     line = shown_text(line, LONGEST_LINE)
     note = figure.supxlabel(line, fontsize=5, color="grey", ha="center", parse_math=False)
     # Without dates, so that the same result gives the same file.
-    metadata = {".png": {"Description": line}, ".pdf": {"Subject": line, "CreationDate": None}}
+    formats: dict[str, dict[str, object]] = {
+        ".png": {"metadata": {"Description": line}, "pil_kwargs": {"compress_level": PNG_LEVEL}},
+        ".pdf": {"metadata": {"Subject": line, "CreationDate": None}},
+    }
     written, layout = [], figure.get_layout_engine()
-    for suffix, entries in metadata.items():
+    for suffix, options in formats.items():
         path = base.with_name(base.name + suffix)
         written.append(
             write_atomically(
                 path,
-                lambda file, entries=entries: figure.savefig(file, dpi=DPI, metadata=entries),  # type: ignore[misc]
+                lambda file, options=options: figure.savefig(file, dpi=DPI, **options),  # type: ignore[misc]
             )
         )
         # What is laid out need not be once more, which takes as long as drawing it.
