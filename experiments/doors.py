@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments.common.schema import build, schema
 from experiments.console import Parser
 from mvest.cases import exporting, importing
-from mvest.cases.writer import write_case
+from mvest.cases.writer import require_new, write_case
 from mvest.errors import ConfigurationError, MvestError
 
 __all__ = ["Door", "doors", "export_command", "import_command"]
@@ -89,6 +89,8 @@ def import_command(given: Sequence[str]) -> int:
     """``mvest import NAME SOURCE CASE [option=value ...]``: write a case folder; exit status."""
 
     def write(door: Door, source: Path, target: Path, options: Any) -> None:
+        # Reading may take a minute.
+        require_new(target)
         case = door.pass_through(source, options)
         write_case(target, case)
         print(case)

@@ -18,7 +18,7 @@ from mvest.files import write_atomically
 from mvest.reading.table import write_columns
 from mvest.valve.io.leaflet_surfaces import write_surface
 
-__all__ = ["write_case"]
+__all__ = ["require_new", "write_case"]
 
 
 def write_case(folder: Path | str, case: ValveCase) -> Path:
@@ -43,11 +43,23 @@ def write_case(folder: Path | str, case: ValveCase) -> Path:
         The folder is not empty or cannot be written, or the reference frame is not the surface of
         the case.
     """
+    target = require_new(folder)
+    _check_reference(case)
+    return write_atomically(target, lambda part: _write_files(part, case))
+
+
+def require_new(folder: Path | str) -> Path:
+    """The folder, where a case may be written.
+
+    Raises
+    ------
+    InputError
+        There is something.
+    """
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{target}: exists and is not an empty folder; expected a new one")
-    _check_reference(case)
-    return write_atomically(target, lambda part: _write_files(part, case))
+    return target
 
 
 def _check_reference(case: ValveCase) -> None:

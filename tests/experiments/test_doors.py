@@ -98,10 +98,11 @@ def test_what_is_wrong_is_one_line(package, tmp_path, capsys, words, said):
     assert not (tmp_path / "case").exists()
 
 
-def test_an_existing_case_stays(package, tmp_path, capsys):
+def test_an_existing_case_stays_and_nothing_is_read_for_it(package, tmp_path, capsys):
     (tmp_path / "case").mkdir()
     (tmp_path / "case" / "mine").touch()
-    assert cli.main(["import", "other", "there", "case", "pressure_mmHg=1"]) == 2
+    # Read without a pressure, it would be refused for that.
+    assert cli.main(["import", "other", "there", "case"]) == 2
     assert "exists and is not an empty folder" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "case").iterdir()] == ["mine"]
 
