@@ -163,6 +163,10 @@ class RestGeometry:
         """
         return RestVariation(self._still(len(moves)), tips=moves, rest_length=rest_length)
 
+    def rest_lengths(self, changes: FloatArray) -> RestVariation:
+        """Of the chordae's rest lengths, by relative changes ``(q, c)``."""
+        return RestVariation(self._still(len(changes)), rest_length=changes)
+
     def insertions(self, moves: FloatArray) -> RestVariation:
         """Of where the chordae end, by displacements ``(q, c, 3)`` mm at rest."""
         members, weights, slope = self._patches

@@ -93,6 +93,18 @@ class RestVariation:
         members = next((part.members for part in parts if part.members is not None), None)
         return cls(nodes, **{name: of(name) for name in _OPTIONAL}, members=members)
 
+    @classmethod
+    def summed(cls, parts: Sequence[RestVariation]) -> RestVariation:
+        """As many quantities, each of which does what it does in all parts at once."""
+
+        def of(name: str) -> FloatArray | None:
+            own = [values for part in parts if (values := getattr(part, name)) is not None]
+            return sum(own[1:], own[0]) if own else None
+
+        members = next((part.members for part in parts if part.members is not None), None)
+        nodes = sum((part.nodes for part in parts[1:]), parts[0].nodes)
+        return cls(nodes, **{name: of(name) for name in _OPTIONAL}, members=members)
+
 
 _OPTIONAL = tuple(f.name for f in fields(RestVariation) if f.name not in ("nodes", "members"))
 

@@ -41,6 +41,7 @@ from mvest.observation.vertices import Observation
 from mvest.personalise.considered_geometry import geometry_columns
 from mvest.personalise.considered_law import law_columns
 from mvest.personalise.design import SHARES, FrameDesigns, StatedErrors
+from mvest.personalise.error_budget import BudgetRow, budget_rows, sample_parts
 from mvest.personalise.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
@@ -95,8 +96,7 @@ def personalise_case(
 ) -> Personalised:
     """Estimate the unknowns of a case.
 
-    Numerical failure is part of the result, with its reason; only inadmissible input raises: among
-    it are error samples of which more than a quarter are no valve that closes.
+    Numerical failure is part of the result, with its reason; only inadmissible input raises.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def personalise_case(
     seconds = {"generic": time.perf_counter() - started}
     if generic.converged and case.error_samples is not None:
         began = time.perf_counter()
-        chain.sample_geometry(generic.y)
+        chain.sample_geometry(start, generic.y)
         seconds["geometry"] = time.perf_counter() - began
 
     def timed(part: str, began: float) -> None:
@@ -137,6 +137,7 @@ def personalise_case(
         timed("held_out", began)
         narrower = chain.narrower(result)
     image_share = chain.image_share(result)
+    budget = chain.budget(result)
     moduli_only = paper = confirmed = None
     # With everything else known.
     chain.considered = ()
@@ -173,6 +174,7 @@ def personalise_case(
         chain.geometry,
         image_share,
         chain.unconsidered,
+        budget,
     )
 
 
@@ -311,7 +313,6 @@ class _Chain:
         self.shared = SharedStart(self.registered, start)
         self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.filter = self._filter(settings.tolerance)
-        self.store = store
         self.estimated = np.array([name not in self._held for name in self.names])
         self.geometry: GeometryErrors | None = None
         self.errors: SampledErrors | None = None
@@ -422,6 +423,8 @@ class _Chain:
             self.unconsidered = (prediction.reason,)
             return rough
         self.consider(at, prediction.y)
+        if self.errors is not None:
+            self.sample_geometry(at, prediction.y)
         result = self.estimate(
             self._filter(self.settings.tolerance, tuple(at.tolist())), self.observation()
         )
@@ -468,21 +471,20 @@ class _Chain:
         ]
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
-    def sample_geometry(self, generic: FloatArray) -> None:
-        """Find out what errors of the case's frames do to the observation.
+    def sample_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
+        """Find out what errors of the case's frames do to the observation at ``m``.
 
         Parameters
         ----------
-        generic : array
-            Both frames as predicted at the start, stacked.
+        m : (p,)
+        predicted : array
+            Both frames there, stacked.
         """
-        start = self.shared.start
-        self.geometry = geometry = sample_geometry(
-            self.case, self.settings, self.registered.mechanical(start), store=self.store
-        )
-        if geometry.too_few:
-            raise GeometryError(f"case {self.case.name}: {geometry.too_few}")
-        errors = errors_of(self.plain_observation(), self.closed, generic, geometry)
+        geometry = sample_geometry(self.case, self.registered, m)
+        if isinstance(geometry, str):
+            raise GeometryError(f"case {self.case.name}: what its error samples do: {geometry}")
+        self.geometry = geometry
+        errors = errors_of(self.plain_observation(), self.closed, predicted, geometry)
         self.errors = SampledErrors(self.noise(), errors)
 
     def observation(self) -> Observed:
@@ -638,6 +640,34 @@ class _Chain:
         posterior = self.sampled_posterior(filtered)
         share = np.diag(posterior.from_samples) / np.diag(posterior.covariance)
         return share[[u.is_modulus for u in self.unknowns]]
+
+    def budget(self, result: StudyResult) -> tuple[BudgetRow, ...]:
+        """What each part of what is not known costs the moduli; of error samples alone."""
+        filtered, observation = result.filtered, self.plain_observation()
+        if self.errors is None or filtered is None or filtered.prediction is None:
+            return ()
+        m = filtered.mean
+        predicted = self.shared(m)
+        parts, frames = sample_parts(self.case)
+        # One factorisation for all of them.
+        vertices, tips = (
+            np.concatenate(each) for each in zip(*parts.values(), *frames, strict=True)
+        )
+        joined = sample_geometry(self.case, self.registered, m, vertices, tips)
+        if not predicted.converged or isinstance(joined, str):
+            return ()
+        columns = errors_of(observation, self.closed, predicted.y, joined)
+        each = np.split(columns / np.sqrt(self.errors.count), len(parts) + len(frames), axis=1)
+        z = filtered.transformed_iterates[-1]
+        return budget_rows(
+            filtered.names,
+            filtered.prediction.jacobian * filtered.transform.derivative(z),
+            to_filter(filtered.transform, filtered.prior).covariance,
+            self.noise(filtered.learned, without=self._kinds),
+            dict(zip(parts, each, strict=False)),
+            each[len(parts) :],
+            {own.name: own.columns for own in self.considered},
+        )
 
     def estimate_moduli(
         self, filter_: Filter, observation: Observed, *, log: bool, variance: float | None = None

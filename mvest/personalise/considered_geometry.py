@@ -37,7 +37,15 @@ __all__ = ["ConsideredGeometry", "closure_at", "geometry_columns", "observed_cha
 SEEN = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
 
-_SCALES = ("shape_mm", "annulus_mm", "tips_mm", "insertions_mm", "thickness", "fibre_degrees")
+_SCALES = (
+    "shape_mm",
+    "annulus_mm",
+    "tips_mm",
+    "insertions_mm",
+    "rest_lengths",
+    "thickness",
+    "fibre_degrees",
+)
 
 TOLERANCE = 1e-4
 """Of derivatives, relative, far below what is known of the size of errors."""
@@ -62,6 +70,8 @@ class ConsideredGeometry:
         Of each coordinate of a papillary tip.
     insertions_mm : float
         Of each coordinate of where a chord ends, along the leaflet.
+    rest_lengths : float
+        Relative, of the rest length of each chord, beside a factor on all of them.
     thickness : float
         Relative, of each leaflet.
     fibre_degrees : float
@@ -79,6 +89,7 @@ class ConsideredGeometry:
     annulus_length_mm: float = 20.0
     tips_mm: float = 1.0
     insertions_mm: float = 0.5
+    rest_lengths: float = 0.0
     thickness: float = 0.1
     fibre_degrees: float = 10.0
     factor: float = 2.0
@@ -199,6 +210,9 @@ def _variations(
         moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
         moves = moves.reshape(-1, *moves.shape[2:])
         kinds.append(("insertions", geometry.insertions(moves), 1.0))
+    if considered.rest_lengths:
+        changes = considered.rest_lengths * np.eye(len(case.valve.chordae))
+        kinds.append(("rest lengths", geometry.rest_lengths(changes), 1.0))
     if considered.thickness:
         factors = considered.thickness * _leaflets(surface)
         kinds.append(("thickness", geometry.thickness(factors), 1.0))
@@ -233,26 +247,46 @@ def _leaflets(surface: LeafletSurface) -> FloatArray:
 
 
 def rest_lengths_by_tips(case: ValveCase, moves: FloatArray) -> FloatArray | None:
-    """Relative change ``(q, c)`` of the chordae's rest lengths where they follow from the tips.
+    """As `rest_lengths_by_ends` where tips ``(q, t, 3)`` mm are in error in all frames alike.
+
+    What is hard to make out is so at any time.
+    """
+    if not case.chordae_follow:
+        return None
+    away = -moves[:, case.chordae.tip]
+    return rest_lengths_by_ends(case, away, away)
+
+
+def rest_lengths_by_ends(
+    case: ValveCase, open_moves: FloatArray, closed_moves: FloatArray
+) -> FloatArray | None:
+    """Relative change ``(q, c)`` of the chordae's rest lengths where they follow from the frames.
 
     They are in proportion to a chord's distance in the closed frame, or, where that would be too
     short, in the open one (`mvest.cases.chord_layout.lay_out_chordae`). Where vertices of the
     closed frame do not correspond, so that it is not known where a chord ends there, the open one
-    stands for it. Tips are in error in all frames alike: what is hard to make out is so at any
-    time.
+    stands for it. None: they are known by themselves.
+
+    Parameters
+    ----------
+    case : ValveCase
+    open_moves, closed_moves : (q, c, 3) mm
+        By which the end of each chord moves against its tip in these frames.
     """
     if not case.chordae_follow:
         return None
     closed, surface, chordae = case.frame(Role.CLOSED), case.surface, case.chordae
     away = chordae.insertion - np.asarray(case.frame(Role.REFERENCE).papillary_tips)[chordae.tip]
+    moves = open_moves
     if closed.corresponds:
         place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
         ends = place.interpolate(closed.vertices, surface.triangles)
         in_closed = ends - np.asarray(closed.papillary_tips)[chordae.tip]
         by_open = ChordLayout().open_slack * np.linalg.norm(away, axis=1)
-        away = np.where((chordae.rest_length > (1 + 1e-6) * by_open)[:, None], in_closed, away)
-    squared = np.sum(away**2, axis=1)
-    return np.asarray(-np.einsum("qci,ci->qc", moves[:, chordae.tip], away) / squared)
+        by_closed = (chordae.rest_length > (1 + 1e-6) * by_open)[:, None]
+        away = np.where(by_closed, in_closed, away)
+        moves = np.where(by_closed, closed_moves, open_moves)
+    return np.asarray(np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1))
 
 
 def _of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:

@@ -1,38 +1,40 @@
 """What errors of the frames that a model is built from do to what it predicts.
 
-Each error sample of a case is a valve of its own: its open shape, boundary and chordae are built
-and closed with the parameters at which an estimation begins. How far its closed valve moves against
-that of the case, less how far its closed frame is moved, is one sample of the error of the
-innovation, that of the observation included. Closures are those of the guide's mesh where there is
-one: of the differences, 0.5 mm, it is off by a tenth (24 x 3 cells against 40 x 5, simulated).
+Each error sample of a case is a valve of its own, whose open shape, annulus, papillary tips and
+chordae are elsewhere, and with them the closed valve. How far this moves against that of the case,
+to first order (`mvest.closure.rest_geometry`), less how far its closed frame is moved, is one
+sample of the error of the innovation, that of the observation included. What errors have in common
+in both frames cancels so as far as the valve is the same elsewhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.cases.case import Frame, Role, ValveCase
-from mvest.cases.displaced import displaced_case
-from mvest.closure.model import ClosureModel
-from mvest.errors import MvestError
+from mvest.closure.rest_geometry import RestGeometry
 from mvest.estimation.noise import NoiseCovariance
 from mvest.estimation.prediction import ObservationModel, Prediction, predict
+from mvest.mechanics.reference import RestVariation
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
-from mvest.personalise.model import build_coarse
-from mvest.personalise.settings import PersonaliseSettings
+from mvest.personalise.considered_geometry import TOLERANCE, closure_at, rest_lengths_by_ends
 from mvest.problem.problem import Observed
+from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.band import Band
+from mvest.valve.geometry.proximity import closest_points
 
-__all__ = ["GeometryErrors", "WeighedObservation", "errors_of", "sample_geometry"]
-
-MAX_FAILED_SHARE = 0.25
-"""Share of the samples that need not close; those that do not are counted and reported."""
+__all__ = [
+    "GeometryErrors",
+    "WeighedObservation",
+    "errors_of",
+    "frame_errors",
+    "sample_geometry",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,83 +47,88 @@ class GeometryErrors:
         Displacement of the predicted closed valve.
     seen : (K, n, 3) mm
         Displacement of the closed frame in the same samples.
-    failures : tuple of str
-        Why samples were left out: they are no valve, or did not close.
     """
 
     predicted: FloatArray
     seen: FloatArray
-    failures: tuple[str, ...]
 
-    @property
-    def asked(self) -> int:
-        """Number of samples, those that failed included."""
-        return len(self.predicted) + len(self.failures)
-
-    @property
-    def too_few(self) -> str:
-        """Why the samples that closed do not stand for all; empty if they do."""
-        if len(self.failures) <= MAX_FAILED_SHARE * self.asked and len(self.predicted) >= 2:
-            return ""
-        return (
-            f"{len(self.failures)} of {self.asked} error samples do not close, expected at most "
-            f"{MAX_FAILED_SHARE:.0%}; the first: {self.failures[0]}"
-        )
+    def __len__(self) -> int:
+        return len(self.seen)
 
 
 def sample_geometry(
     case: ValveCase,
-    settings: PersonaliseSettings,
+    registered: RegisteredModel,
     m: FloatArray,
-    *,
-    store: Path | None = None,
-    on_sample: Callable[[int], None] | None = None,
-) -> GeometryErrors:
-    """Close the valve of every error sample of a case.
+    vertices: FloatArray | None = None,
+    tips: FloatArray | None = None,
+) -> GeometryErrors | str:
+    """How far the closed valve moves with every error sample of a case, or why that is not known.
 
     Parameters
     ----------
     case : ValveCase
-        With error samples.
-    settings : PersonaliseSettings
+    registered : RegisteredModel
+        Of the case; its last closed state is gone on from.
     m : (p,)
-        Parameters of the closure, those of a registration excluded.
-    store : Path, optional
-        Where an unstructured mesh is kept.
-    on_sample : callable, optional
-        Progress: called with the number of samples done.
+        Parameters at which the model is linearised.
+    vertices : (K, f, n, 3) mm, optional
+    tips : (K, f, t, 3) mm, optional
+        Other samples than those of the case.
     """
-    samples = case.error_samples
-    assert samples is not None
-    number = next(k for k, frame in enumerate(case.frames) if frame.role is Role.CLOSED)
-    n = len(case.surface.vertices)
-    first = _closed(build_coarse(case, settings, store), m)
-    if isinstance(first, str):
-        nothing = np.zeros((0, n, 3))
-        return GeometryErrors(
-            nothing, nothing, (f"the valve as it was seen: {first}",) * len(samples)
-        )
-    predicted, seen, failures = [], [], []
-    for k in range(len(samples)):
-        try:
-            closed = _closed(build_coarse(displaced_case(case, k), settings, store), m)
-        except MvestError as fault:
-            closed = str(fault)
-        if isinstance(closed, str):
-            failures.append(f"sample {k}: {closed}")
-        else:
-            predicted.append(closed - first)
-            seen.append(samples.vertices[k, number])
-        if on_sample is not None:
-            on_sample(k + 1)
-    shape = (-1, n, 3)
-    return GeometryErrors(np.reshape(predicted, shape), np.reshape(seen, shape), tuple(failures))
+    if vertices is None or tips is None:
+        assert case.error_samples is not None
+        vertices, tips = case.error_samples.vertices, case.error_samples.tips
+    model, at, states = closure_at(registered, m)
+    geometry = RestGeometry(model)
+    change = geometry.change(at, frame_errors(case, geometry, vertices, tips), states, TOLERANCE)
+    if isinstance(change, str):
+        return change
+    return GeometryErrors(np.moveaxis(change[-1], -1, 0), vertices[:, _numbers(case)[1]])
 
 
-def _closed(model: ClosureModel, m: FloatArray) -> FloatArray | str:
-    """Vertices ``(n, 3)`` mm of the closed valve, or why there are none."""
-    prediction = model(m)
-    return prediction.y.reshape(2, -1, 3)[1] if prediction.converged else prediction.reason
+def frame_errors(
+    case: ValveCase, geometry: RestGeometry, moves: FloatArray, tips: FloatArray
+) -> RestVariation:
+    """What a model is built from, as it is moved by samples of open and closed frame.
+
+    Parameters
+    ----------
+    case : ValveCase
+    geometry : RestGeometry
+        Of its model.
+    moves : (K, f, n, 3) mm
+    tips : (K, f, t, 3) mm
+    """
+    open_, closed = _numbers(case)
+    valve, contact, chordae = geometry.model.valve, geometry.model.contact_valve, case.chordae
+    annulus = moves[:, closed][:, case.annulus]
+    if contact is not valve:
+        band, rest = Band(valve), valve.surface.vertices[valve.annulus]
+        phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
+        still = band.annulus_positions(phi, rest)
+        annulus = np.stack([band.annulus_positions(phi, rest + own) - still for own in annulus])
+    surface = case.surface
+    place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+
+    def from_tips(number: int) -> FloatArray:
+        ends = place.interpolate(np.moveaxis(moves[:, number], 0, -1), surface.triangles)
+        return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, number][:, chordae.tip])
+
+    rest_lengths = rest_lengths_by_ends(case, from_tips(open_), from_tips(closed))
+    return RestVariation.summed(
+        [
+            geometry.shape(moves[:, open_]),
+            geometry.annulus(annulus),
+            geometry.tips(tips[:, closed], rest_lengths),
+        ]
+    )
+
+
+def _numbers(case: ValveCase) -> tuple[int, int]:
+    """Of the open and the closed frame."""
+    roles = [frame.role for frame in case.frames]
+    return roles.index(Role.REFERENCE), roles.index(Role.CLOSED)
 
 
 def errors_of(

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvest.cases.case import ValveCase
 from mvest.estimation.gaussian import Gaussian
+from mvest.personalise.error_budget import BudgetRow
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
 from mvest.problem.estimate import StudyResult
@@ -76,6 +77,8 @@ class Personalised:
         they did not enter.
     unconsidered : tuple of str
         Why what is to be considered of geometry and law was not.
+    budget : tuple of BudgetRow
+        What each part of what is not known costs the moduli, where error samples are given.
     """
 
     case: ValveCase
@@ -96,6 +99,7 @@ class Personalised:
     geometry: GeometryErrors | None = None
     image_share: FloatArray | None = None
     unconsidered: tuple[str, ...] = ()
+    budget: tuple[BudgetRow, ...] = ()
 
     def __str__(self) -> str:
         distances = [

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mvest.cases.case import ErrorSamples, Role
-from mvest.cases.displaced import displaced_case
+from mvest.cases.case import Role
+from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.noise import observation_noise
@@ -17,6 +17,7 @@ from mvest.personalise import personalise_case
 from mvest.personalise.considered_geometry import (
     ConsideredGeometry,
     geometry_columns,
+    rest_lengths_by_ends,
     rest_lengths_by_tips,
     smooth_modes,
 )
@@ -74,6 +75,18 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     np.testing.assert_allclose(
         fibres.columns @ fibres.columns.T, C @ C.T, atol=1e-3 * (C @ C.T).max()
     )
+    # A chord by itself longer by a percent does what all do together, taken apart.
+    (lengths,) = columns_of(rest_lengths=0.01)
+    geometry = RestGeometry(model)
+    count = len(model.valve.chordae)
+    all_longer = geometry.change(AT, geometry.rest_lengths(np.full((1, count), 0.01)))[1]
+    longer = np.einsum("ij,njq->niq", turn, all_longer).ravel()
+    assert lengths.columns.shape[1] <= count
+    np.testing.assert_allclose(
+        lengths.columns @ np.linalg.lstsq(lengths.columns, longer, rcond=None)[0],
+        longer,
+        atol=0.02 * np.abs(longer).max(),
+    )
     both = columns_of(shape_mm=0.3, tips_mm=1.0)
     assert [(own.name, own.factor) for own in both] == [
         ("open shape", 2.0),
@@ -90,6 +103,45 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     assert columns_of(shape_mm=0.3, tips_mm=1.0) == ()
 
 
+def laid_out(case, tips=0.0, open_move=0.0, closed_move=0.0):
+    """The chordae as they are laid out if tips and leaflets are elsewhere."""
+    surface, closed = case.surface, case.frame(Role.CLOSED)
+    band = LeafletBand.of(
+        surface.vertices + open_move,
+        surface.triangles,
+        surface.region,
+        case.annulus,
+        case.free_edge,
+        surface.region_names.index("anterior"),
+    )
+    return lay_out_chordae(
+        band,
+        np.asarray(case.frame(Role.REFERENCE).papillary_tips) + tips,
+        closed.vertices + closed_move,
+        closed.papillary_tips + tips,
+    )
+
+
+@pytest.mark.parametrize("lift", [0.0, 8.0])
+def test_rest_lengths_change_as_chordae_that_are_laid_out_on_other_frames(lift):
+    plain = corresponding(40, 12)
+    closed = plain.frame(Role.CLOSED)
+    lifted = replace(closed, vertices=closed.vertices + lift * UP)
+    plain = replace(plain, frames=tuple(lifted if f is closed else f for f in plain.frames))
+    still = laid_out(plain)
+    case = replace(plain, chordae_follow=True, chordae=still)
+    for open_, seen in (([0.2, -0.1, 0.3], 0.0), (0.0, [0.1, 0.4, -0.2])):
+        h = 1e-3
+        ahead, behind = (
+            laid_out(plain, open_move=s * np.array(open_), closed_move=s * np.array(seen))
+            for s in (h, -h)
+        )
+        expected = (ahead.rest_length - behind.rest_length) / (2 * h * still.rest_length)
+        ends = [np.broadcast_to(move, (1, len(still), 3)) for move in (open_, seen)]
+        (found,) = rest_lengths_by_ends(case, *ends)
+        np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(found).max() + 1e-6)
+
+
 @pytest.mark.parametrize("lift", [0.0, 8.0])
 def test_rest_lengths_that_follow_the_tips_change_as_those_of_a_case_with_other_tips(lift):
     # Of leaflets that are farther from the tips when closed the closed frame decides.
@@ -101,13 +153,9 @@ def test_rest_lengths_that_follow_the_tips_change_as_those_of_a_case_with_other_
             for one in plain.frames
         ),
     )
-    frames, n = len(plain.frames), len(plain.surface.vertices)
     move = np.random.default_rng(4).standard_normal((1, len(plain.valve.papillary_tips), 3))
-    tips = np.stack([h * move[0] for h in (0.01, -0.01, 0.0, 0.0)])[:, None].repeat(frames, 1)
-    samples = ErrorSamples(np.zeros((4, frames, n, 3)), tips)
-    case = replace(plain, chordae_follow=True, error_samples=samples)
-    ahead, behind, still = (displaced_case(case, k).chordae for k in range(3))
-    case = replace(case, chordae=still)
+    ahead, behind, still = (laid_out(plain, tips=h * move[0]) for h in (0.01, -0.01, 0.0))
+    case = replace(plain, chordae_follow=True, chordae=still)
     expected = (ahead.rest_length - behind.rest_length) / (0.02 * still.rest_length)
     (found,) = rest_lengths_by_tips(case, move)
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())

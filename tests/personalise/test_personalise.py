@@ -23,6 +23,8 @@ from mvest.personalise import (
     personalise_case,
 )
 from mvest.personalise.chain import _Chain, _thinned
+from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
+from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.model import held_state
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -32,7 +34,6 @@ from tests.made_up_closure import (
     MECHANICS,
     PRIORS,
     TRUE,
-    VALVE,
     MadeUpClosure,
     made_up_case,
     settings,
@@ -566,27 +567,15 @@ def seen_in_error(case, count=12, std=0.4, seed=3):
     )
 
 
-def use_geometry(monkeypatch, *, fails=()):
+def use_geometry(monkeypatch):
     """The formula, moved along with the open shape twice as far as this is moved."""
     use(monkeypatch)
-    rest = VALVE.surface.vertices
 
-    def build(case, wanted, store=None):
-        model = MadeUpClosure(MODULI)
-        call = model.__call__
-        moved = 2.0 * (case.surface.vertices - rest)
+    def sample(case, registered, m, vertices=None, tips=None):
+        given = case.error_samples.vertices if vertices is None else vertices
+        return GeometryErrors(2.0 * given[:, 0], given[:, 1])
 
-        def predict(m):
-            if np.abs(moved).max() > 0 and next(numbers) in fails:
-                return Prediction.failed("no equilibrium")
-            found = call(m[:2])
-            y = found.y + np.concatenate([np.zeros(moved.size), moved.ravel()])
-            return Prediction(y, found.jacobian)
-
-        return predict
-
-    numbers = iter(range(10**6))
-    monkeypatch.setattr("mvest.personalise.geometry_errors.build_coarse", build)
+    monkeypatch.setattr("mvest.personalise.chain.sample_geometry", sample)
 
 
 @pytest.mark.parametrize(("correspondence", "std"), [(True, 0.3), (False, 0.02)])
@@ -615,23 +604,34 @@ def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
     use_geometry(monkeypatch)
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     chain = _Chain(case, settings(*right_nuisances()), None, None)
-    chain.sample_geometry(chain.shared(chain.shared.start).y)
+    start = chain.shared.start
+    chain.sample_geometry(start, chain.shared(start).y)
     each = case.error_samples.vertices[:, 1]
     np.testing.assert_allclose(chain.geometry.predicted, 2.0 * each, atol=1e-9)
     np.testing.assert_allclose(chain.errors.samples.T, each.reshape(len(each), -1), atol=1e-9)
 
 
-def test_samples_that_do_not_close_are_counted_and_too_many_of_them_are_an_error(monkeypatch):
+def test_errors_of_frames_that_cannot_be_told_are_an_error(monkeypatch):
+    use_geometry(monkeypatch)
+    monkeypatch.setattr("mvest.personalise.chain.sample_geometry", lambda *_: "no equilibrium")
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
-    use_geometry(monkeypatch, fails=(1, 5, 7))
-    found = personalise_case(case, settings(*right_nuisances()))
-    assert [text.split(":")[0] for text in found.geometry.failures] == [
-        "sample 1", "sample 5", "sample 7"
-    ]  # fmt: skip
-    assert (found.geometry.asked, len(found.geometry.predicted)) == (12, 9)
-    use_geometry(monkeypatch, fails=(1, 5, 7, 8))
-    with pytest.raises(GeometryError, match=r"4 of 12 error samples do not close.*no equilibrium"):
+    with pytest.raises(GeometryError, match="error samples do: no equilibrium"):
         personalise_case(case, settings(*right_nuisances()))
+
+
+def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
+    use_geometry(monkeypatch)
+    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1), displaced=False))
+    found = personalise_case(case, settings(*right_nuisances()))
+    of = {(row.part, row.modulus): row for row in found.budget}
+    for modulus in MODULI:
+        everything, images = of[EVERYTHING, modulus], of[IMAGES, modulus]
+        assert everything.alone < images.alone
+        assert images.without < everything.without
+        # Errors that are the same in both frames cancel in part; unlike each other they do not.
+        assert of[APART, modulus].without > everything.without
+    plain = replace(case, error_samples=None)
+    assert personalise_case(plain, settings(*right_nuisances())).budget == ()
 
 
 def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):

@@ -28,6 +28,7 @@ from mvest.reporting.case.findings import (
     NUISANCE,
     About,
     CaseFindings,
+    Cost,
     ErrorRow,
     FrameDistances,
     ImageErrors,
@@ -180,6 +181,9 @@ def _case_findings(
         observation_std_mm=fit.case.uncertainty.typical_mm,
         narrow=_narrow(fit),
         image_errors=_image_errors(fit),
+        budget=tuple(
+            Cost(_label(row.part), row.modulus, row.without, row.alone) for row in fit.budget
+        ),
         measurements=_measurements(fit),
         confirmed_mm=fit.confirmed_mm,
         settings=settings,
@@ -396,8 +400,7 @@ def _image_errors(fit: Personalised) -> ImageErrors | None:
     moduli = [name for name in fit.names if name.startswith("E_f.")]
     share = fit.image_share
     return ImageErrors(
-        fit.geometry.asked,
-        tuple(fit.geometry.failures),
+        len(fit.geometry),
         None if share is None else dict(zip(moduli, map(float, share), strict=True)),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from experiments.common.estimates import Data, SeedRun
-from mvest.reporting.case.findings import FrameDistances, ImageErrors, UnknownRow
+from mvest.reporting.case.findings import Cost, FrameDistances, ImageErrors, UnknownRow
 
 __all__ = ["KNOWN", "Findings", "KnownGeometry", "Row"]
 
@@ -46,6 +46,7 @@ class Findings:
     unknowns: tuple[UnknownRow, ...]
     known_geometry: KnownGeometry
     image_errors: ImageErrors | None = None
+    budget: tuple[Cost, ...] = ()
     distances: tuple[FrameDistances, ...] = ()
     repeats: tuple[SeedRun, ...] = ()
     data: Data | None = None

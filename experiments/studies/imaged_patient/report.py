@@ -9,6 +9,7 @@ from experiments.common.cases.blind import ESTIMATE, read_estimate
 from experiments.common.cases.report import estimation_text, write_case_run
 from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
+from experiments.studies.imaged_patient.budget import write_budget
 from experiments.studies.imaged_patient.findings import KNOWN, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables
 from mvest.reporting.case.findings import UnknownRow
@@ -47,6 +48,14 @@ def write_run(folder: Path, record: Record[Findings]) -> list[Path]:
 def write_volumes(
     folder: Path, records: Mapping[str, Record[Findings]], _arrays: Mapping[str, Path]
 ) -> list[Path]:
-    """The table of all volumes."""
+    """The table of all volumes, and what costs them how much of the moduli."""
+    last = list(records.values())[-1]
     rows = [row for record in records.values() for row in record.findings.rows]
-    return write_volume_tables(folder, rows, list(records.values())[-1].line)
+    first = rows[0].modulus
+    budgets = {record.row: record.findings.budget for record in records.values()}
+    return [
+        *write_volume_tables(folder / last.table, rows, last.line),
+        *write_budget(
+            folder / f"{last.table}_budget", budgets, first.prior_std / first.prior_mean, last.line
+        ),
+    ]

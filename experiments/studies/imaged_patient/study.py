@@ -114,6 +114,7 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
         if isinstance(known, str)
         else KnownGeometry(known.status != FAILED, known.reason, known.findings.case.unknowns),
         image_errors=left.case.image_errors if left else None,
+        budget=left.case.budget if left else (),
         distances=left.case.distances if left else (),
         repeats=(replace(left.repeats[0], seed=values["seed"]),) if left else (),
         data=left.data if left else None,
@@ -262,6 +263,14 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSet
     return case_of_sequence(stated, frames, texts)
 
 
+def _costs(table: str, of: str) -> Section:
+    """What `write_budget` leaves of a table."""
+    name = f"{table}_budget"
+    caption = f"Where the information dies between a volume and a modulus.{of} Simulated."
+    title = f"What is not known costs the moduli.{of}"
+    return Section(name, {name: caption}, title=title, table=table)
+
+
 STUDY = Study(
     settings=Settings,
     findings=Findings,
@@ -274,5 +283,11 @@ STUDY = Study(
         Section(
             "volume", title="Moduli from simulated volumes", answer=volumes_answer, headline=True
         ),
+        _costs("volume", ""),
+        Section(
+            "volume_development",
+            title="Moduli from simulated volumes of the patients that choices were made on",
+        ),
+        _costs("volume_development", " Patients that choices were made on."),
     ),
 )

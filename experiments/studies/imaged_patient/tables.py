@@ -86,8 +86,8 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     return out
 
 
-def write_volume_tables(results: Path, rows: Sequence[Row], line: str) -> list[Path]:
-    """``volume.*`` from rows as for `volume_table`; ``line`` says where they came from.
+def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path]:
+    """The table ``base`` of rows as for `volume_table`; ``line`` says where they came from.
 
     Raises
     ------
@@ -119,4 +119,4 @@ def write_volume_tables(results: Path, rows: Sequence[Row], line: str) -> list[P
         for one in baselines(moduli)
     ]
     notes = [TRUTH_OF_MODULI, skill_words(moduli), *volume_words(table)]
-    return write_table(results / "volume", table, readable, line, notes)
+    return write_table(base, table, readable, line, notes)

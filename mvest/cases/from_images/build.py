@@ -20,9 +20,13 @@ from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError
+from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template, TemplateParameters, vertex_region
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
+from mvest.valve.geometry.triangles import unit_rows
 
 __all__ = ["CaseTexts", "case_of_sequence"]
 
@@ -51,13 +55,15 @@ def case_of_sequence(
 ) -> ValveCase:
     """The case that a sequence tells.
 
+    Thickness and fibres vary over a leaflet as they do in the template: that cannot be seen.
+
     Parameters
     ----------
     sequence : ValveSequence
     frames : CaseFrames
     texts : CaseTexts
     thickness_mm : mapping, optional
-        Of each leaflet; generic values if not given.
+        Of each leaflet next to the annulus; generic values if not given.
     error_samples : ErrorSamples, optional
         In the frames of the case, in the order of time.
 
@@ -81,20 +87,26 @@ def case_of_sequence(
     if thickness_mm is None:
         listed = ", ".join(f"{given[name]:g} mm ({name})" for name in layout.region_names)
         derived.append(f"thickness: {listed} assumed")
-    region = np.where(np.mod(layout.phi, 360.0) < 180.0, 0, 1)
-    thickness = np.array([given[name] for name in layout.region_names])[region]
+    typical = Template(
+        TemplateParameters().changed(
+            {f"leaflets.{name}.thickness": mm for name, mm in given.items()}
+        )
+    )
+    thickness = typical.thickness(layout.phi, layout.s)
     check_thickness(thickness)
     derived += [
-        "fibre: circumferential, perpendicular to the gradient from annulus to free edge",
+        "thickness: falls towards the free edge as in the template, to "
+        f"{typical.parameters.leaflets.edge_thinning:.0%}",
+        "fibre: around the valve, turned as in the template near the commissures of the anterior "
+        "leaflet",
         "annulus and free edge: the first and the last row of the image step's layout",
     ]
-    around = surface_coordinates(reference, layout.triangles, layout.annulus, layout.free_edge)
     surface = LeafletSurface(
         reference,
         layout.triangles,
         layout.region,
         layout.region_names,
-        around.circumferential,
+        _fibres(layout, reference, typical),
         thickness,
     )
     band = LeafletBand.of(
@@ -131,6 +143,19 @@ def case_of_sequence(
         error_samples=error_samples,
         chordae_follow=True,
     )
+
+
+def _fibres(layout: ValveLayout, vertices: FloatArray, typical: Template) -> FloatArray:
+    """Directions ``(n, 3)`` around the valve, turned towards its axis as they typically are."""
+    loops = layout.annulus, layout.free_edge
+    t = surface_coordinates(vertices, layout.triangles, *loops).circumferential
+    grid = vertices.reshape(layout.rows, layout.columns, 3)
+    onward = (np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1)).reshape(-1, 3)
+    t = t * np.sign(np.sum(t * onward, axis=1))[:, None]
+    r = np.asarray(np.gradient(grid, axis=0)).reshape(-1, 3)
+    r = unit_rows(r - np.sum(r * t, axis=1)[:, None] * t)
+    angle = typical.fibre_angle(layout.phi, vertex_region(layout.phi))[:, None]
+    return np.asarray(np.cos(angle) * t - np.sin(angle) * r)
 
 
 def _check_frame(sequence: ValveSequence, number: int, side: float, *, is_reference: bool) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 from mvest.problem.verdict import Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
-__all__ = ["About", "CaseFindings", "ErrorRow", "FrameDistances", "ImageErrors", "ImageStep",
-           "ModuliAlone", "ModulusRow", "Narrower", "Picture", "ToTruth", "UnknownRow",
-           "VolumeAbout", "WhitenessTest"]  # fmt: skip
+__all__ = ["About", "CaseFindings", "Cost", "ErrorRow", "FrameDistances", "ImageErrors",
+           "ImageStep", "ModuliAlone", "ModulusRow", "Narrower", "Picture", "ToTruth",
+           "UnknownRow", "VolumeAbout", "WhitenessTest"]  # fmt: skip
 
 MODULUS, NUISANCE = "modulus", "nuisance"
 """Kinds of an unknown."""
@@ -174,8 +174,20 @@ class ImageErrors:
     """
 
     samples: int
-    failures: tuple[str, ...] = ()
     share_of_variance: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """SD of a modulus' logarithm if a part of what is not known were, and if it were all there is.
+
+    See `mvest.personalise.error_budget`.
+    """
+
+    part: str
+    modulus: str
+    without: float
+    alone: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +274,7 @@ class CaseFindings:
     observation_std_mm: float | None = None
     narrow: tuple[Narrower, ...] = ()
     image_errors: ImageErrors | None = None
+    budget: tuple[Cost, ...] = ()
     measurements: Mapping[str, Mapping[str, Mapping[str, float | None]]] = field(
         default_factory=dict
     )

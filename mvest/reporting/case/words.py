@@ -418,13 +418,9 @@ def image_error_words(case: CaseFindings) -> list[str]:
     if errors is None:
         return []
     out = [
-        f"The valve was closed anew with {errors.samples} samples of the errors of its images: "
+        f"The closed valve was moved as {errors.samples} samples of the errors of its images say: "
         "of the open shape, annulus, tips and chordae as well as of the closed frame."
     ]
-    if errors.failures:
-        out.append(
-            f"{len(errors.failures)} of them did not close and were left out: {errors.failures[0]}."
-        )
     labels = {row.name: row.label for row in case.unknowns}
     for name, share in (errors.share_of_variance or {}).items():
         out.append(f"Of the variance of {labels.get(name, name)} they make {percent(share)}.")

@@ -22,7 +22,7 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, band_grid
 
-__all__ = ["ChordLayout", "Template", "TemplateParameters"]
+__all__ = ["ChordLayout", "Template", "TemplateParameters", "vertex_region"]
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")
@@ -43,6 +43,11 @@ def _mirrored(point: tuple[float, float, float]) -> FloatArray:
 def _between(phi: FloatArray, start: float, end: float) -> BoolArray:
     """Which angles ``(k,)`` in degrees lie in [start, end], whatever multiple of 360 they are."""
     return np.asarray(np.mod(phi - start, 360.0) <= end - start)
+
+
+def vertex_region(phi: FloatArray) -> IntArray:
+    """The leaflet of vertices ``(k,)`` at angles in degrees; commissures are the posterior's."""
+    return np.where((phi > 0) & (phi < 180), ANTERIOR, POSTERIOR)
 
 
 class Template:
@@ -197,14 +202,18 @@ class Template:
     def fibre(self, phi: FloatArray, s: FloatArray, region: IntArray) -> FloatArray:
         """Unit fibre directions ``(k, 3)`` seen from the leaflet ``region``."""
         t, r = self.tangents(phi, s)
-        turn = self.parameters.leaflets.fibre_turn * 180.0
-        from_commissure = np.minimum(np.mod(phi, 360.0), np.abs(180.0 - np.mod(phi, 360.0)))
-        angle = 0.5 * np.pi * (1 - _smoothstep(from_commissure / turn))
-        angle = np.where(region == ANTERIOR, angle, 0.0)
+        angle = self.fibre_angle(phi, region)
         normal = np.cross(r, t)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         across = np.cross(normal, t)
         return np.cos(angle)[..., None] * t + np.sin(angle)[..., None] * across
+
+    def fibre_angle(self, phi: FloatArray, region: IntArray) -> FloatArray:
+        """Angle ``(k,)`` in rad of the fibres to the direction around the valve."""
+        turn = self.parameters.leaflets.fibre_turn * 180.0
+        from_commissure = np.minimum(np.mod(phi, 360.0), np.abs(180.0 - np.mod(phi, 360.0)))
+        angle = 0.5 * np.pi * (1 - _smoothstep(from_commissure / turn))
+        return np.where(region == ANTERIOR, angle, 0.0)
 
     # -- what hangs on it -------------------------------------------------------------------------
     @property
@@ -304,13 +313,12 @@ class Template:
                 f"template of {columns} x {rows} vertices, expected an even number >= 8 x >= 3"
             )
         phi, s, triangles, region = band_grid(columns, rows)
-        vertex_region = np.where((phi > 0) & (phi < 180), ANTERIOR, POSTERIOR)
         surface = LeafletSurface(
             self.position(phi, s),
             triangles,
             region,
             REGIONS,
-            self.fibre(phi, s, vertex_region),
+            self.fibre(phi, s, vertex_region(phi)),
             self.thickness(phi, s),
         )
         return Valve(

@@ -16,6 +16,7 @@ from mvest.cases.from_images import (
     measure_sequence,
     samples_in_world,
     valve_axes,
+    with_mirror_images,
     without_mean_error,
 )
 from mvest.cases.writer import write_case
@@ -74,6 +75,41 @@ def test_a_case_does_not_depend_on_how_the_patient_lies():
     np.testing.assert_allclose(there.chordae.rest_length, here.chordae.rest_length, rtol=1e-9)
     np.testing.assert_array_equal(there.chordae.tip, here.chordae.tip)
     assert there.derived == here.derived
+
+
+def test_thickness_and_fibres_vary_as_in_the_template():
+    case, valve = case_of_sequence(sequence(TURN), FRAMES, TEXTS), Template().valve(32, 9)
+    np.testing.assert_allclose(case.surface.thickness, valve.surface.thickness, rtol=1e-12)
+    along = np.abs(np.sum(case.surface.fibre @ TURN * valve.surface.fibre, axis=1))
+    # Directions follow from the vertices alone; at the commissures the surface bends sharply.
+    away = np.abs(np.sin(np.deg2rad(LAYOUT.phi))) > 0.3
+    assert along[away].min() > 0.97
+    assert np.median(along) > 0.995
+    # Half-way to the commissure they are turned by half a right angle, to one side only.
+    turned = case.surface.fibre @ TURN
+    t = np.cross(valve.surface.fibre, turned)
+    assert np.median(np.linalg.norm(t, axis=1)) < 0.1
+    thicker = case_of_sequence(
+        sequence(), FRAMES, TEXTS, thickness_mm={"anterior": 2.64, "posterior": 1.26}
+    )
+    middle = LAYOUT.vertex(90.0, 0)
+    assert thicker.surface.thickness[middle] == pytest.approx(2.64)
+
+
+def test_errors_as_seen_in_a_mirror():
+    rng = np.random.default_rng(0)
+    errors, tips = rng.standard_normal((3, 2, LAYOUT.size, 3)), rng.standard_normal((3, 2, 2, 3))
+    both, both_tips = with_mirror_images(LAYOUT, errors, tips)
+    np.testing.assert_array_equal(both[:3], errors)
+    # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
+    here, there = LAYOUT.vertex(45.0, 4), LAYOUT.vertex(135.0, 4)
+    np.testing.assert_array_equal(both[3:, :, there], errors[:, :, here] * [-1, 1, 1])
+    behind, beside = LAYOUT.vertex(225.0, 2), LAYOUT.vertex(315.0, 2)
+    np.testing.assert_array_equal(both[3:, :, beside], errors[:, :, behind] * [-1, 1, 1])
+    np.testing.assert_array_equal(both_tips[3:, :, 0], tips[:, :, 1] * [-1, 1, 1])
+    again, tips_again = with_mirror_images(LAYOUT, both[3:], both_tips[3:])
+    np.testing.assert_array_equal(again[3:], errors)
+    np.testing.assert_array_equal(tips_again[3:], tips)
 
 
 def test_what_was_seen_last_may_be_the_open_valve():

@@ -11,6 +11,7 @@ from experiments.common.study import Job
 from experiments.common.virtual_patients import PatientSettings
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
+from experiments.studies.imaged_patient.budget import write_budget
 from experiments.studies.imaged_patient.findings import Findings, KnownGeometry, Row
 from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
 from experiments.studies.imaged_patient.tables import (
@@ -19,7 +20,8 @@ from experiments.studies.imaged_patient.tables import (
     write_volume_tables,
 )
 from mvest.errors import InputError
-from mvest.reporting.case.findings import UnknownRow
+from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
+from mvest.reporting.case.findings import Cost, UnknownRow
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import an_outcome
 
@@ -158,7 +160,7 @@ def test_errors_of_moduli_add_up():
 
 
 def test_the_table_of_moduli_is_readable(tmp_path):
-    written = write_volume_tables(tmp_path, MODULI, "volumes: mvest 0.1.0")
+    written = write_volume_tables(tmp_path / "volume", MODULI, "volumes: mvest 0.1.0")
     assert [path.name for path in written] == ["volume.csv", "volume.md", "volume.tex"]
     text = written[1].read_text(encoding="utf-8")
     rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
@@ -168,6 +170,30 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     assert rows[2].count("–") == 3
     assert "Simulated" in text or "simulated" in text
     assert "\\" in written[2].read_text(encoding="utf-8")
+
+
+def test_what_errors_cost_is_a_median_over_patients(tmp_path):
+    def costs(scale):
+        return [
+            Cost(part, f"E_f.{leaflet}", scale * without, scale * alone)
+            for leaflet in ("anterior", "posterior")
+            for part, without, alone in (
+                (EVERYTHING, 0.2, 0.05),
+                (IMAGES, 0.1, 0.15),
+                (APART, 0.3, 0.25),
+                ("papillary tips", 0.19, 0.06),
+                ("pressure", 0.17, 0.1),
+            )
+        ]
+
+    budgets = {"a": costs(1.0), "b": costs(2.0), "c": costs(1.1), "lost": ()}
+    written = write_budget(tmp_path / "volume_budget", budgets, 0.5, "line")
+    assert {path.suffix for path in written} >= {".csv", ".md", ".png"}
+    text = (tmp_path / "volume_budget.md").read_text(encoding="utf-8")
+    assert "| pressure | 0.187 | 0.110 | 0.187 | 0.110 |" in text
+    assert "median over 3 simulated" in text
+    assert "Alone cost most: pressure (0.11), papillary tips (0.07)." in text
+    assert write_budget(tmp_path / "none", {"lost": ()}, 0.5, "line") == []
 
 
 @pytest.mark.parametrize(
