@@ -137,6 +137,9 @@ class Indications:
         Whether the valve has passed the gate (:mod:`mvest.closure.robustness`); None: not asked.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
+    unlike : str
+        How the volume that the case is from is unlike those that detectors were trained on; empty
+        where it is not, or where there is no volume.
     """
 
     estimated: bool
@@ -157,6 +160,7 @@ class Indications:
     gate: bool | None = None
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
+    unlike: str = ""
 
 
 APPROXIMATION = 2.0
@@ -248,6 +252,8 @@ def _approximated(e: Indications) -> Seen:
 def _plausible(e: Indications) -> Seen:
     for text in e.mistakes:
         yield Ground("case", NONE, text, "mend the case and run it again")
+    if e.unlike:
+        yield Ground("case", NONE, e.unlike, "record another volume, or segment it by other means")
     for text in e.doubts:
         yield Ground("case", DOUBTFUL, text, "look at this part of the case")
 

@@ -188,7 +188,9 @@ def _case_findings(
         confirmed_mm=fit.confirmed_mm,
         settings=settings,
         image_step=image_step,
-        verdict=judge(indications_of(fit, gate)),
+        verdict=judge(
+            replace(indications_of(fit, gate), unlike=image_step.unlike if image_step else "")
+        ),
     )
 
 

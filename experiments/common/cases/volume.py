@@ -32,10 +32,7 @@ from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection.tracking import NoValveError, TrackingSettings, detect_valve
-from mvest.imaging.detection.trained_model import (
-    default_model,
-    load_model,
-)
+from mvest.imaging.detection.trained_model import UNLIKE_SHARE, default_model, load_model
 from mvest.imaging.landmarks import ANNULUS_LABELS, LANDMARKS
 from mvest.imaging.markups import read_markups
 from mvest.imaging.models import MODEL_FILE
@@ -67,7 +64,8 @@ class DetectedValve:
     """The valve that the image step detected in a volume, with the measures of every frame.
 
     Of the detection model there is what is known of it, as plain data. Where no pressure is stated
-    the case has a stand-in for it, and is there to be checked only.
+    the case has a stand-in for it, and is there to be checked only. ``unlike`` says how the volume
+    is unlike those of training, and is empty where it is not.
     """
 
     volume: VolumeSequence
@@ -78,6 +76,7 @@ class DetectedValve:
     model: dict[str, Any]
     pressure_stated: bool
     min_confidence: float
+    unlike: str
 
 
 def run_volume(
@@ -173,7 +172,7 @@ def detect_in_volume(
         settings.licence,
         settings.simulated,
     )
-    accuracy = model.accuracy
+    accuracy = model.accuracy.at(valve.confidence)
     corrected, errors, tip_errors = without_mean_error(
         valve, frames, accuracy.samples, accuracy.tip_samples
     )
@@ -197,7 +196,28 @@ def detect_in_volume(
     )
     about = {"sha256": model.sha256, "trained_on": model.trained_on}
     stated = not (settings.pressure_mmHg is None and curve is None)
-    return DetectedValve(volume, valve, rows, frames, case, about, stated, settings.min_confidence)
+    return DetectedValve(
+        volume,
+        valve,
+        rows,
+        frames,
+        case,
+        about,
+        stated,
+        settings.min_confidence,
+        _unlike(valve.confidence, accuracy.like_from),
+    )
+
+
+def _unlike(confidence: float, like_from: float) -> str:
+    """How a volume is unlike those of training; empty if it is not."""
+    if confidence >= like_from:
+        return ""
+    return (
+        f"the volume is unlike those that the detectors were trained on: confidence "
+        f"{confidence:.2f} in the median frame, expected at least {like_from:.2f}, which all but "
+        f"{100 * UNLIKE_SHARE:g} % of volumes like those reach"
+    )
 
 
 def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
@@ -267,6 +287,7 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         confidence=tuple(detected.valve.frame_confidence.tolist()),
         std_mm=uncertainty.typical_mm,
         correlation_length_mm=uncertainty.correlation_length_mm,
+        unlike=detected.unlike,
     )
 
 
@@ -303,6 +324,7 @@ def _sentences(detected: DetectedValve) -> tuple[str, ...]:
         "The detectors were trained and tested on simulated volumes only; their error there is "
         f"{detected.case.uncertainty.typical_mm:.2f} mm in each coordinate, alike over "
         f"{detected.case.uncertainty.correlation_length_mm:.0f} mm.",
+        *([f"{detected.unlike[0].upper()}{detected.unlike[1:]}."] if detected.unlike else []),
         *(f"Derived: {sentence}." for sentence in detected.case.derived),
         *(() if detected.pressure_stated else (NO_PRESSURE,)),
     )

@@ -51,13 +51,16 @@ SETTING = {"sequence": VOLUMES[0], "shifted sequence": VOLUMES[1]}
 """What tables call volumes over time."""
 
 
-def findings_of(store: ImagingStore, tested: Evaluation | None, model_file: Path) -> Findings:
+def findings_of(
+    store: ImagingStore, tested: Evaluation | None, model_file: Path, trained_on: Row
+) -> Findings:
     """What a finished study cost, and what came of it."""
     settings, raw = store.settings, model_file.read_bytes()
     spent = _spent(store)
     motion = settings.population.motion
     cpu_s = spent["training"].cpu_s
-    which = ("train",) if tested is None else ("train", "calibration", "test")
+    trained = () if store.given else ("train",)
+    which = trained if tested is None else (*trained, "calibration", "test")
     return Findings(
         seconds=cpu_s or 0.0,
         memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
@@ -67,8 +70,9 @@ def findings_of(store: ImagingStore, tested: Evaluation | None, model_file: Path
             name: record.Population(getattr(settings, name).count, dict(drawn.refused))
             for name in which
             for drawn in (store.population(name),)
-        },
-        training_volumes=store.training.volumes,
+        }
+        | ({} if trained else {"train": record.Population(len(trained_on["valves"]), {})}),
+        training_volumes=trained_on["volumes"],
         spent=spent,
         targets=settings.targets,
         tested=tested,
@@ -102,6 +106,9 @@ def tested_of(
             sequences=len(accuracy.samples),
             left_out=len(sequences["calibration"]) - len(accuracy.samples),
             mean_error_mm=float(np.linalg.norm(accuracy.samples.mean(axis=0), axis=2).mean()),
+            widening=accuracy.widening,
+            like_from=accuracy.like_from,
+            unlike=_unlike(held_out, accuracy.like_from),
             correlogram=Correlations(
                 **{key: _rounded(values) for key, values in asdict(correlogram).items()}
             ),
@@ -272,17 +279,27 @@ def _coverage(
     if not held_out.sequences[kind]:
         return
     errors, mean = held_out.stacked(kind, "errors"), accuracy.samples.mean(axis=0)
+    factor = np.array([accuracy.factor(c) for c in held_out.confidence(kind)])[:, None, None, None]
     for k, frame in enumerate(("open", "closed")):
         own, about = errors[:, k : k + 1], mean[k : k + 1]
         yield Coverage(
             setting=setting,
             frame=frame,
             sequences=len(errors),
-            share=share_within(own, accuracy.std_mm),
-            share_about_mean=share_within(own, accuracy.std_mm, about),
+            share=share_within(own / factor, accuracy.std_mm),
+            share_about_mean=share_within((own - about) / factor, accuracy.std_mm),
             rms_mm=float(np.sqrt((own**2).mean())),
-            stated_rms_mm=float(np.sqrt((accuracy.std_mm**2).mean())),
+            stated_rms_mm=float(np.sqrt((accuracy.std_mm**2).mean() * (factor**2).mean())),
         )
+
+
+def _unlike(held_out: HeldOut, like_from: float) -> dict[str, int]:
+    """How many volumes over time count as unlike those of training, by what tables call them."""
+    return {
+        setting: int((held_out.confidence(kind) < like_from).sum())
+        for kind, setting in SETTING.items()
+        if held_out.sequences[kind]
+    }
 
 
 def _mean(values: Any) -> float:
@@ -292,17 +309,19 @@ def _mean(values: Any) -> float:
 def _spent(store: ImagingStore) -> dict[str, Spent]:
     """CPU and wall-clock seconds of every part; None where it was not measured."""
     settings = store.settings
-    volumes = store.samples(store.population("train").valves, store.training.volumes)
-    parts = {
-        "valves": store.population_spent("train"),
-        "volumes": Spent(sum(one.cpu_s for one in volumes)),
-        "draft": store.draft_spent(),
-        "trees": store.model_spent(store.training.volumes),
-    }
+    parts = dict.fromkeys(("valves", "volumes", "draft", "trees"), Spent(None))
+    if store.given is None:
+        volumes = store.samples(store.population("train").valves, store.training.volumes)
+        parts = {
+            "valves": store.population_spent("train"),
+            "volumes": Spent(sum(one.cpu_s for one in volumes)),
+            "draft": store.draft_spent(),
+            "trees": store.model_spent(store.training.volumes),
+        }
     known = [spent.cpu_s for spent in parts.values() if spent.cpu_s is not None]
     parts["training"] = Spent(sum(known) if len(known) == len(parts) else None)
     if settings.evaluate:
-        for size in settings.curve:
+        for size in store.curve:
             parts[f"trees of {size} volumes"] = store.model_spent(size)
         for which in ("calibration", "test"):
             parts[f"valves of {which}"] = store.population_spent(which)

@@ -138,7 +138,10 @@ class Accuracy:
     """Errors that detectors state, from volumes over time of valves of their own.
 
     ``std_mm (n,)`` is of a coordinate of each vertex. Volumes in which the valve was not detected,
-    or something else was, are left out.
+    or something else was, are left out. In a volume errors are stated wider by a factor that
+    ``widening`` gives for its confidence, and it is unlike those of training below ``like_from``
+    (:class:`mvest.imaging.detection.trained_model.DetectionAccuracy`); ``unlike`` says how many
+    volumes over time are, by setting.
     """
 
     std_mm: Vector
@@ -149,6 +152,9 @@ class Accuracy:
     mean_error_mm: float
     correlogram: Correlations
     within_95: tuple[Coverage, ...]
+    widening: Vector = (1.0, 0.0)
+    like_from: float = 0.0
+    unlike: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

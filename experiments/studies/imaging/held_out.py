@@ -66,6 +66,12 @@ class HeldOut:
         ]
         return HeldOut(self.volumes, {kind: kept})
 
+    def confidence(self, kind: str) -> FloatArray:
+        """Of each volume over time ``(S,)``, as `mvest.imaging.valve_sequence.ValveSequence`."""
+        return np.array(
+            [np.median([f["confidence"] for f in row["frames"]]) for row, _ in self.sequences[kind]]
+        )
+
     def stacked(self, kind: str, name: str) -> FloatArray:
         """Arrays of all volumes over time: ``errors (S, 2, n, 3)``, ``tip_errors``, ``rest`` mm."""
         return np.stack([arrays[name] for _, arrays in self.sequences[kind]])
@@ -80,20 +86,25 @@ def hold_out(
     held_out = store.settings.held_out
     counts = dict(zip(VOLUMES, (held_out.volumes, held_out.shifted), strict=True))
     counts |= dict.fromkeys(WITHOUT_VALVE, held_out.without_valve)
-    every = [store.training.volumes, *sorted(store.settings.curve, reverse=True)]
+    every = [store.training.volumes, *sorted(store.curve, reverse=True)]
     asked = []
     for kind, count in counts.items():
         for number in range(count):
             also = kind in VOLUMES and number < held_out.curve_volumes
             asked.append((_trial(store, kind, number), every if also else every[:1]))
     volumes = _volumes(store, asked, test, settings)
-    lengths = (len(calibration), held_out.sequences, held_out.shifted_sequences)
+    lengths = (
+        len(calibration),
+        held_out.sequences,
+        held_out.shifted_sequences,
+        held_out.wide_calibration,
+    )
     sequences = {
         kind: _sequences(
             store,
             [_trial(store, kind, number) for number in range(count)],
-            "calibration" if kind == "calibration" else "test",
-            calibration if kind == "calibration" else test,
+            "calibration" if kind.endswith("calibration") else "test",
+            calibration if kind.endswith("calibration") else test,
             settings,
         )
         for kind, count in zip(SEQUENCES, lengths, strict=True)

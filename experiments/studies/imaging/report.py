@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,13 @@ from experiments.studies.imaging.findings import Accuracy, Confidences, Evaluati
 from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_table
 from mvest.imaging.layout import ValveLayout
 from mvest.reporting.figures import save_figure_with
-from mvest.reporting.images.figures import SETTINGS, distance_figure, std_figure, training_figure
+from mvest.reporting.images.figures import (
+    LIMITS_MM,
+    SETTINGS,
+    distance_figure,
+    std_figure,
+    training_figure,
+)
 from mvest.reporting.markup import MISSING, number
 from mvest.reporting.style import COLOURS, GREY, MARKERS, SMALL, headline, panels
 
@@ -50,6 +56,7 @@ SEQUENCES: Final = {
     "calibration": "over time, in distribution, other valves",
     "sequence": "over time, in distribution",
     "shifted sequence": "over time, shifted",
+    "wide calibration": "over time, in part shifted, other valves",
 }
 """What volumes over time are called here."""
 
@@ -77,8 +84,8 @@ def study_words(findings: Findings) -> list[str]:
     total = spent["training"].cpu_s
     said = [
         f"Trained on {findings.training_volumes} volumes of "
-        f"{findings.valves['train'].count} simulated valves; CPU time "
-        + ", ".join(parts)
+        f"{findings.valves['train'].count} simulated valves"
+        + ("; CPU time " + ", ".join(parts) if parts else "")
         + (f"; {total / 60.0:.1f} minutes in all." if total is not None else ".")
     ]
     if tested is None:
@@ -96,9 +103,21 @@ def study_words(findings: Findings) -> list[str]:
         f"{accuracy.mean_error_mm:.2f} mm. Left out, as the valve was not detected or something "
         f"else was taken for it: {accuracy.left_out}."
     )
+    start, slope = accuracy.widening
+    said.append(
+        f"In a volume they are stated {start:.2f} exp({slope:.2f} (1 - c)) times as large, c being "
+        f"its confidence. Below a confidence of {accuracy.like_from:.2f} a volume is said to be "
+        "unlike those of training, and no moduli are stated: over time "
+        + ", ".join(
+            f"{count} of {sum(row.setting == setting for row in tested.sequences)} {setting}"
+            for setting, count in accuracy.unlike.items()
+        )
+        + "."
+    )
+    said += list(_trusted(tested, accuracy.like_from))
     said += [
         f"{row.setting.capitalize()}, {row.frame} frame: {100 * row.share:.0f} % of "
-        f"coordinates lie within 1.96 of these standard deviations "
+        f"coordinates lie within 1.96 of the standard deviations stated "
         f"({100 * row.share_about_mean:.0f} % with the mean error taken off), of "
         f"{row.sequences} volumes."
         for row in accuracy.within_95
@@ -115,6 +134,22 @@ def study_words(findings: Findings) -> list[str]:
             "these best."
         )
     return said
+
+
+def _trusted(tested: Evaluation, like_from: float) -> Iterator[str]:
+    """By setting: how many volumes of one frame are wrong, and how many of these are believed."""
+    for setting in SETTINGS:
+        own = [row for row in tested.rows if row.setting == setting]
+        wrong = [row for row in own if (row.surface_mm or 0.0) >= LIMITS_MM[-1]]
+        believed = [row for row in wrong if row.confidence >= like_from]
+        if own:
+            yield (
+                f"{setting.capitalize()}, one frame: of {len(own)} volumes "
+                f"{100 * (1 - len(wrong) / len(own)):.0f} % lie below {LIMITS_MM[-1]:g} mm or are "
+                f"called none; {sum(row.confidence < like_from for row in own)} are unlike those "
+                f"of training, and of the wrong ones {len(believed)} "
+                f"({100 * len(believed) / len(own):.1f} %) are not said to be."
+            )
 
 
 def imaging_text(record: Record[Findings]) -> str:

@@ -30,6 +30,7 @@ class HeldOutSettings:
     curve_volumes: int  # of each of these two, for detectors trained on fewer volumes
     sequences: int  # of all frames of a valve, drawn as those of training are
     shifted_sequences: int
+    wide_calibration: int  # of valves to calibrate with, each setting within or outside
     without_valve: int  # of each kind of volume in which there is none
     wrong_mm: float = 5.0  # mean distance of a valve's points from which on it is not the valve
 
@@ -50,6 +51,7 @@ class ImagingSettings:
     held_out: HeldOutSettings
     targets: dict[str, Any] = field(default_factory=dict)  # setting -> column of the table -> limit
     processes: int = 1
+    model: str | None = None  # file, or "package": detectors to be tested, none being trained
     publish_model: bool = False  # make the model the one that comes with the package
 
 

@@ -25,6 +25,7 @@ from experiments.studies.imaging.findings import Spent
 from experiments.studies.imaging.parallel import in_processes
 from experiments.studies.imaging.settings import ImagingSettings
 from mvest.errors import InputError
+from mvest.files import sha256_of
 from mvest.imaging.detection.shape_model import ShapeModel, fit_shape_model
 from mvest.imaging.detection.trained_model import STAGES, DetectionModel, load_model, save_model
 from mvest.imaging.learning.boosting import Boosters
@@ -35,6 +36,7 @@ from mvest.imaging.learning.training import (
     train_stage,
     volume_samples,
 )
+from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.moving_valve import MovingValve
 from mvest.kept import Entry, get_or_make
 from mvest.provenance import write_json
@@ -55,6 +57,9 @@ SPENT = "spent.json"
 """In the folder of an entry: what it cost."""
 
 VALVES, DETECTORS = "valves.npz", "detectors.npz"
+
+PACKAGED = "package"
+"""Stands for the detectors that come with the package."""
 
 SAMPLED_BY = (volume_samples, draft_of, fit_shape_model)
 
@@ -110,6 +115,8 @@ class ImagingStore:
             "test": settings.test,
         }
         self._shapes: ShapeModel | None = None
+        self.given = None if settings.model is None else _file(settings.model)
+        self.curve = () if self.given else settings.curve
 
     # -- valves -----------------------------------------------------------------------------------
     def _valves(self, which: str) -> Entry[Population]:
@@ -180,7 +187,9 @@ class ImagingStore:
         return key_of(described, SAMPLED_BY)
 
     def model_key(self, volumes: int) -> str:
-        """Key of the detectors that are trained on the first so many volumes."""
+        """Key of the detectors that are trained on the first so many volumes, or of those given."""
+        if self.given:
+            return sha256_of(self.given)
         described = {
             "samples": self.samples_key,
             "settings": asdict(self.training) | {"volumes": volumes},
@@ -280,12 +289,18 @@ class ImagingStore:
         return entry.get_or_make(train, partial(_write_with_cost, save_model, DETECTORS)), file
 
     def model_file(self, volumes: int) -> Path:
-        """Where detectors are that were trained on so many volumes."""
+        """Where detectors are that were trained on so many volumes, or those given."""
+        if self.given:
+            return self.given
         return self.store.folder / "models" / self.model_key(volumes) / DETECTORS
 
     def model_spent(self, volumes: int) -> Spent:
         """What growing the trees cost, the volumes apart."""
         return _spent(self.model_file(volumes).with_name(SPENT))
+
+
+def _file(model: str) -> Path:
+    return MODEL_FILE if model == PACKAGED else Path(model)
 
 
 def _write_with_cost(

@@ -33,7 +33,7 @@ from mvest.imaging.detection.trained_model import (
 )
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.accuracy import Correlogram, measure_accuracy
+from mvest.imaging.learning.accuracy import Correlogram, measure_accuracy, widened
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.moving_valve import MovingValve
 from mvest.provenance import provenance
@@ -48,6 +48,9 @@ MODEL = "tee.npz"
 
 POPULATIONS = ("train", "calibration", "test")
 
+WIDE = "wide calibration"
+"""Volumes of the valves of calibration by which errors are stated wider where one is less sure."""
+
 
 def run_imaging(job: Job[Settings]) -> Outcome[Findings]:
     """Train detectors, and test them on valves that no training saw; the model is left beside.
@@ -60,7 +63,7 @@ def run_imaging(job: Job[Settings]) -> Outcome[Findings]:
     require_imaging(job.values)
     settings = job.settings.imaging
     store = ImagingStore(job.values, settings)
-    valves = store.population("train").valves
+    valves = () if store.given else store.population("train").valves
     trained_on = {
         "valves": [valve.name for valve in valves],
         "seed": store.seed,
@@ -71,27 +74,30 @@ def run_imaging(job: Job[Settings]) -> Outcome[Findings]:
     def train(volumes: int) -> DetectionModel:
         return store.model(valves, volumes, {**trained_on, "volumes": volumes})[0]
 
-    model = train(store.training.volumes)
+    if store.given:
+        model = load_model(store.given)
+        trained_on = dict(model.trained_on)
+    else:
+        model = train(store.training.volumes)
+        trained_on |= {"volumes": store.training.volumes, "config_hash": job.config_hash}
     tested: Evaluation | None = None
     accuracy: DetectionAccuracy | None = None
     if settings.evaluate:
         apart = [store.population(which).valves for which in POPULATIONS[1:]]
         require_apart(valves, *apart)
-        for volumes in settings.curve:
+        _require_unseen(trained_on, *apart)
+        for volumes in store.curve:
             train(volumes)
         held_out = hold_out(store, *apart)
         (accuracy, correlogram), trained_on["calibrated_on"] = _calibrated(settings, held_out)
         tested = tested_of(store, held_out, accuracy, correlogram)
-    final = DetectionModel(
-        model.shape,
-        model.boosters,
-        {**trained_on, "volumes": store.training.volumes, "config_hash": job.config_hash},
-        accuracy,
+    save_model(
+        job.folder / MODEL, DetectionModel(model.shape, model.boosters, trained_on, accuracy)
     )
-    save_model(job.folder / MODEL, final)
+    done = [] if store.given else ["trained"]
     return Outcome(
-        findings=findings_of(store, tested, job.folder / MODEL),
-        reason="trained" if tested is None else "trained and tested",
+        findings=findings_of(store, tested, job.folder / MODEL, trained_on),
+        reason=" and ".join([*done, *([] if tested is None else ["tested"])]),
     )
 
 
@@ -115,7 +121,17 @@ def _calibrated(
     samples, tips, rest = (
         detected.stacked(kind, name) for name in ("errors", "tip_errors", "rest")
     )
-    return measure_accuracy(samples, tips, rest.mean(axis=0)), [row["valve"] for row, _ in rows]
+    accuracy, correlogram = measure_accuracy(samples, tips, rest.mean(axis=0))
+    valves = [row["valve"] for row, _ in rows]
+    wide = held_out.detected(WIDE, threshold, wrong)
+    if wide.sequences[WIDE]:
+        accuracy = widened(
+            accuracy,
+            detected.confidence(kind),
+            wide.stacked(WIDE, "errors"),
+            wide.confidence(WIDE),
+        )
+    return (accuracy, correlogram), valves
 
 
 def publish_model(job: Job[Settings], _record: Record[Findings]) -> None:
@@ -167,6 +183,17 @@ def require_apart(*populations: tuple[MovingValve, ...]) -> None:
         seen |= own
 
 
+def _require_unseen(trained_on: Values, *populations: tuple[MovingValve, ...]) -> None:
+    """Refuse valves that detectors from a file were trained on."""
+    known = set(trained_on.get("valves", ()))
+    for valve in (valve for valves in populations for valve in valves):
+        if valve.name in known:
+            raise ConfigurationError(
+                f"valve {valve.name} was trained on, expected other valves to calibrate with and "
+                "to test on: imaging.calibration.seed, imaging.test.seed"
+            )
+
+
 def require_imaging(config: Values) -> None:
     """Refuse settings that the study could not run with.
 
@@ -178,6 +205,10 @@ def require_imaging(config: Values) -> None:
     settings = build(Settings, config).imaging
     training, held_out = settings.training, settings.held_out
     _require_populations(settings)
+    if settings.model and not settings.evaluate:
+        raise ConfigurationError(
+            "imaging.model is given and imaging.evaluate=false: nothing would be done"
+        )
     _require_min(1, "training.volumes", training.volumes)
     _require_min(1, "processes", settings.processes)
     for size in settings.curve:
@@ -190,6 +221,7 @@ def require_imaging(config: Values) -> None:
         raise ConfigurationError(f"imaging.curve = {list(settings.curve)}, expected other numbers")
     for name, minimum in {
         "volumes": 1, "shifted": 1, "sequences": 1, "shifted_sequences": 0, "without_valve": 1,
+        "wide_calibration": 0,
         "curve_volumes": 1 if settings.curve else 0,
     }.items():  # fmt: skip
         _require_min(minimum, f"held_out.{name}", getattr(held_out, name))

@@ -52,8 +52,8 @@ PIXEL_MM = 0.3
 VOLUMES = ("in distribution", "shifted")
 """Kinds of volumes of one frame with a valve, as tables call them."""
 
-SEQUENCES = ("calibration", "sequence", "shifted sequence")
-"""Kinds of volumes of all frames of a valve; the first ones say how far detectors are off."""
+SEQUENCES = ("calibration", "sequence", "shifted sequence", "wide calibration")
+"""Kinds of volumes of all frames of a valve; those of calibration say how far detectors are off."""
 
 KINDS = (*VOLUMES, *WITHOUT_VALVE, *SEQUENCES)
 
@@ -81,7 +81,9 @@ class Trial:
 
     @property
     def spread(self) -> Setting:
-        """Whether its acquisition is drawn as in training, or outside of those ranges."""
+        """Whether its acquisition is drawn as in training, or in part or wholly outside."""
+        if self.kind.startswith("wide"):
+            return "wide"
         return "shifted" if self.kind.startswith("shifted") else "training"
 
     @property

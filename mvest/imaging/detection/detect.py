@@ -76,6 +76,11 @@ RATING_SHARE = 0.3
 """Weight of a pose's rating beside what is seen of the leaflets, in the confidence. Of simulated
 volumes unlike those of training, the rating alone prefers a wrong pose in every third."""
 
+STRANGE_SHARE = 0.15
+"""Confidence that a shape loses for each unit by which its squared distance from the mean shape
+(over the deviations, mean over the modes) exceeds 1, which is that of the valves of training.
+Fitted to chamber walls, or front to back, a shape is strained to a distance of 1.5 to 4."""
+
 
 class NoValveError(InputError):
     """A volume shows no valve that the detectors believe in.
@@ -154,7 +159,7 @@ def merits(
     """Confidence ``(P,)`` in valves at some poses, fitted roughly to every second row and column.
 
     Where images are unlike those of training, a wrong pose may be rated best; its leaflets then are
-    not where the boundary is seen.
+    not where the boundary is seen, or are of a shape that valves do not have.
     """
     return np.array([_merit(frame, model, poses[k : k + 1], settings) for k in range(len(poses))])
 
@@ -174,19 +179,20 @@ def _merit(
         vertices = pose.world(shape.shape(b[None]))[0][some.ravel()]
         normals, offset, std, seen = model.boundary(frame, vertices, coarse, reach)
         pose, b = fit_shape(shape, pose, b, Pulls(some.ravel(), normals, offset, wide * std))
-    return _confidence(frame, model, pose, seen)
+    return _confidence(frame, model, pose, b, seen)
 
 
 def _confidence(
-    frame: StandardFrame, model: DetectionModel, pose: Poses, seen: FloatArray
+    frame: StandardFrame, model: DetectionModel, pose: Poses, b: FloatArray, seen: FloatArray
 ) -> float:
-    """How sure it is that there is a valve, 0 to 1: how well its leaflets are seen, and its pose.
+    """How sure it is that there is a valve, 0 to 1: its leaflets are seen, its pose and its shape.
 
     In volumes with walls and no valve, leaflets may be seen (on a wall) where no pose is believed
-    in, or the other way round.
+    in, or the other way round, and mostly in a shape that no valve has.
     """
     rating = float(np.clip(model.poses.refined(frame, pose, 1)[1][0], 0.0, 1.0))
-    return min(1.0, RATING_SHARE * rating + float(seen.mean()))
+    strange = max(0.0, float(((b / model.shape.std[: len(b)]) ** 2).mean()) - 1.0)
+    return max(0.0, min(1.0, RATING_SHARE * rating + float(seen.mean())) - STRANGE_SHARE * strange)
 
 
 def fit_frame(
@@ -262,7 +268,7 @@ def fit_frame(
     )
     hand = _by_hand(at[manual], vertices, points[manual], HAND_STD_MM[1])
     vertices = relax(vertices, layout, Pulls.joined([pulls, hand]), chosen.stiffness, chosen.hold)
-    sure = _confidence(frame, model, pose, confidence)
+    sure = _confidence(frame, model, pose, b, confidence)
     return FrameValve(begin, pose, b, vertices, tips, sure, confidence, stages)
 
 

@@ -68,6 +68,9 @@ class TrackingSettings:
         Times over which annulus, free edge and papillary tips are smoothed; 0: not at all.
     min_confidence : float
         Of the best frame: below it there is no valve.
+    lost_by : float
+        Confidence by which a frame is behind the best one from which on it is sought again from the
+        frames beside it.
     fit : FitSettings
     """
 
@@ -77,6 +80,7 @@ class TrackingSettings:
     still_mm: float = 2.0
     smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
     min_confidence: float = MIN_CONFIDENCE
+    lost_by: float = 0.2
     fit: FitSettings = field(default_factory=FitSettings)
 
 
@@ -116,6 +120,7 @@ def detect_valve(
         valves.append(fit_frame(frame, model, poses[k : k + 1], chosen.fit, fixed=by_hand.get(k)))
         if progress is not None:
             progress(k + 1, len(frames))
+    valves = _found_again(frames, valves, model, chosen, by_hand)
     confidence = np.array([valve.confidence for valve in valves])
     sure = np.stack([valve.vertex_confidence for valve in valves])
     vertices, tips = smooth_in_time(
@@ -130,6 +135,8 @@ def detect_valve(
     for k, points in by_hand.items():
         vertices[k], tips[k] = _held(vertices[k], tips[k], points, model, chosen.fit)
     accuracy, layout = model.accuracy, model.shape.layout
+    if accuracy is not None:
+        accuracy = accuracy.at(float(np.median(confidence)))
     valve = ValveSequence(
         layout,
         np.asarray(volume.times),
@@ -149,6 +156,45 @@ def detect_valve(
             valve,
         )
     return valve
+
+
+def _found_again(
+    frames: list[StandardFrame],
+    valves: list[FrameValve],
+    model: DetectionModel,
+    chosen: TrackingSettings,
+    by_hand: Mapping[int, Mapping[int, FloatArray]],
+) -> list[FrameValve]:
+    """The valves, those of lost frames sought again from the frames beside them, surest first.
+
+    A frame is lost where another one is surer by ``lost_by``. What is found again is kept if it is
+    surer than what was there.
+    """
+    again = list(valves)
+    best = max(valve.confidence for valve in valves)
+    lost = {k for k, v in enumerate(valves) if v.confidence < best - chosen.lost_by}
+    lost -= set(by_hand)
+    while lost:
+        beside = {k: max(_beside(k, again, lost), default=None) for k in lost}
+        surest = {k: pair for k, pair in beside.items() if pair is not None}
+        if not surest:
+            break
+        k = max(surest, key=lambda k: surest[k])
+        near = again[surest[k][1]]
+        lost.remove(k)
+        other = fit_frame(
+            frames[k], model, near.pose, chosen.fit, coefficients=near.coefficients, tips=near.tips
+        )
+        if other.confidence > again[k].confidence:
+            again[k] = other
+    return again
+
+
+def _beside(k: int, valves: list[FrameValve], lost: set[int]) -> list[tuple[float, int]]:
+    """Confidence and number of the frames beside one, those that are not lost."""
+    return [
+        (valves[j].confidence, j) for j in (k - 1, k + 1) if 0 <= j < len(valves) and j not in lost
+    ]
 
 
 def _held(

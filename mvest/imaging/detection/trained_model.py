@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,6 +61,10 @@ MAX_REASON = 120
 """Characters of another library's message that are passed on; some quote the file."""
 
 
+UNLIKE_SHARE = 0.02
+"""Of volumes drawn as those of training: so many are expected to count as unlike them."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionAccuracy:
     """How the detectors err on simulated volumes that they have not seen.
@@ -73,12 +77,37 @@ class DetectionAccuracy:
     samples : (S, F, n, 3)
         Errors in the valve's axes, mm: of S sequences, in the open and in the closed frame.
     tip_samples : (S, F, 2, 3)
+    widening : (float, float)
+        Factor on the errors of a volume of confidence 1, and the exponent by which it grows for
+        each unit of confidence that is lacking.
+    like_from : float
+        Confidence below which a volume is unlike those of training: of these, `UNLIKE_SHARE` are
+        expected there.
     """
 
     std_mm: FloatArray
     correlation_length_mm: float
     samples: FloatArray
     tip_samples: FloatArray
+    widening: tuple[float, float] = (1.0, 0.0)
+    like_from: float = 0.0
+
+    def at(self, confidence: float) -> DetectionAccuracy:
+        """Errors in a volume of some confidence: wider about their mean the less it is."""
+        factor = self.factor(confidence)
+        mean, tip_mean = self.samples.mean(axis=0), self.tip_samples.mean(axis=0)
+        return replace(
+            self,
+            std_mm=factor * self.std_mm,
+            samples=mean + factor * (self.samples - mean),
+            tip_samples=tip_mean + factor * (self.tip_samples - tip_mean),
+            widening=(1.0, 0.0),
+        )
+
+    def factor(self, confidence: float) -> float:
+        """On the errors of a volume of some confidence (`ValveSequence.confidence`)."""
+        start, slope = self.widening
+        return float(start * np.exp(slope * (1.0 - confidence)))
 
 
 class DetectionModel:
@@ -165,6 +194,8 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         arrays["accuracy.correlation_length_mm"] = np.array(accuracy.correlation_length_mm)
         arrays["accuracy.samples"] = accuracy.samples.astype(np.float32)
         arrays["accuracy.tip_samples"] = accuracy.tip_samples.astype(np.float32)
+        arrays["accuracy.widening"] = np.array(accuracy.widening)
+        arrays["accuracy.like_from"] = np.array(accuracy.like_from)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -242,11 +273,17 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
     accuracy = None
     if "accuracy.std_mm" in stored:
         count = np.shape(stored["accuracy.samples"])[:2]
+        # A file of before these were measured: errors are of one size, and no volume is unlike.
+        known = {"widening": np.array([1.0, 0.0]), "like_from": np.array(0.0)}
+        known |= {key: stored[name] for key in known if (name := f"accuracy.{key}") in stored}
+        start, slope = _numbers(known, "widening", (2,))
         accuracy = DetectionAccuracy(
             _numbers(stored, "accuracy.std_mm", (n,)),
             float(_numbers(stored, "accuracy.correlation_length_mm", ())),
             _numbers(stored, "accuracy.samples", (*count, n, 3)),
             _numbers(stored, "accuracy.tip_samples", (*count, 2, 3)),
+            (float(start), float(slope)),
+            float(_numbers(known, "like_from", ())),
         )
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.distance import cdist
+from scipy.stats import t as student_t
 
 from mvest.errors import InputError
-from mvest.imaging.detection.trained_model import DetectionAccuracy
+from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "matern",
     "measure_accuracy",
     "share_within",
+    "widened",
 ]
 
 BIN_MM = 1.0
@@ -148,6 +150,65 @@ def measure_accuracy(
     std = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 1) * frames * 3))
     correlations = correlogram(about.transpose(0, 1, 3, 2).reshape(-1, n), rest)
     return DetectionAccuracy(std, fitted_length(correlations), samples, tip_samples), correlations
+
+
+def widened(
+    accuracy: DetectionAccuracy,
+    confidence: FloatArray,
+    wide: FloatArray,
+    wide_confidence: FloatArray,
+) -> DetectionAccuracy:
+    """What is stated of a volume by its own confidence, so that 95 % of coordinates lie within.
+
+    The factor on errors is exponential in the confidence that is lacking. Its growth is that of the
+    errors' size (least squares over volumes); its start is such that of all coordinates of all
+    volumes 95 % lie within 1.96 of what is stated. A volume is unlike those of the sequences where
+    its confidence is below what one more of these has but for `UNLIKE_SHARE` (Student's bound for
+    one further normal number).
+
+    Parameters
+    ----------
+    accuracy : DetectionAccuracy
+        Measured; each of its S sequences is compared with the others, as one that is none of them.
+    confidence : (S,)
+        Of these sequences.
+    wide : (W, F, n, 3) mm
+        Errors of further sequences, of other valves and over wider acquisitions.
+    wide_confidence : (W,)
+
+    Raises
+    ------
+    InputError
+        If confidences are not one for each, or there is no further sequence.
+    """
+    samples, std = accuracy.samples, accuracy.std_mm
+    count, frames = samples.shape[:2]
+    if len(confidence) != count or len(wide) != len(wide_confidence) or not len(wide):
+        raise InputError(
+            f"errors by confidence: {count} sequences with {len(confidence)} confidences, and "
+            f"{len(wide)} with {len(wide_confidence)}, expected one for each, and some of both"
+        )
+    mean = samples.mean(axis=0)
+    compared = samples if count > 2 else samples[:0]  # one other has no spread
+    off = []
+    for k, own in enumerate(compared):
+        others = np.delete(samples, k, axis=0)
+        about = others - others.mean(axis=0)
+        one = np.sqrt((about**2).sum(axis=(0, 1, 3)) / ((count - 2) * frames * 3))
+        off.append(np.abs(own - others.mean(axis=0)) / one[:, None])
+    off += [np.abs(own - mean) / std[:, None] for own in wide]
+    lacking = 1.0 - np.concatenate([confidence[: len(compared)], wide_confidence])
+    size = np.log([np.quantile(one, 0.95) for one in off])
+    from_mean = lacking - lacking.mean()
+    spread = float((from_mean**2).sum())
+    slope = max(0.0, float(from_mean @ size) / spread) if spread > 0 else 0.0
+    z = np.stack(off) / np.exp(slope * lacking)[:, None, None, None]
+    bound = student_t.ppf(UNLIKE_SHARE, count - 1) * np.sqrt(1.0 + 1.0 / count)
+    return replace(
+        accuracy,
+        widening=(float(np.quantile(z, 0.95)) / NORMAL_95, slope),
+        like_from=float(confidence.mean() + bound * confidence.std(ddof=1)),
+    )
 
 
 def share_within(errors: FloatArray, std_mm: FloatArray, mean: FloatArray | None = None) -> float:

@@ -61,8 +61,8 @@ __all__ = [
 MANY_TREES = ("pose_coarse", "pose_fine", "boundary")
 """Stages with ``TrainingSettings.many_trees``."""
 
-Setting: TypeAlias = Literal["training", "shifted"]
-"""Within the ranges that detectors are trained in, or outside of them."""
+Setting: TypeAlias = Literal["training", "wide", "shifted"]
+"""Within the ranges that detectors are trained in, in part or wholly outside of them."""
 
 Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Stage -> features ``(P, F)`` and what they mean ``(P, outputs)``."""

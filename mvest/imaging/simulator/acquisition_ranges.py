@@ -10,7 +10,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition
 
-__all__ = ["SHIFTED", "TRAINING", "AcquisitionRanges", "Range", "draw_acquisition"]
+__all__ = ["SHIFTED", "TRAINING", "WIDE", "AcquisitionRanges", "Range", "draw_acquisition"]
 
 Interval: TypeAlias = tuple[float, float]
 
@@ -129,6 +129,17 @@ SHIFTED = AcquisitionRanges(
 from that of training, and mostly on the worse side."""
 
 
+WIDE = AcquisitionRanges(
+    "wide",
+    tuple(
+        Range(own.setting, own.how, tuple(dict.fromkeys((*own.intervals, *beyond.intervals))))
+        for own, beyond in zip(TRAINING.ranges, SHIFTED.ranges, strict=True)
+    ),
+)
+"""Each setting by itself inside the ranges of training or outside: half and half, or with chances
+of one to two where both sides lie outside."""
+
+
 def draw_acquisition(
     rng: np.random.Generator,
     base: Acquisition | None = None,
@@ -141,7 +152,7 @@ def draw_acquisition(
     rng : numpy Generator
     base : Acquisition, optional
         The default one if none is given.
-    spread : AcquisitionRanges or its name, "training" or "shifted"
+    spread : AcquisitionRanges or its name, "training", "wide" or "shifted"
         What is drawn, and from where.
 
     Raises
@@ -151,9 +162,9 @@ def draw_acquisition(
     """
     base = base or Acquisition()
     if isinstance(spread, str):
-        known = {s.name: s for s in (TRAINING, SHIFTED)}
+        known = {s.name: s for s in (TRAINING, WIDE, SHIFTED)}
         if spread not in known:
-            raise InputError(f"spread {spread!r}, expected {' or '.join(known)}")
+            raise InputError(f"spread {spread!r}, expected one of {', '.join(known)}")
         spread = known[spread]
     drawn: dict[str, float] = {}
     for entry in spread.ranges:

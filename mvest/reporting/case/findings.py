@@ -214,7 +214,8 @@ class ImageStep:
     """How a case came from the ``f`` frames of a volume.
 
     Of each frame there are measures by name and the confidence ``(f,)``; of an observed coordinate
-    the error's SD, and over which length it is alike.
+    the error's SD, and over which length it is alike. ``unlike`` says how the volume is unlike
+    those that detectors were trained on; empty where it is not.
     """
 
     pictures: Mapping[str, Picture]
@@ -228,6 +229,7 @@ class ImageStep:
     confidence: Vector
     std_mm: float
     correlation_length_mm: float
+    unlike: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

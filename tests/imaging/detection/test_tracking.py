@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection import position, tracking
-from mvest.imaging.detection.detect import search_frame
+from mvest.imaging.detection.detect import fit_frame, search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import PoseSearch
@@ -97,6 +97,41 @@ def test_what_was_measured_of_a_model_goes_with_the_sequence(shape, truths):
     found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy), TOLD)
     np.testing.assert_array_equal(found.std_mm, accuracy.std_mm)
     assert found.correlation_length_mm == 7.5
+
+
+def test_the_less_a_volume_is_believed_the_wider_its_errors_are_stated(shape, truths):
+    n = LAYOUT.size
+    rng = np.random.default_rng(0)
+    accuracy = DetectionAccuracy(
+        np.linspace(1, 2, n), 7.5, rng.standard_normal((3, 2, n, 3)),
+        rng.standard_normal((3, 2, 2, 3)), (1.2, 2.0),
+    )  # fmt: skip
+    found = detect_valve(volume(), oracle_model(shape, truths, accuracy=accuracy, seen=0.8), TOLD)
+    factor = 1.2 * np.exp(2.0 * (1.0 - np.median(found.frame_confidence)))
+    assert factor > 1.25
+    np.testing.assert_allclose(found.std_mm, factor * accuracy.std_mm)
+    wider = accuracy.at(found.confidence)
+    np.testing.assert_allclose(wider.samples.mean(axis=0), accuracy.samples.mean(axis=0))
+    for name in ("samples", "tip_samples"):
+        ratio = getattr(wider, name).std(axis=0) / getattr(accuracy, name).std(axis=0)
+        np.testing.assert_allclose(ratio, factor)
+
+
+def test_a_lost_frame_is_found_again_from_its_neighbours(shape, truths):
+    # Its own search ended elsewhere; two frames in a row are found one after the other.
+    model = oracle_model(shape, truths)
+    frames = [NumberedFrame(k) for k in range(4)]
+    valves = [fit_frame(frames[k], model, truths[k].pose, UNSMOOTHED.fit) for k in range(4)]
+    astray = truths[0].pose.moved(np.array([[30.0, 0, 0, 0, 0, 0, 0]]))
+    for k in (1, 2):
+        valves[k] = fit_frame(frames[k], model, astray, UNSMOOTHED.fit)
+        assert np.linalg.norm(valves[k].vertices - truths[k].vertices, axis=1).mean() > 10.0
+    again = tracking._found_again(frames, valves, model, UNSMOOTHED, {})
+    for k, true in enumerate(truths):
+        assert np.linalg.norm(again[k].vertices - true.vertices, axis=1).mean() < 0.6
+    # Hands that placed a frame are not overruled.
+    kept = tracking._found_again(frames, valves, model, UNSMOOTHED, {1: {}, 2: {}})
+    assert [a is b for a, b in zip(kept, valves, strict=True)] == [True] * 4
 
 
 def test_smoothing_of_a_steady_motion_leaves_it_where_it_is(shape, truths):

@@ -10,6 +10,7 @@ from mvest.imaging.learning.accuracy import (
     matern,
     measure_accuracy,
     share_within,
+    widened,
 )
 from mvest.observation.errors import SpatialCorrelation
 
@@ -71,6 +72,34 @@ def test_the_share_within_tells_too_small_errors():
     assert share_within(errors + 5.0, std) < 0.01
     mean = np.full(errors.shape[1:], 5.0)
     assert share_within(errors + 5.0, std, mean) == pytest.approx(0.95, abs=0.01)
+
+
+def test_errors_are_stated_wider_where_there_is_less_confidence():
+    # Errors of the further volumes are three times as large, and these are believed less.
+    std = np.full(len(sheet()), 0.7)
+    own, wide = fields(40, std, 1), 3.0 * fields(30, std, 2)
+    rng = np.random.default_rng(0)
+    confidence, less = 0.95 + 0.01 * rng.standard_normal(40), 0.75 + 0.01 * rng.standard_normal(30)
+    accuracy, _ = measure_accuracy(own, np.zeros((40, 2, 2, 3)), sheet())
+    found = widened(accuracy, confidence, wide, less)
+    assert found.factor(0.95) == pytest.approx(1.0, abs=0.1)
+    assert found.factor(0.75) == pytest.approx(3.0, rel=0.1)
+    for errors, stated in ((fields(40, std, 3), 0.95), (3.0 * fields(40, std, 4), 0.75)):
+        assert share_within(errors, found.at(stated).std_mm) == pytest.approx(0.95, abs=0.015)
+    # Two in a hundred of further volumes of the first kind count as unlike.
+    fresh = 0.95 + 0.01 * rng.standard_normal(20_000)
+    assert 0.005 < (fresh < found.like_from).mean() < 0.05
+    with pytest.raises(InputError, match="39 confidences"):
+        widened(accuracy, confidence[1:], wide, less)
+
+
+def test_volumes_off_by_the_same_are_stated_alike_whatever_their_confidence():
+    std = np.full(len(sheet()), 0.7)
+    accuracy, _ = measure_accuracy(fields(40, std, 1), np.zeros((40, 2, 2, 3)), sheet())
+    smaller = 0.5 * fields(30, std, 2)
+    found = widened(accuracy, np.full(40, 0.95), smaller, np.full(30, 0.75))
+    # What is better in volumes that are believed less is luck, and is not extrapolated.
+    assert found.widening[1] == 0.0
 
 
 @pytest.mark.parametrize(

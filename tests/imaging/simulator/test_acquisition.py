@@ -72,7 +72,7 @@ def test_what_is_drawn_lies_in_the_ranges_and_fills_them(spread):
 
 
 def test_unknown_spreads_and_settings_are_refused():
-    with pytest.raises(InputError, match="spread 'wild', expected training or shifted"):
+    with pytest.raises(InputError, match="spread 'wild', expected one of training, wide, shifted"):
         draw_acquisition(np.random.default_rng(0), spread="wild")
     with pytest.raises(InputError, match="range of 'colour'"):
         Range("colour", "plus", ((0.0, 1.0),))
