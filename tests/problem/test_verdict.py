@@ -53,6 +53,7 @@ CASES = {
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
+    "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
     "innovation beyond its band": ({"nis": 1.06}, DOUBTFUL, "1.03 times"),
     "innovation far beyond": ({"nis": 1.01 * NIS_FACTOR * 1.04}, NONE, "times what its errors"),

@@ -199,8 +199,8 @@ def confidences(
         rows = [row for row in volumes if row["kind"] == kind]
         values[kind] = tuple(float(row["confidence"]) for row in rows)
         off[kind] = tuple(row["errors"]["points"] if "errors" in row else None for row in rows)
-    for kind in SEQUENCES:
-        frames = [row["frames"] for row in sequences[kind]]
+    for kind, over_time in sequences.items():
+        frames = [row["frames"] for row in over_time]
         values[kind] = tuple(max(f["confidence"] for f in own) for own in frames)
         off[kind] = tuple(_mean([f["points"] for f in own]) for own in frames)
     right: list[float] = []

@@ -15,6 +15,7 @@ from experiments.common.record import Record
 from experiments.common.tables import write_table
 from experiments.studies.imaging.findings import Accuracy, Confidences, Evaluation, Findings
 from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_table
+from mvest.imaging.detection.trained_model import UNLIKE_SHARE
 from mvest.imaging.layout import ValveLayout
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.figures import (
@@ -107,14 +108,15 @@ def study_words(findings: Findings) -> list[str]:
     said.append(
         f"In a volume they are stated {start:.2f} exp({slope:.2f} (1 - c)) times as large, c being "
         f"its confidence. Below a confidence of {accuracy.like_from:.2f} a volume is said to be "
-        "unlike those of training, and no moduli are stated: over time "
-        + ", ".join(
-            f"{count} of {sum(row.setting == setting for row in tested.sequences)} {setting}"
-            for setting, count in accuracy.unlike.items()
-        )
-        + "."
+        f"unlike those of training, and no moduli are stated; {100 * UNLIKE_SHARE:g} % of those "
+        "drawn like them are expected there."
     )
-    said += list(_trusted(tested, accuracy.like_from))
+    said += [
+        f"Over time, {setting}: {count} of "
+        f"{sum(row.setting == setting for row in tested.sequences)} volumes are unlike."
+        for setting, count in accuracy.unlike.items()
+    ]
+    said += [*_trusted(tested, accuracy.like_from), *_lost(confidence)]
     said += [
         f"{row.setting.capitalize()}, {row.frame} frame: {100 * row.share:.0f} % of "
         f"coordinates lie within 1.96 of the standard deviations stated "
@@ -150,6 +152,18 @@ def _trusted(tested: Evaluation, like_from: float) -> Iterator[str]:
                 f"of training, and of the wrong ones {len(believed)} "
                 f"({100 * len(believed) / len(own):.1f} %) are not said to be."
             )
+
+
+def _lost(confidence: Confidences) -> Iterator[str]:
+    """How many volumes over time are lost: not called a valve, or something else is."""
+    for kind in SEQUENCES:
+        values, off = confidence.values.get(kind, ()), confidence.off_mm.get(kind, ())
+        lost = [
+            value < confidence.min_confidence or far is None or far >= confidence.wrong_mm
+            for value, far in zip(values, off, strict=True)
+        ]
+        if lost:
+            yield f"Lost {_called(kind)}: {sum(lost)} of {len(lost)}."
 
 
 def imaging_text(record: Record[Findings]) -> str:

@@ -225,9 +225,32 @@ def test_the_seed_decides_and_not_the_processes(done: Path, tmp_path: Path):
     # Only a training: nothing else was drawn or written.
     assert not (tmp_path / "outputs" / "detectors" / "volumes").exists()
     assert not (tmp_path / "two" / "imaging.md").exists()
-    assert call(tmp_path, "imaging.evaluate=false", "seed=2", "hydra.run.dir=other") == 0
+    assert call(tmp_path, "imaging.evaluate=false", "seed=3", "hydra.run.dir=other") == 0
     other = load_model(tmp_path / "other" / "tee.npz")
     assert other.boosters["boundary"].texts != first.boosters["boundary"].texts
+
+
+def test_given_detectors_are_tested_and_calibrated_and_none_is_trained(
+    done: Path, tmp_path: Path, capsys
+):
+    valves = tmp_path / "outputs" / "detectors" / "valves"
+    shutil.copytree(done / "outputs" / "detectors" / "valves", valves)
+    given = f"imaging.model={done / 'run' / 'tee.npz'}"
+    assert call(tmp_path, given, "hydra.run.dir=run") == 0
+    record, first = record_of(tmp_path), load_model(done / "run" / "tee.npz")
+    assert record.reason == "tested"
+    assert record.findings.spent["training"].cpu_s is None
+    assert record.findings.training_volumes == 6
+    assert not (tmp_path / "outputs" / "detectors" / "samples").exists()
+    again = load_model(tmp_path / "run" / "tee.npz")
+    for name in STAGES:
+        assert first.boosters[name].texts == again.boosters[name].texts
+    assert again.accuracy.widening == first.accuracy.widening
+    capsys.readouterr()
+    assert call(tmp_path, given, "imaging.train.seed=9", "imaging.calibration.seed=1") == 2
+    assert "was trained on, expected other valves" in capsys.readouterr().err
+    assert call(tmp_path, given, "imaging.evaluate=false") == 2
+    assert "nothing would be done" in capsys.readouterr().err
 
 
 def test_a_model_is_made_the_one_of_the_package_without_training_again(
@@ -302,7 +325,7 @@ def test_keys_follow_what_they_are_of():
     more = keys("imaging.training.volumes=9")
     assert more == base
     assert keys("imaging.training.draft_volumes=2")[1] != base[1]
-    other = keys("seed=2")
+    other = keys("seed=3")
     assert other[0] == base[0]
     assert other[1] != base[1]
     assert not set(keys("imaging.train.seed=9")) & set(base)
@@ -324,7 +347,9 @@ def test_every_trial_has_a_stream_of_its_own():
     states |= {tuple(np.random.SeedSequence(1, spawn_key=(k,)).generate_state(2)) for k in range(3)}
     assert len(states) == len(trials) + 3
     assert {trial.spread for trial in trials if "shifted" in trial.kind} == {"shifted"}
-    assert {trial.spread for trial in trials if "shifted" not in trial.kind} == {"training"}
+    within = [trial for trial in trials if "shifted" not in trial.kind]
+    assert {trial.spread for trial in within if "wide" in trial.kind} == {"wide"}
+    assert {trial.spread for trial in within if "wide" not in trial.kind} == {"training"}
 
 
 def volume(kind: str, number: int, size: float, confidence: float = 0.9) -> dict:

@@ -1,5 +1,7 @@
 """What a study of the image step says: numbers in words, and what figures show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,30 @@ def test_words_of_a_training_alone_are_its_cost(tmp_path):
     assert "Not tested" in imaging_text(record())
     assert write_imaging(tmp_path, {"imaging": record()}, {}) == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_words_say_what_is_wrong_and_yet_believed():
+    # Below 1.5 mm, not called a valve, wrong and unlike, wrong and believed.
+    sizes = ((1.0, 0.9), (None, 0.4), (2.0, 0.75), (2.0, 0.9))
+    rows = tuple(
+        replace(volume(state_right=None), surface_mm=surface, confidence=confidence)
+        for surface, confidence in sizes
+    )
+    confidence = replace(
+        CONFIDENCE,
+        values={"sequence": (0.9, 0.2, 0.9)},
+        off_mm={"sequence": (1.0, 1.0, 9.0)},
+    )
+    accuracy = replace(ACCURACY, widening=(1.1, 5.0), like_from=0.8, unlike={"shifted": 3})
+    tested = Evaluation(
+        rows=rows, training=(), confidence=confidence, sequences=(), accuracy=accuracy
+    )
+    words = " ".join(study_words(findings(tested=tested)))
+    assert "Shifted, one frame: of 4 volumes 50 % lie below 1.5 mm or are called none" in words
+    assert "2 are unlike those of training, and of the wrong ones 1 (25.0 %)" in words
+    assert "1.10 exp(5.00 (1 - c))" in words
+    assert "Over time, shifted: 3 of 0 volumes are unlike." in words
+    assert "Lost over time, in distribution: 2 of 3." in words
 
 
 def test_words_say_whether_the_stated_errors_are_true():

@@ -5,7 +5,7 @@ The detectors are stood for by the valve that is in the volume; they have tests 
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -209,6 +209,29 @@ def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume,
     assert len(step.frames) == len(step.confidence) == 4
     assert (step.open_frame, step.volume.shape) == (0, (4, 20, 20, 20))
     assert json.dumps(asdict(step), allow_nan=False)
+
+
+def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wider(
+    run, monkeypatch, tmp_path
+):
+    asked, seen = [], sequence().confidence
+
+    def personalised(values, personal, case, folder, image_step):
+        asked.append((case, image_step))
+        raise InputError("not tried here")
+
+    monkeypatch.setattr("experiments.common.cases.volume.run_case", personalised)
+    measured = run.model.accuracy
+    for like_from, widening in ((seen - 0.05, (1.0, 0.0)), (seen + 0.05, (1.0, 7.0))):
+        run.model.accuracy = replace(measured, like_from=like_from, widening=widening)
+        assert run("figures=false", "tracking.enabled=false")[0] == 2
+    (like, step), (unlike, other) = asked
+    assert step.unlike == ""
+    assert f"{seen:.2f} in the median frame, expected at least {seen + 0.05:.2f}" in other.unlike
+    assert "2 % of volumes" in other.unlike
+    assert any("unlike those that the detectors" in said for said in other.sentences)
+    spread = [np.std(case.error_samples.vertices, axis=0).mean() for case in (like, unlike)]
+    assert spread[1] / spread[0] == pytest.approx(np.exp(7.0 * (1.0 - seen)))
 
 
 def test_what_is_missing_is_said_before_the_volume_is_searched(run):
