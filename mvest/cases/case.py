@@ -142,10 +142,14 @@ class ErrorSamples:
         the case, in the axes of the case. The annulus and the free edge move with their vertices.
     tips : (K, f, t, 3) mm
         The same of the papillary tips.
+    source : (K,) or None
+        From what each was made, a number: samples of one source, as a valve and what it is in a
+        mirror, are not independent of each other. None: all are.
     """
 
     vertices: FloatArray
     tips: FloatArray
+    source: IntArray | None = None
 
     def __post_init__(self) -> None:
         for name in ("vertices", "tips"):
@@ -174,6 +178,16 @@ class ErrorSamples:
                 f"error samples: {self.vertices.shape[:2]} samples and frames of the vertices, "
                 f"{self.tips.shape[:2]} of the tips; expected as many"
             )
+        if self.source is not None:
+            source = np.array(self.source)
+            if source.shape != (len(self),) or not np.issubdtype(source.dtype, np.integer):
+                raise InputError(
+                    f"error samples, source: {source.dtype} of shape {source.shape}, expected an "
+                    f"integer for each of {len(self)} samples"
+                )
+            source = source.astype(np.int64)
+            source.setflags(write=False)
+            object.__setattr__(self, "source", source)
         if not MIN_SAMPLES <= len(self) <= MAX_SAMPLES:
             raise InputError(f"{len(self)} error samples, expected {MIN_SAMPLES} to {MAX_SAMPLES}")
 

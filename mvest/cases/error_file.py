@@ -15,13 +15,15 @@ from mvest.reading.text import one_line
 __all__ = ["ARRAYS", "read_error_samples", "write_error_samples"]
 
 ARRAYS = ("frames", "vertices", "tips")
+SOURCE = "source"
 
 
 def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     """Read the samples of a case whose frames have these names, in this order.
 
     ``frames`` are names ``(f,)``, ``vertices (K, f, n, 3)`` and ``tips (K, f, t, 3)`` displacements
-    in mm from where a point was seen to where it may have been.
+    in mm from where a point was seen to where it may have been. ``source (K,)`` may be there:
+    integers, alike for samples that are not independent of each other.
 
     Raises
     ------
@@ -31,7 +33,7 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
     """
     if file.suffix.lower() != ".npz":
         raise InputError(f"{file.name}: extension {file.suffix!r}, expected .npz")
-    stored = read_npz(file, ARRAYS, exact=True, where=file.name)
+    stored = read_npz(file, ARRAYS, exact=True, optional=(SOURCE,), where=file.name)
     names, vertices, tips = (stored[name] for name in ARRAYS)
     if names.ndim != 1 or names.dtype.kind != "U" or names.tolist() != list(frames):
         shown = (
@@ -40,11 +42,13 @@ def read_error_samples(file: Path, frames: Sequence[str]) -> ErrorSamples:
             else f"an array of {names.dtype}"
         )
         raise InputError(f"{file.name}: frames {shown}, expected {one_line(list(frames), 120)}")
-    return ErrorSamples(vertices, tips)
+    return ErrorSamples(vertices, tips, stored.get(SOURCE))
 
 
 def write_error_samples(file: Path, samples: ErrorSamples, frames: Sequence[str]) -> None:
     """Write samples so that they are read back unchanged."""
-    np.savez_compressed(
-        file, frames=np.array(list(frames)), vertices=samples.vertices, tips=samples.tips
-    )
+    names, vertices, tips = np.array(list(frames)), samples.vertices, samples.tips
+    if samples.source is None:
+        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips)
+    else:
+        np.savez_compressed(file, frames=names, vertices=vertices, tips=tips, source=samples.source)

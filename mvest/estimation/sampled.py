@@ -10,9 +10,10 @@ of its estimate is taken from the samples themselves, through a gain K that has 
     P⁺ = (I − K H) P (I − K H)ᵀ + c / K Σ (K₋ₖ dₖ)(K₋ₖ dₖ)ᵀ
 
 the form of Joseph, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes
-with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th. Of K samples
-the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 % point of Student's distribution
-with K degrees of freedom, so that an interval of ± 1.96 standard deviations is one of 95 %.
+with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th and what was
+made from the same. Of K samples the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 %
+point of Student's distribution with K degrees of freedom, so that an interval of ± 1.96 standard
+deviations is one of 95 %.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
 from mvest.estimation.prediction import require_finite
-from mvest.typing import BoolArray, FloatArray
+from mvest.typing import BoolArray, FloatArray, IntArray
 
 __all__ = ["SampledErrors", "SampledPosterior"]
 
@@ -52,10 +53,15 @@ class SampledErrors:
         R of n observations: how errors of single observations are weighed.
     samples : (n, K)
         In units of the observation.
+    source : (K,) or None
+        Samples with the same number are not independent of each other: of one of them a gain that
+        has not seen it has seen none of these. Student's distribution has a degree of freedom for
+        each source. None: all are independent.
     """
 
     base: ObservationNoise
     samples: FloatArray
+    source: IntArray | None = None
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
@@ -65,6 +71,11 @@ class SampledErrors:
                 "with K at least 2"
             )
         require_finite(samples, "samples of errors")
+        if self.source is not None and np.shape(self.source) != (samples.shape[1],):
+            raise InputError(
+                f"sources of shape {np.shape(self.source)}, expected one for each of "
+                f"{samples.shape[1]} samples"
+            )
         samples.setflags(write=False)
         object.__setattr__(self, "samples", samples)
 
@@ -112,11 +123,14 @@ class SampledErrors:
         noise = low_rank_noise(white, D / np.sqrt(self.count))
         rest = np.eye(len(P)) - K @ noise.whiten(H)
         moved = np.empty((len(P), self.count))
-        for k in range(self.count):
-            whitened, without = gain(np.delete(D, k, axis=1))
-            moved[:, k] = without @ whitened[:, k]
+        source = np.arange(self.count) if self.source is None else self.source
+        sources = np.unique(source)
+        for one in sources:
+            own = source == one
+            whitened, without = gain(D[:, ~own])
+            moved[:, own] = without @ whitened[:, own]
         widened = (
-            scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, self.count)
+            scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(sources))
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
         ) ** 2
         part = widened / self.count * moved @ moved.T

@@ -485,7 +485,9 @@ class _Chain:
             raise GeometryError(f"case {self.case.name}: what its error samples do: {geometry}")
         self.geometry = geometry
         errors = errors_of(self.plain_observation(), self.closed, predicted, geometry)
-        self.errors = SampledErrors(self.noise(), errors)
+        samples = self.case.error_samples
+        assert samples is not None
+        self.errors = SampledErrors(self.noise(), errors, samples.source)
 
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""

@@ -48,6 +48,7 @@ def read_npz(
     names: Sequence[str] | None = None,
     *,
     exact: bool = False,
+    optional: Sequence[str] = (),
     max_bytes: int = MAX_ARRAYS,
     where: str = "",
 ) -> dict[str, NDArray[Any]]:
@@ -60,6 +61,8 @@ def read_npz(
         Arrays that must be there, and the only ones that are read; without them all are.
     exact : bool
         Whether others may not be there.
+    optional : sequence of str
+        Arrays that are read as well if they are there.
     max_bytes : int
         Of the arrays that are read.
     where : str
@@ -84,6 +87,7 @@ def read_npz(
         with zipfile.ZipFile(path) as archive:
             members = _members(archive, where)
             asked = list(members) if names is None else list(names)
+            asked += [name for name in optional if name in members and name not in asked]
             missing = [name for name in asked if name not in members]
             if missing:
                 shown = one_line(", ".join(missing), 120)

@@ -42,6 +42,12 @@ def test_what_a_case_says_of_its_errors_comes_back_as_it_was_written(tmp_path):
     assert back.uncertainty.correlation_length_mm == 8.0
     np.testing.assert_array_equal(back.error_samples.vertices, told.error_samples.vertices)
     np.testing.assert_array_equal(back.error_samples.tips, told.error_samples.tips)
+    assert back.error_samples.source is None
+    own = dataclasses.replace(told.error_samples, source=np.array([0, 1, 2, 0, 1, 2]))
+    again = write_case(tmp_path / "again", dataclasses.replace(told, error_samples=own))
+    np.testing.assert_array_equal(read_case(again).error_samples.source, own.source)
+    with pytest.raises(InputError, match="an integer for each of 6 samples"):
+        dataclasses.replace(told.error_samples, source=np.zeros(6))
     assert back.chordae_follow
     # The samples are part of the case and of its hash.
     other = dataclasses.replace(told, error_samples=samples(6, 3, n, seed=7))

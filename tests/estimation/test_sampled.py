@@ -93,6 +93,20 @@ def test_few_samples_widen_by_student_s_distribution():
     np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
+def test_what_a_sample_was_made_from_is_left_out_with_it():
+    base, samples = observation_noise(0.2**2, N), errors(6, np.random.default_rng(8))
+    alone = SampledErrors(base, samples).posterior(H, P0)
+    # Twice the same tells nothing more: were the copies taken for independent, a gain that has seen
+    # one of them would be better than it is where neither was seen.
+    twice = np.concatenate([samples, samples], axis=1)
+    together = SampledErrors(base, twice, np.tile(np.arange(6), 2)).posterior(H, P0)
+    np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-9)
+    apart = SampledErrors(base, twice).posterior(H, P0)
+    assert np.all(np.diag(apart.from_samples) < 0.7 * np.diag(alone.from_samples))
+    with pytest.raises(InputError, match="one for each of 12 samples"):
+        SampledErrors(base, twice, np.arange(6))
+
+
 @pytest.mark.parametrize(
     ("samples", "message"),
     [

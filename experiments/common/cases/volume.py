@@ -19,11 +19,7 @@ from experiments.common.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
-from mvest.cases.from_images.errors_in_world import (
-    samples_in_world,
-    with_mirror_images,
-    without_mean_error,
-)
+from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
 from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
 from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
@@ -177,13 +173,12 @@ def detect_in_volume(
         valve, frames, accuracy.samples, accuracy.tip_samples
     )
     kept = _thinned(len(errors), settings.error_samples)
-    both_ways = with_mirror_images(valve.layout, errors[kept], tip_errors[kept])
     case = case_of_sequence(
         corrected,
         frames,
         texts,
         thickness_mm=thickness,
-        error_samples=samples_in_world(corrected, frames, *both_ways),
+        error_samples=samples_in_world(corrected, frames, errors[kept], tip_errors[kept]),
     )
     off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
     case = replace(

@@ -7,27 +7,32 @@ from dataclasses import dataclass
 from experiments.common.estimates import Data, SeedRun
 from mvest.reporting.case.findings import Cost, FrameDistances, ImageErrors, UnknownRow
 
-__all__ = ["KNOWN", "Findings", "KnownGeometry", "Row"]
+__all__ = ["KNOWN", "SEGMENTED", "Findings", "KnownGeometry", "Row"]
 
 KNOWN = "known"
 """Folder of the estimation from the known geometry, in that of the run."""
 
+SEGMENTED = "segmented"
+"""That of the one from a perfect segmentation of the same volume."""
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A modulus as it was estimated from the volume, and as it was from the known geometry, MPa.
+    """A modulus as it was estimated from the volume, and as it was from better ones, MPa.
 
-    The truth was revealed. Neither has an estimate where that did not converge.
+    These are the known geometry and a perfect segmentation. The truth was revealed. None has an
+    estimate where that did not converge.
     """
 
     patient: str
     modulus: UnknownRow
     known_geometry: float | None
+    segmented: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class KnownGeometry:
-    """The estimation from where the valve truly was; without unknowns if it left nothing."""
+    """An estimation from where the valve truly was; without unknowns if it left nothing."""
 
     converged: bool
     reason: str
@@ -45,6 +50,7 @@ class Findings:
     rows: tuple[Row, ...]
     unknowns: tuple[UnknownRow, ...]
     known_geometry: KnownGeometry
+    segmented: KnownGeometry | None = None
     image_errors: ImageErrors | None = None
     budget: tuple[Cost, ...] = ()
     distances: tuple[FrameDistances, ...] = ()

@@ -10,7 +10,7 @@ from experiments.common.cases.report import estimation_text, write_case_run
 from experiments.common.cases.skill import skill_words
 from experiments.common.record import Record
 from experiments.studies.imaged_patient.budget import write_budget
-from experiments.studies.imaged_patient.findings import KNOWN, Findings
+from experiments.studies.imaged_patient.findings import KNOWN, SEGMENTED, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables
 from mvest.reporting.case.findings import UnknownRow
 
@@ -39,7 +39,7 @@ def write_run(folder: Path, record: Record[Findings]) -> list[Path]:
     """Table and page of both estimations, as far as they left something."""
     return [
         path
-        for place in (folder, folder / KNOWN)
+        for place in (folder, folder / SEGMENTED, folder / KNOWN)
         if (place / ESTIMATE).is_file()
         for path in write_case_run(place, record, read_estimate(place).findings.case)
     ]

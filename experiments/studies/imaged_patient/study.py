@@ -23,7 +23,13 @@ from experiments.common.virtual_patients import (
     first_that_closes,
     require_patient,
 )
-from experiments.studies.imaged_patient.findings import KNOWN, Findings, KnownGeometry, Row
+from experiments.studies.imaged_patient.findings import (
+    KNOWN,
+    SEGMENTED,
+    Findings,
+    KnownGeometry,
+    Row,
+)
 from experiments.studies.imaged_patient.report import (
     volume_text,
     volumes_answer,
@@ -31,7 +37,7 @@ from experiments.studies.imaged_patient.report import (
     write_volumes,
 )
 from experiments.studies.imaged_patient.settings import Settings
-from mvest.cases.case import ValveCase
+from mvest.cases.case import ErrorSamples, ValveCase
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.writer import write_case
@@ -42,12 +48,14 @@ from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.imaging.writing.slicer import write_sequence_nrrd
+from mvest.observation.errors import SpatialCorrelation
 from mvest.provenance import write_json
 from mvest.reading.json_file import read_mapping
 from mvest.reporting.case.findings import UnknownRow
 from mvest.simulation.motion.closing import MotionSettings
 from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
 from mvest.simulation.motion.population import draw_tip_motion
+from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 
 __all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient", "volume_rows"]
@@ -80,13 +88,18 @@ class ImagedPlace:
         return self.hidden / KNOWN
 
     @property
+    def segmented(self) -> Path:
+        """Folder of a case with these as a perfect segmentation has them."""
+        return self.hidden / SEGMENTED
+
+    @property
     def truth(self) -> Path:
         """Folder of what no estimation is given."""
         return self.hidden / TRUTH
 
 
 def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
-    """Simulate, estimate apart from the volume and from the true positions, reveal.
+    """Simulate, estimate apart from the volume and from better geometries, reveal.
 
     Raises
     ------
@@ -99,20 +112,20 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
     stated = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
     volume = _estimated(stated, folder, place.volume, place.hidden)
     # Of the known shape nothing is in error but what the estimator cannot know.
-    beside = folder / KNOWN
-    beside.mkdir(exist_ok=True)
-    known = _estimated(values, beside, place.known, place.truth)
+    known, segmented = (
+        _beside(values, folder / case.name, case, place.truth)
+        for case in (place.known, place.segmented)
+    )
     lost = volume if isinstance(volume, str) else ""
     run = known if isinstance(volume, str) else volume
     if isinstance(run, str):
         raise InputError(run)
     left = None if lost else run.findings
     findings = Findings(
-        rows=volume_rows(job.settings.patient.name, volume, known, hidden["values"]),
+        rows=volume_rows(job.settings.patient.name, volume, known, segmented, hidden["values"]),
         unknowns=left.case.unknowns if left else (),
-        known_geometry=KnownGeometry(False, known)
-        if isinstance(known, str)
-        else KnownGeometry(known.status != FAILED, known.reason, known.findings.case.unknowns),
+        known_geometry=_kept(known),
+        segmented=_kept(segmented),
         image_errors=left.case.image_errors if left else None,
         budget=left.case.budget if left else (),
         distances=left.case.distances if left else (),
@@ -145,15 +158,31 @@ def _estimated(values: Values, folder: Path, case: Path, sealed: Path) -> Estima
         return str(fault)
 
 
+def _beside(values: Values, folder: Path, case: Path, sealed: Path) -> Estimation:
+    folder.mkdir(exist_ok=True)
+    return _estimated(values, folder, case, sealed)
+
+
+def _kept(found: Estimation) -> KnownGeometry:
+    if isinstance(found, str):
+        return KnownGeometry(False, found)
+    return KnownGeometry(found.status != FAILED, found.reason, found.findings.case.unknowns)
+
+
 def volume_rows(
-    patient: str, volume: Estimation, known: Estimation, truth: Mapping[str, float]
+    patient: str,
+    volume: Estimation,
+    known: Estimation,
+    segmented: Estimation,
+    truth: Mapping[str, float],
 ) -> tuple[Row, ...]:
-    """Each modulus as estimated from the volume and from the known geometry."""
+    """Each modulus as estimated from the volume and from better geometries."""
     return tuple(
         Row(
             patient,
             replace(_unknown(volume, known, name), truth=truth[name]),
             _unknown(known, volume, name).estimate,
+            None if isinstance(segmented, str) else _unknown(segmented, volume, name).estimate,
         )
         for name in sorted(name for name in truth if name.startswith("E_f."))
     )
@@ -210,6 +239,13 @@ KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
 """What the case of the true positions states: about what the image step does."""
 
 
+VOXELS_ALIKE = 4.0
+"""Over how many voxels errors of a segmentation are alike: surfaces of label maps are smoothed."""
+
+SAMPLES = 20
+"""Of the errors of a segmentation, that go with its case."""
+
+
 _Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
 """A patient, how it was imaged, and how many anatomies were drawn for it."""
 
@@ -238,7 +274,12 @@ def _write(place: ImagedPlace, imaged: _Made, patient: PatientSettings, describe
     # The source of what is simulated names the patient; a file has its name alone.
     write_sequence_nrrd(place.volume, volume)
     frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
-    write_case(place.known, _known_case(true_sequence(made.valve, probe), frames, patient))
+    true = true_sequence(made.valve, probe)
+    write_case(place.known, _known_case(true, frames, patient))
+    segmented = _segmented_case(
+        true, frames, patient, float(volume.spacing.max()), described["seed"]
+    )
+    write_case(place.segmented, segmented)
     write_json(
         place.truth / HIDDEN,
         {
@@ -269,6 +310,39 @@ def _costs(table: str, of: str) -> Section:
     caption = f"Where the information dies between a volume and a modulus.{of} Simulated."
     title = f"What is not known costs the moduli.{of}"
     return Section(name, {name: caption}, title=title, table=table)
+
+
+def _segmented_case(
+    true: ValveSequence, frames: CaseFrames, patient: PatientSettings, voxel_mm: float, seed: int
+) -> ValveCase:
+    """The true positions as a label map without mistakes has them: to the error of a voxel.
+
+    The error of a position that is rounded to a voxel, in open and closed frame and of the tips,
+    independent of each other, and samples of it.
+    """
+    rng = np.random.default_rng([seed, 3])
+    std, count = voxel_mm / np.sqrt(12.0), len(true.times)
+    length, n = VOXELS_ALIKE * voxel_mm, true.layout.size
+    factor = SpatialCorrelation(true.vertices[frames.open], length).factor
+
+    def errors(samples: int) -> tuple[FloatArray, FloatArray]:
+        white = rng.standard_normal((samples, count, n, 3))
+        tips = rng.standard_normal((samples, count, 2, 3))
+        return std * np.einsum("nk,sfkd->sfnd", factor, white), std * tips
+
+    (leaflets,), (tips,) = errors(1)
+    seen = replace(
+        true,
+        vertices=true.vertices + leaflets,
+        tips=true.tips + tips,
+        std_mm=np.full(n, std),
+        correlation_length_mm=length,
+    )
+    vertices, tip_errors = (each[:, frames.in_order] for each in errors(SAMPLES))
+    texts = CaseTexts(
+        patient.name, f"{patient.description}, a perfect segmentation", "simulated", "MIT", True
+    )
+    return case_of_sequence(seen, frames, texts, error_samples=ErrorSamples(vertices, tip_errors))
 
 
 STUDY = Study(

@@ -22,7 +22,8 @@ __all__ = ["volume_table", "volume_words", "write_volume_tables"]
 TRUTH_OF_MODULI: Final = (
     "Moduli estimated from simulated transoesophageal echo (TEE) volumes of simulated valves. The "
     "truth is the modulus with which the valve was simulated; the known geometry is that valve's "
-    "own midsurface in every frame, in place of what the image step detected. Errors have a sign: "
+    "own midsurface in every frame, in place of what the image step detected; a perfect "
+    "segmentation is that with the error of a voxel of the volume. Errors have a sign: "
     "that from known geometry and the part from the images add up to the whole. Nothing here was "
     "measured in patients."
 )
@@ -44,7 +45,10 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
     if not (truth > 0).all():
         raise InputError(f"moduli from volumes: truth {truth.min()} MPa, expected > 0")
     error = 100.0 * (numbers["estimate"] - truth) / truth
-    known = 100.0 * (np.array([row.known_geometry for row in rows], dtype=float) - truth) / truth
+    known, segmented = (
+        100.0 * (np.array(values, dtype=float) - truth) / truth
+        for values in zip(*((row.known_geometry, row.segmented) for row in rows), strict=True)
+    )
     return pd.DataFrame(
         {
             "patient": [row.patient for row in rows],
@@ -55,6 +59,7 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
             "95 % high [MPa]": numbers["high"],
             "inside": pd.Series([row.modulus.inside for row in rows], dtype=object),
             "error [%]": error,
+            "error from a perfect segmentation [%]": segmented,
             "error from known geometry [%]": known,
             "part from the images [%]": error - known,
         }
@@ -73,6 +78,7 @@ def volume_words(table: pd.DataFrame) -> list[str]:
         words: table[column].abs().median()
         for words, column in (
             ("from the volume", "error [%]"),
+            ("from a perfect segmentation", "error from a perfect segmentation [%]"),
             ("from the known geometry", "error from known geometry [%]"),
             ("part from the images", "part from the images [%]"),
         )
@@ -106,7 +112,7 @@ def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path
                 for name, value in errors.items()
             },
         }
-        for row, (_, errors) in zip(rows, table[table.columns[-3:]].iterrows(), strict=True)
+        for row, (_, errors) in zip(rows, table[table.columns[-4:]].iterrows(), strict=True)
     ]
     moduli = [row.modulus for row in rows]
     readable += [

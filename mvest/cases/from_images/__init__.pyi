@@ -2,7 +2,6 @@ from .build import CaseTexts as CaseTexts
 from .build import case_of_sequence as case_of_sequence
 from .errors_in_world import samples_in_world as samples_in_world
 from .errors_in_world import valve_axes as valve_axes
-from .errors_in_world import with_mirror_images as with_mirror_images
 from .errors_in_world import without_mean_error as without_mean_error
 from .files import write_for_slicer as write_for_slicer
 from .files import write_landmarks as write_landmarks

@@ -13,7 +13,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = ["samples_in_world", "valve_axes", "with_mirror_images", "without_mean_error"]
+__all__ = ["samples_in_world", "valve_axes", "without_mean_error"]
 
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
@@ -39,6 +39,10 @@ def samples_in_world(
 ) -> ErrorSamples:
     """Errors measured on other valves, as displacements in the frames of a case.
 
+    With each of them goes what it would be on the other side, as in a mirror: valves are nearly
+    alike on both sides of the middle of their leaflets, and so is what is wrong with how they are
+    seen. Few samples stand for twice as many, though not for as many that are independent.
+
     Parameters
     ----------
     sequence : ValveSequence
@@ -53,12 +57,15 @@ def samples_in_world(
         They are not of this layout.
     """
     _require_layout(sequence, errors, tip_errors)
+    count = len(errors)
+    errors, tip_errors = _with_mirror_images(sequence.layout, errors, tip_errors)
     numbers, which = _frames_and_errors(frames)
     axes = np.stack([valve_axes(sequence, number) for number in numbers])
     # Where it may have been is where it was found less the error.
     return ErrorSamples(
         -np.einsum("fij,kfnj->kfni", axes, errors[:, which]),
         -np.einsum("fij,kfnj->kfni", axes, tip_errors[:, which]),
+        np.tile(np.arange(count), 2),
     )
 
 
@@ -105,14 +112,10 @@ def without_mean_error(
     )
 
 
-def with_mirror_images(
+def _with_mirror_images(
     layout: ValveLayout, errors: FloatArray, tip_errors: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors as of :func:`samples_in_world` and, after them, what they would be on the other side.
-
-    Valves are nearly alike on both sides of the middle of their leaflets, and so is what is wrong
-    with how they are seen: few samples stand for twice as many.
-    """
+    """Errors as of :func:`samples_in_world` and, after them, what they are in a mirror."""
     rows, columns = np.divmod(np.arange(layout.size), layout.columns)
     other = rows * layout.columns + np.mod(layout.columns // 2 - columns, layout.columns)
     across = np.array([-1.0, 1.0, 1.0])

@@ -16,7 +16,6 @@ from mvest.cases.from_images import (
     measure_sequence,
     samples_in_world,
     valve_axes,
-    with_mirror_images,
     without_mean_error,
 )
 from mvest.cases.writer import write_case
@@ -96,20 +95,21 @@ def test_thickness_and_fibres_vary_as_in_the_template():
     assert thicker.surface.thickness[middle] == pytest.approx(2.64)
 
 
-def test_errors_as_seen_in_a_mirror():
+def test_errors_go_with_what_they_are_in_a_mirror():
     rng = np.random.default_rng(0)
-    errors, tips = rng.standard_normal((3, 2, LAYOUT.size, 3)), rng.standard_normal((3, 2, 2, 3))
-    both, both_tips = with_mirror_images(LAYOUT, errors, tips)
-    np.testing.assert_array_equal(both[:3], errors)
+    errors, tips = rng.standard_normal((4, 2, LAYOUT.size, 3)), rng.standard_normal((4, 2, 2, 3))
+    seen = sequence()
+    found = samples_in_world(seen, FRAMES, errors, tips)
+    np.testing.assert_array_equal(found.source, [0, 1, 2, 3, 0, 1, 2, 3])
+    axes = valve_axes(seen, 2)
+    own, mirrored = found.vertices[:4, 1] @ axes, found.vertices[4:, 1] @ axes
+    np.testing.assert_allclose(own, -errors[:, 1], atol=1e-9)
     # x runs between the commissures: what was seen at 45 degrees is mirrored to 135.
-    here, there = LAYOUT.vertex(45.0, 4), LAYOUT.vertex(135.0, 4)
-    np.testing.assert_array_equal(both[3:, :, there], errors[:, :, here] * [-1, 1, 1])
-    behind, beside = LAYOUT.vertex(225.0, 2), LAYOUT.vertex(315.0, 2)
-    np.testing.assert_array_equal(both[3:, :, beside], errors[:, :, behind] * [-1, 1, 1])
-    np.testing.assert_array_equal(both_tips[3:, :, 0], tips[:, :, 1] * [-1, 1, 1])
-    again, tips_again = with_mirror_images(LAYOUT, both[3:], both_tips[3:])
-    np.testing.assert_array_equal(again[3:], errors)
-    np.testing.assert_array_equal(tips_again[3:], tips)
+    for phi, other in ((45.0, 135.0), (225.0, 315.0), (0.0, 180.0), (90.0, 90.0)):
+        here, there = LAYOUT.vertex(phi, 4), LAYOUT.vertex(other, 4)
+        np.testing.assert_allclose(mirrored[:, there], own[:, here] * [-1, 1, 1], atol=1e-9)
+    tips_found = found.tips[:, 1] @ axes
+    np.testing.assert_allclose(tips_found[4:, 0], tips_found[:4, 1] * [-1, 1, 1], atol=1e-9)
 
 
 def test_what_was_seen_last_may_be_the_open_valve():
@@ -152,7 +152,7 @@ def test_errors_become_displacements_back_to_where_it_may_have_been():
     tips[2, 1, 0, 0] = 1.5
     seen = sequence(TURN)
     found = samples_in_world(seen, FRAMES, errors, tips)
-    assert found.vertices.shape == (4, 3, LAYOUT.size, 3)
+    assert found.vertices.shape == (8, 3, LAYOUT.size, 3)
     atrium = valve_axes(seen, 0)[:, 2]
     np.testing.assert_allclose(found.vertices[1, 0], np.tile(-0.7 * atrium, (LAYOUT.size, 1)))
     # Held-out frames err as the closed one does, which they are like.

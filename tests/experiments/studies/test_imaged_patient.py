@@ -29,27 +29,30 @@ TRUTH = {"E_f.posterior": 2.0, "E_f.anterior": 6.0, "pressure_scale": 1.05}
 
 
 def test_rows_put_volume_and_known_geometry_side_by_side():
-    rows = volume_rows("one", an_outcome(5.0, 2.5), an_outcome(5.8, 2.1), TRUTH)
+    rows = volume_rows(
+        "one", an_outcome(5.0, 2.5), an_outcome(5.8, 2.1), an_outcome(5.4, 2.2), TRUTH
+    )
     assert [(row.modulus.leaflet, row.modulus.truth) for row in rows] == [
         ("anterior", 6.0),
         ("posterior", 2.0),
     ]
     first = rows[0]
-    assert (first.patient, first.known_geometry) == ("one", 5.8)
+    assert (first.patient, first.known_geometry, first.segmented) == ("one", 5.8, 5.4)
     assert (first.modulus.estimate, first.modulus.low, first.modulus.high) == (5.0, 4.0, 6.0)
     assert first.modulus.inside
 
 
 @pytest.mark.parametrize("found", ["lost", an_outcome(5.0, 2.5, "failed")])
 def test_a_volume_without_an_estimate_keeps_its_rows(found):
-    rows = volume_rows("one", found, an_outcome(5.8, 2.1), TRUTH)
+    rows = volume_rows("one", found, an_outcome(5.8, 2.1), "lost", TRUTH)
     assert [row.modulus.estimate for row in rows] == [None, None]
     assert [row.known_geometry for row in rows] == [5.8, 2.1]
+    assert [row.segmented for row in rows] == [None, None]
 
 
 def test_what_is_hidden_lies_together(tmp_path):
     place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
-    assert place.known.parent == place.truth.parent == place.hidden
+    assert {place.known.parent, place.segmented.parent, place.truth.parent} == {place.hidden}
     assert place.hidden not in place.volume.parents
     assert place.truth not in place.known.parents
 
@@ -61,14 +64,14 @@ def test_the_table_is_that_of_all_patients(tmp_path):
         publish(STUDY, tmp_path, f"volumes-{name}", record, tmp_path / "no such folder")
 
     for name, found in (("a", an_outcome(5.0, 2.5)), ("b", "lost")):
-        kept(name, volume_rows(name, found, an_outcome(5.8, 2.1), TRUTH))
+        kept(name, volume_rows(name, found, an_outcome(5.8, 2.1), "lost", TRUTH))
     assert {path.stem for path in (tmp_path / "records" / "volume").iterdir()} == {
         "volumes-a", "volumes-b"
     }  # fmt: skip
     table = pd.read_csv(tmp_path / "volume.csv", comment="#")
     assert list(table["patient"]) == ["a", "a", "b", "b"]
     # Run again, a patient takes its own place.
-    kept("a", volume_rows("a", an_outcome(5.5, 2.2), an_outcome(5.8, 2.1), TRUTH))
+    kept("a", volume_rows("a", an_outcome(5.5, 2.2), an_outcome(5.8, 2.1), "lost", TRUTH))
     table = pd.read_csv(tmp_path / "volume.csv", comment="#")
     assert list(table["estimate [MPa]"][:2]) == [5.5, 2.2]
     assert table["estimate [MPa]"][2:].isna().all()
@@ -127,7 +130,9 @@ def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(monkeypatch, 
     record = made_up(outcome.findings, row="one", reason=outcome.reason)
     assert STUDY.words(record) == "one: the estimation left no result: MemoryError"
     # Only what was left is written down, in the folder of its estimation.
-    assert STUDY.write_run(tmp_path, record) == [tmp_path / "known" / "unknowns.csv"]
+    assert STUDY.write_run(tmp_path, record) == [
+        tmp_path / name / "unknowns.csv" for name in ("segmented", "known")
+    ]
 
 
 def modulus(leaflet, truth, estimate=None, low=None, high=None):
@@ -167,7 +172,7 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     assert "6 (4.5 to 7.5) |" in rows[0]
     assert "✗" in rows[1]
     assert "-25.0" in rows[1]
-    assert rows[2].count("–") == 3
+    assert rows[2].count("–") == 4
     assert "Simulated" in text or "simulated" in text
     assert "\\" in written[2].read_text(encoding="utf-8")
 
