@@ -26,7 +26,7 @@ EVERYTHING = "everything"
 
 IMAGES, APART = "errors of the images", "errors of open and closed frame unlike each other"
 
-BANDS = ("near the annulus", "of the belly", "near the free edge")
+BANDS = ("{} frame near the annulus", "belly of the {} frame", "{} frame near the free edge")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def sample_parts(case: ValveCase) -> tuple[dict[str, Moves], tuple[Moves, Moves]
     for name, k in (("open", open_), ("closed", closed)):
         for words, share in zip(BANDS, shares, strict=True):
             weight = np.concatenate([share, np.zeros(len(points[k]) - n)])[:, None]
-            part(f"{name} frame {words}", {k: weight * left[k]})
+            part(words.format(name), {k: weight * left[k]})
     at_tips = np.arange(moves.shape[2])[:, None] >= n
     part("papillary tips", {k: at_tips * left[k] for k in fields})
 

@@ -20,6 +20,7 @@ from mvest.reporting.markup import number
 
 __all__ = [
     "GENERIC",
+    "HALF",
     "PRIOR",
     "PRIOR_STD",
     "Baseline",

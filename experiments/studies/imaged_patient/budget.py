@@ -5,24 +5,43 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from experiments.common.cases.skill import HALF, log_width
 from experiments.common.tables import write_table
 from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
-from mvest.reporting.case.findings import Cost
+from mvest.reporting.case.findings import Cost, UnknownRow
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.style import SMALL, headline, panels
 
-__all__ = ["budget_figure", "budget_table", "write_budget"]
+__all__ = ["budget_figure", "budget_table", "with_unseen", "write_budget"]
 
 NOTE = (
     "Standard deviation of a modulus' logarithm at the estimate, to first order, median over {n} "
     "simulated volumes. *Without*: the part known exactly and all else as it is; *alone*: all else "
     "known exactly ({everything} alone: nothing but the noise of single points). Parts of the "
     "errors of the images come from held-out volumes and add up to them; {apart}: as if the frames "
-    "had nothing in common. Prior of the moduli: {prior:.2f}."
+    "had nothing in common; {unseen}: by how much the reported interval, with a gain that has not "
+    "seen a sample, is wider than that of all samples together. Prior of the moduli: {prior:.2f}."
 )
+
+UNSEEN = "directions that no sample shows"
+"""Of errors of the images: what is lost because few samples tell of them."""
+
+
+def with_unseen(rows: Sequence[Cost], moduli: Sequence[UnknownRow]) -> list[Cost]:
+    """The rows, and what the reported intervals have beyond them."""
+    out = list(rows)
+    for modulus in moduli:
+        whole = [r.without for r in rows if (r.part, r.modulus) == (EVERYTHING, modulus.name)]
+        width = log_width(modulus)
+        if whole and width is not None:
+            reported = width / (2 * HALF)
+            beyond = max(reported**2 - whole[0] ** 2, 0.0)
+            out.append(Cost(UNSEEN, modulus.name, whole[0], float(np.sqrt(beyond))))
+    return out
 
 
 def budget_table(budgets: Mapping[str, Sequence[Cost]]) -> pd.DataFrame:
@@ -69,7 +88,10 @@ def budget_figure(budgets: Mapping[str, Sequence[Cost]]) -> Figure:
         one.set_xlim(0.0, None)
         one.set_title(leaflet, loc="left", fontsize=SMALL + 0.5)
         one.set_xlabel("SD of the modulus' logarithm")
-    axes[0, -1].legend(fontsize=SMALL, frameon=False)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower right", ncols=2, fontsize=SMALL, frameon=False
+    )
     headline(
         figure,
         "Where the information dies between a volume and a modulus",
@@ -104,7 +126,11 @@ def write_budget(
         for part, row in medians.iterrows()
     ]
     note = NOTE.format(
-        n=len(budgets), everything=f"*{EVERYTHING}*", apart=f"*{APART}*", prior=prior
+        n=len(budgets),
+        everything=f"*{EVERYTHING}*",
+        apart=f"*{APART}*",
+        prior=prior,
+        unseen=f"*{UNSEEN}*",
     )
     return [
         *write_table(base, table, readable, line, [note, budget_words(medians)]),

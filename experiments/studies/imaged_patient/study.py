@@ -239,10 +239,11 @@ KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
 """What the case of the true positions states: about what the image step does."""
 
 
-VOXELS_ALIKE = 4.0
-"""Over how many voxels errors of a segmentation are alike: surfaces of label maps are smoothed."""
+VOXELS_ALIKE = 10.0
+"""Over how many voxels errors of a segmentation are alike: surfaces of label maps are smoothed, and
+rougher ones cannot be meshed."""
 
-SAMPLES = 20
+SAMPLES = 40
 """Of the errors of a segmentation, that go with its case."""
 
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -11,7 +12,7 @@ from experiments.common.study import Job
 from experiments.common.virtual_patients import PatientSettings
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
-from experiments.studies.imaged_patient.budget import write_budget
+from experiments.studies.imaged_patient.budget import UNSEEN, with_unseen, write_budget
 from experiments.studies.imaged_patient.findings import Findings, KnownGeometry, Row
 from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
 from experiments.studies.imaged_patient.tables import (
@@ -199,6 +200,12 @@ def test_what_errors_cost_is_a_median_over_patients(tmp_path):
     assert "median over 3 simulated" in text
     assert "Alone cost most: pressure (0.11), papillary tips (0.07)." in text
     assert write_budget(tmp_path / "none", {"lost": ()}, 0.5, "line") == []
+    # An interval of ± 1.96 · 0.25 has 0.15 beyond the 0.2 of everything.
+    half = float(np.exp(1.959964 * 0.25))
+    reported = [modulus("anterior", 5.0, 6.0, 6.0 / half, 6.0 * half), modulus("posterior", 2.0)]
+    *_, last = with_unseen(costs(1.0), reported)
+    assert (last.part, last.modulus) == (UNSEEN, "E_f.anterior")
+    assert last.alone == pytest.approx(0.15, rel=1e-4)
 
 
 @pytest.mark.parametrize(
