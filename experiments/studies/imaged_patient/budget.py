@@ -85,7 +85,7 @@ def budget_figure(budgets: Mapping[str, Sequence[Cost]]) -> Figure:
             )
         one.set_yticks(list(places), parts)
         one.set_ylim(len(parts) - 0.5, -0.5)
-        one.set_xlim(0.0, None)
+        one.set_xlim(0.0, 1.08 * float(medians.loc[parts].to_numpy().max()))
         one.set_title(leaflet, loc="left", fontsize=SMALL + 0.5)
         one.set_xlabel("SD of the modulus' logarithm")
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -95,7 +95,7 @@ def budget_figure(budgets: Mapping[str, Sequence[Cost]]) -> Figure:
     headline(
         figure,
         "Where the information dies between a volume and a modulus",
-        "Each part of what is not known, alone and taken away; dashed: all together. Simulated.",
+        "Each part of what is not known, alone and taken away; dashed: all but the last.",
     )
     return figure
 

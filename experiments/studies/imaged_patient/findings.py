@@ -21,13 +21,14 @@ class Row:
     """A modulus as it was estimated from the volume, and as it was from better ones, MPa.
 
     These are the known geometry and a perfect segmentation. The truth was revealed. None has an
-    estimate where that did not converge.
+    estimate where that did not converge. The verdict is on the estimate from the volume.
     """
 
     patient: str
     modulus: UnknownRow
     known_geometry: float | None
     segmented: float | None = None
+    verdict: str = ""
 
 
 @dataclass(frozen=True, slots=True)

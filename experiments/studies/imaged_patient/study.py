@@ -183,9 +183,16 @@ def volume_rows(
             replace(_unknown(volume, known, name), truth=truth[name]),
             _unknown(known, volume, name).estimate,
             None if isinstance(segmented, str) else _unknown(segmented, volume, name).estimate,
+            _verdict(volume),
         )
         for name in sorted(name for name in truth if name.startswith("E_f."))
     )
+
+
+def _verdict(estimation: Estimation) -> str:
+    """How far an estimate may be believed, as it says itself; empty where it was not judged."""
+    verdict = None if isinstance(estimation, str) else estimation.findings.case.verdict
+    return "" if verdict is None else verdict.trust
 
 
 def _unknown(estimation: Estimation, other: Estimation, name: str) -> UnknownRow:

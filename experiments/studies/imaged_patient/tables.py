@@ -58,6 +58,7 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
             "95 % low [MPa]": numbers["low"],
             "95 % high [MPa]": numbers["high"],
             "inside": pd.Series([row.modulus.inside for row in rows], dtype=object),
+            "verdict": [row.verdict for row in rows],
             "error [%]": error,
             "error from a perfect segmentation [%]": segmented,
             "error from known geometry [%]": known,
@@ -86,6 +87,17 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     medians = ", ".join(f"{words} {v:.1f} %" for words, v in sizes.items() if np.isfinite(v))
     if medians:
         out.append(f"Median size of the error: {medians}.")
+    by_leaflet = table["error [%]"].abs().groupby(table["modulus"], sort=False).median()
+    listed = ", ".join(f"{name} {v:.1f} %" for name, v in by_leaflet.items() if np.isfinite(v))
+    if listed:
+        out.append(f"From the volume by leaflet: {listed}.")
+    judged = table[table["verdict"] != ""]
+    if len(judged):
+        trusts = ", ".join(
+            f"{trust} {len(own)} ({int(own['inside'].eq(True).sum())} inside)"
+            for trust, own in judged.groupby("verdict")
+        )
+        out.append(f"Verdicts: {trusts}.")
     width = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
     if len(known):
         out.append(f"Width of the interval over the estimate: median {width.median():.2f}.")
@@ -107,6 +119,7 @@ def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path
             "modulus": row.modulus.leaflet,
             "truth [MPa]": number(row.modulus.truth),
             "estimate, 95 % [MPa]": interval_words(row.modulus),
+            "verdict": row.verdict or MISSING,
             **{
                 str(name): MISSING if pd.isna(value) else f"{value:+.1f}"
                 for name, value in errors.items()

@@ -144,8 +144,8 @@ def modulus(leaflet, truth, estimate=None, low=None, high=None):
 
 
 MODULI = [
-    Row("normal_small", modulus("anterior", 5.0, 6.0, 4.5, 7.5), 5.2),
-    Row("normal_small", modulus("posterior", 2.0, 1.5, 1.2, 1.8), 2.1),
+    Row("normal_small", modulus("anterior", 5.0, 6.0, 4.5, 7.5), 5.2, 5.5, "doubtful"),
+    Row("normal_small", modulus("posterior", 2.0, 1.5, 1.2, 1.8), 2.1, None, "doubtful"),
     Row("prolapse", modulus("anterior", 4.0), 4.0),
 ]
 
@@ -162,7 +162,10 @@ def test_errors_of_moduli_add_up():
     assert words[0] == "The 95 % interval contains the truth for 1 of 2 moduli."
     assert words[1] == "For 1 of 3 moduli there is no estimate."
     assert "from the volume 22.5 %" in words[2]
+    assert "from a perfect segmentation 10.0 %" in words[2]
     assert "from the known geometry 4.0 %" in words[2]
+    assert words[3] == "From the volume by leaflet: anterior 20.0 %, posterior 25.0 %."
+    assert words[4] == "Verdicts: doubtful 2 (1 inside)."
 
 
 def test_the_table_of_moduli_is_readable(tmp_path):
@@ -173,7 +176,7 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     assert "6 (4.5 to 7.5) |" in rows[0]
     assert "✗" in rows[1]
     assert "-25.0" in rows[1]
-    assert rows[2].count("–") == 4
+    assert rows[2].count("–") == 5
     assert "Simulated" in text or "simulated" in text
     assert "\\" in written[2].read_text(encoding="utf-8")
 
