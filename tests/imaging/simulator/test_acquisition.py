@@ -6,7 +6,13 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.simulator import SMALL, Acquisition, draw_acquisition
-from mvest.imaging.simulator.acquisition_ranges import SHIFTED, TRAINING, AcquisitionRanges, Range
+from mvest.imaging.simulator.acquisition_ranges import (
+    SHIFTED,
+    TRAINING,
+    WIDE,
+    AcquisitionRanges,
+    Range,
+)
 
 # Echo strengths and compensation may be those of training in both.
 BOTH = {"wall_db", "chord_db", "papillary_db", "vessel_db", "compensation_db_per_cm_mhz"}
@@ -55,7 +61,7 @@ def test_shifted_acquisitions_lie_outside_of_all_training_ranges():
         assert all(outside) or entry.setting in BOTH, entry.setting
 
 
-@pytest.mark.parametrize("spread", [TRAINING, SHIFTED])
+@pytest.mark.parametrize("spread", [TRAINING, WIDE, SHIFTED])
 def test_what_is_drawn_lies_in_the_ranges_and_fills_them(spread):
     rng, base = np.random.default_rng(0), Acquisition()
     drawn = [draw_acquisition(rng, base, spread.name) for _ in range(200)]
