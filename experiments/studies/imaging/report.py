@@ -237,7 +237,7 @@ def write_imaging(
 def _figures(layout: ValveLayout, tested: Evaluation) -> dict[str, Figure]:
     accuracy = tested.accuracy
     figures = {"distance": distance_figure([asdict(row) for row in tested.rows])}
-    if tested.training:
+    if len({row.training_volumes for row in tested.training}) > 1:
         figures["training"] = training_figure(pd.DataFrame(map(asdict, tested.training)))
     return figures | {
         "confidence": confidence_figure(tested.confidence),
