@@ -210,8 +210,8 @@ def _unlike(confidence: float, like_from: float) -> str:
         return ""
     return (
         f"the volume is unlike those that the detectors were trained on: confidence "
-        f"{confidence:.2f} in the median frame, expected at least {like_from:.2f}, which all but "
-        f"{100 * UNLIKE_SHARE:g} % of volumes like those reach"
+        f"{confidence:.2f} in the median frame, expected at least {like_from:.2f}, below which "
+        f"{100 * UNLIKE_SHARE:g} % of volumes like those are expected"
     )
 
 
