@@ -14,9 +14,10 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from subprocess import PIPE
+from subprocess import PIPE, TimeoutExpired
 from typing import Any
 
 import experiments
@@ -41,6 +42,9 @@ __all__ = ["StoppedError", "WorkerProcess", "new_worker", "run_apart"]
 WORKER = (sys.executable, "-m", "experiments.runner.worker")
 """Command of a process that runs jobs."""
 
+LEAVE_S = 2.0
+"""For a process without a job to end by itself, before it is ended."""
+
 
 class StoppedError(Exception):
     """A process was stopped from outside; of the job that it ran nothing is recorded."""
@@ -57,6 +61,7 @@ class WorkerProcess:
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
         self._program: Program | None = None
+        self._waits = False
         self._stopped = False
         atexit.register(self.close)
 
@@ -95,6 +100,7 @@ class WorkerProcess:
             timer.start()
         try:
             order = request.to_json() | {MEMORY_LIMIT: memory_limit_gb, "aloud": aloud}
+            self._waits = False
             process.stdin.write(json.dumps(order) + "\n")
             process.stdin.flush()
             line = process.stdout.readline()
@@ -108,6 +114,7 @@ class WorkerProcess:
             timer.cancel()
         if line.endswith("\n") and not expired.is_set():
             answered = json.loads(line)
+            self._waits = True
             if not answered["healthy"]:
                 self.close()
             if aloud and answered.get("refused"):
@@ -123,9 +130,17 @@ class WorkerProcess:
 
     def close(self) -> None:
         """End the process, and whatever it has started."""
-        if self._program is not None:
-            self._program.close()
-            self._program = None
+        if self._program is None:
+            return
+        process = self._program.process
+        if self._waits and process.stdin is not None:
+            # Nothing more is asked for; a signal would come amid its leaving.
+            with suppress(OSError):
+                process.stdin.close()
+            with suppress(TimeoutExpired):
+                process.wait(LEAVE_S)
+        self._program.close()
+        self._program = None
 
     def stop(self) -> None:
         """End the process for good, from another thread than the one that waits for its job."""

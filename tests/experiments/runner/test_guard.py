@@ -120,6 +120,17 @@ def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
     assert pid() not in (first, second)
 
 
+def test_a_process_without_a_job_leaves_by_itself_and_a_busy_one_does_not(tmp_path):
+    left = tmp_path / "left"
+    leaving = f"\nimport pathlib; time.sleep(0.2); pathlib.Path({str(left)!r}).touch()"
+    for order, stays in (({}, True), ({"sleep": 60}, False)):
+        left.unlink(missing_ok=True)
+        found = WorkerProcess((sys.executable, "-c", OBEDIENT + leaving))
+        found.run(request(tmp_path, **order), time_limit_s=3.0)
+        found.close()
+        assert left.exists() is stays
+
+
 def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypatch):
     for name in THREAD_VARIABLES:
         monkeypatch.setenv(name, "7")
