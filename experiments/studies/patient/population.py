@@ -21,11 +21,21 @@ from experiments.common.cases.skill import (
 from experiments.common.record import Record
 from experiments.common.report import cautions
 from experiments.common.tables import write_table
-from experiments.studies.patient.tables import distance_words, provenance_of, table3
+from experiments.studies.patient.tables import (
+    distance_words,
+    provenance_of,
+    table3,
+    verdict_word,
+    without_estimate,
+)
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.markup import MISSING
 
 __all__ = ["population_frame", "write_population_tables"]
+
+WITH = "with nuisances"
+"""The estimation of all unknowns, on which there is a verdict."""
 
 COLUMNS = ("name", "unit", "truth", "estimate", "std", "low", "high", "inside")
 """What is listed of an unknown."""
@@ -39,7 +49,7 @@ def population_frame(records: Sequence[Record[Findings]]) -> pd.DataFrame:
         alone = case.without_nuisances
         moduli = [row for row in case.unknowns if row.is_modulus]
         for estimation, unknowns in (
-            ("with nuisances", case.unknowns),
+            (WITH, case.unknowns),
             ("without nuisances", alone.parameters if alone else ()),
             (GENERIC, list(map(generic_guess, moduli))),
             (PRIOR, list(map(prior_alone, moduli))),
@@ -49,6 +59,7 @@ def population_frame(records: Sequence[Record[Findings]]) -> pd.DataFrame:
                     "patient": case.about.name,
                     "estimation": estimation,
                     "status": record.status,
+                    "verdict": verdict_word(case),
                     **{name: getattr(row, name) for name in COLUMNS},
                 }
                 for row in unknowns
@@ -62,6 +73,8 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
     readable = []
     for (estimation, name), group in table.groupby(["estimation", "name"], sort=False):
         known = group[group["estimate"].notna() & group["truth"].notna()]
+        if estimation == WITH:
+            known = known[known["verdict"] != NONE]
         judged = known["inside"].dropna()
         inside, n = int(judged.sum()), len(judged)
         low, high = share_bounds(inside, n)
@@ -86,13 +99,16 @@ def write_population_tables(results: Path, records: Sequence[Record[Findings]]) 
             }
         )
     distances = table3(records)
-    unknowns = [row for record in records for row in record.findings.case.unknowns]
+    cases = [record.findings.case for record in records]
+    unknowns = [row for case in cases if case.is_stated for row in case.unknowns]
     notes = [
         *cautions(records),
         "Simulated valves with anatomies and moduli drawn at random; the truth was revealed after "
         "the estimation.",
+        *without_estimate(cases),
         skill_words([row for row in unknowns if row.is_modulus]),
         *_both_moduli(table),
+        *_by_verdict(table),
         *distance_words(distances),
     ]
     base = results / "population"
@@ -106,10 +122,29 @@ def _both_moduli(table: pd.DataFrame) -> list[str]:
         "estimation", sort=False
     ):
         known = group[group["name"].str.startswith("E_f.") & group["inside"].notna()]
+        if estimation == WITH:
+            known = known[known["verdict"] != NONE]
         inside = int(known["inside"].sum())
         out.append(
             f"Both moduli, {estimation}: the 95 % interval contains the truth {inside} times of "
             f"{len(known)} ({100 * inside / max(len(known), 1):.0f} %)."
+        )
+    return out
+
+
+def _by_verdict(table: pd.DataFrame) -> list[str]:
+    """What verdicts are worth."""
+    own = table[(table["estimation"] == WITH) & table["name"].str.startswith("E_f.")]
+    out = []
+    for verdict in (TRUSTWORTHY, DOUBTFUL):
+        known = own[(own["verdict"] == verdict) & own["inside"].notna()]
+        if known.empty:
+            continue
+        error = ((known["estimate"] - known["truth"]) / known["truth"]).abs().median()
+        inside, patients = int(known["inside"].sum()), known["patient"].nunique()
+        out.append(
+            f"Called {verdict}: {patients} patients; {inside} of {len(known)} moduli inside, median "
+            f"error {100 * error:.1f} %."
         )
     return out
 
@@ -125,6 +160,8 @@ def population_figure(table: pd.DataFrame) -> Figure:
             axes = grid[i, j]
             part = table[(table["estimation"] == kind) & (table["name"] == name)]
             part = part[part["inside"].notna()]
+            if kind == WITH:
+                part = part[part["verdict"] != NONE]
             axes.set_title(f"{name.replace('E_f.', 'E_f ')}, {kind}", fontsize=10)
             if part.empty:
                 axes.set_axis_off()

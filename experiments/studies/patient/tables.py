@@ -23,10 +23,11 @@ from experiments.common.record import Record
 from experiments.common.report import cautions
 from experiments.common.tables import write_table
 from mvest.errors import InputError
+from mvest.problem.verdict import NONE
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, paint_leak, same_scale
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.reporting.case.figures import corner_colours, distance_top
-from mvest.reporting.case.findings import ModuliAlone, UnknownRow
+from mvest.reporting.case.findings import CaseFindings, ModuliAlone, UnknownRow
 from mvest.reporting.figures import DISTANCE_MAP, save_figure_with
 from mvest.reporting.findings import Spread
 from mvest.reporting.markup import MISSING, number
@@ -39,6 +40,8 @@ __all__ = [
     "provenance_of",
     "table2",
     "table3",
+    "verdict_word",
+    "without_estimate",
     "write_patient_tables",
 ]
 
@@ -78,6 +81,7 @@ def table2(records: Sequence[Record[Findings]]) -> pd.DataFrame:
         for k, row in enumerate(_moduli(case.unknowns)):
             plain: dict[str, Any] = {
                 "patient": case.about.name,
+                "verdict": verdict_word(case),
                 "modulus": row.name,
                 "hidden truth [MPa]": row.truth,
                 "estimate [MPa]": row.estimate,
@@ -171,11 +175,11 @@ def _readable2(records: Sequence[Record[Findings]]) -> list[dict[str, str]]:
     rows = []
     for record in records:
         case = record.findings.case
-        row = {"patient (simulated)": _words(case.about.name)}
+        row = {"patient (simulated)": _words(case.about.name), "verdict": verdict_word(case)}
         for k, unknown in enumerate(_moduli(case.unknowns)):
             short = "E_AL" if k == 0 else "E_PL"
             row[f"{short} truth"] = number(unknown.truth)
-            row[f"{short} estimate, 95 %"] = interval_words(unknown)
+            row[f"{short} estimate, 95 %"] = interval_words(unknown) if case.is_stated else "none"
             row[f"{short} without nuisances"] = _other_words(case.without_nuisances, k)
             row[f"{short} paper's filter"] = _other_words(case.as_in_the_paper, k)
         rows.append(row)
@@ -232,7 +236,7 @@ def _mean_and_sd(row: Any, which: str) -> str:
 
 def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[str]:
     """What Table 2 says, in numbers."""
-    known = table[table["inside"].notna()]
+    known = table[table["inside"].notna() & (table["verdict"] != NONE)]
     said = [
         f"The 95 % interval contains the truth for {int(known['inside'].sum())} of {len(known)} "
         "moduli"
@@ -241,12 +245,14 @@ def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[st
         column = table[f"{words} inside"]
         if column.notna().any():
             said.append(f"{words} for {int(column.sum())} of {int(column.notna().sum())}")
-    moduli = [row for record in records for row in _moduli(record.findings.case.unknowns)]
+    cases = [record.findings.case for record in records]
+    moduli = [row for case in cases if case.is_stated for row in _moduli(case.unknowns)]
     if known.empty:
         return ["No estimation of these patients ended with moduli."]
     relative = (known["95 % high [MPa]"] - known["95 % low [MPa]"]) / known["estimate [MPa]"]
     out = [
         "; ".join(said) + ".",
+        *without_estimate(cases),
         skill_words(moduli),
         f"Width of the interval over the estimate: {relative.min():.2f} to {relative.max():.2f}, "
         f"mean {relative.mean():.2f}.",
@@ -255,6 +261,27 @@ def _words2(table: pd.DataFrame, records: Sequence[Record[Findings]]) -> list[st
     if narrow:
         out.append("What would narrow it, on average: " + "; ".join(narrow) + ".")
     return out
+
+
+def verdict_word(case: CaseFindings) -> str:
+    """What the verdict on an estimate is, in a word; without one, whether there is an estimate."""
+    if not case.is_stated:
+        return NONE
+    return MISSING if case.verdict is None else case.verdict.trust
+
+
+def without_estimate(cases: Sequence[CaseFindings]) -> list[str]:
+    """A sentence on those whose verdict is that there is no estimate, if there are any."""
+    none = [case for case in cases if not case.is_stated]
+    if not none:
+        return []
+    judged = [row.inside for case in none for row in _moduli(case.unknowns)]
+    known = [inside for inside in judged if inside is not None]
+    return [
+        f"For {len(none)} of {len(cases)} the verdict is that there is no estimate "
+        f"({', '.join(_words(case.about.name) for case in none)}); they are not counted. (Of the "
+        f"{len(known)} intervals that they ended with {sum(known)} contain the truth.)"
+    ]
 
 
 def _narrower(records: Sequence[Record[Findings]]) -> list[str]:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mvest.problem.verdict import Verdict
+from mvest.problem.verdict import NONE, Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
 __all__ = ["About", "CaseFindings", "Cost", "ErrorRow", "FrameDistances", "ImageErrors",
@@ -289,6 +289,11 @@ class CaseFindings:
     def title(self) -> str:
         """What a page of it is called."""
         return self.about.description or self.about.name
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether its moduli may be stated: the verdict is not that there are none."""
+        return self.converged and (self.verdict is None or self.verdict.trust != NONE)
 
     @property
     def status(self) -> str:
