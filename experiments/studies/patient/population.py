@@ -143,8 +143,8 @@ def _by_verdict(table: pd.DataFrame) -> list[str]:
         error = ((known["estimate"] - known["truth"]) / known["truth"]).abs().median()
         inside, patients = int(known["inside"].sum()), known["patient"].nunique()
         out.append(
-            f"Called {verdict}: {patients} patients; {inside} of {len(known)} moduli inside, median "
-            f"error {100 * error:.1f} %."
+            f"Called {verdict}: {patients} patients, {inside} of {len(known)} moduli inside, "
+            f"median error {100 * error:.1f} %."
         )
     return out
 

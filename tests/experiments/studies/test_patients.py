@@ -29,6 +29,7 @@ from experiments.studies.patient.tables import (
     write_patient_tables,
 )
 from mvest.errors import InputError
+from mvest.problem.verdict import NONE, TRUSTWORTHY, Ground, Verdict
 from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.studies.made_up_patients import (
     TRUTH,
@@ -144,6 +145,24 @@ def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
         assert "prolapse" not in (tmp_path / "table3.md").read_text()
     else:
         assert "No estimation of these patients ended with moduli." in text
+
+
+def test_moduli_whose_verdict_is_none_are_not_stated(tmp_path):
+    # Both truths lie in its intervals; it is no less without an estimate.
+    refused = patient("prolapse", verdict=Verdict(NONE, (Ground("gate", NONE, "open", "wait"),)))
+    trusted = patient(verdict=Verdict(TRUSTWORTHY))
+    kept = {"a": trusted, "b": refused}
+    write_patient_tables(tmp_path, kept, {})
+    text = (tmp_path / "table2.md").read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith("| prolapse"))
+    assert row.startswith("| prolapse | none | 6 | none |")
+    assert "contains the truth for 2 of 2 moduli" in text
+    assert "For 1 of 2 the verdict is that there is no estimate (prolapse)" in text
+    write_population_tables(tmp_path, [trusted, refused])
+    text = (tmp_path / "population.md").read_text(encoding="utf-8")
+    assert "| with nuisances | E_f.anterior | 1 of 2 | 1 (100 %)" in text
+    assert "with nuisances: the 95 % interval contains the truth 2 times of 2" in text
+    assert "Called trustworthy: 1 patients, 2 of 2 moduli inside" in text
 
 
 def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
