@@ -14,6 +14,12 @@ Sliding along the surface or the curve changes neither, so only what is seen ent
 The derivatives are exact. c is where the distance is smallest, so its own sliding does not change
 the distance to first order (envelope theorem): ``dd/dm = -u . dc/dm`` with c fixed in the tissue.
 
+A surface of facets has creases, across which the derivatives jump, and vertices that are predicted
+are too few to draw it: points on the same closed valve were up to 0.3 mm off, and no estimate came
+to an end. So it may be drawn finer and smoothed (`PredictedSurface.finer`): it has no creases then,
+and goes on beyond its border as it ends. A point of the free edge is compared with the edge of its
+own leaflet where that is known, since in a closed valve that of the other lies beside it.
+
 What to know:
 
 * Where two parts of a surface are equally near (inside a fold, between leaflets for points of
@@ -35,6 +41,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mvest.errors import InputError
 from mvest.estimation.noise import (
@@ -53,8 +60,12 @@ from mvest.valve.geometry.moving_distance import (
     closest_on_loop,
     curve_offsets,
     signed_distances,
+    smooth_distances,
+    smooth_offsets,
 )
 from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.refinement import refined
+from mvest.valve.geometry.triangles import directed_edges
 
 __all__ = [
     "UNKNOWN",
@@ -90,6 +101,9 @@ class ObservedSurface:
         Closed curve along the annulus.
     scale : (q,) or None
         Standard deviation of each point as a part of that of the observation; None: all alike.
+    free_edge_region : (j,) or None
+        Leaflet of each point of the free edge, with whose edge alone it is compared; ``UNKNOWN``
+        where it is not to be compared. None: all are, with the whole edge.
 
     Raises
     ------
@@ -103,6 +117,7 @@ class ObservedSurface:
     free_edge: FloatArray | None = None
     annulus: FloatArray | None = None
     scale: FloatArray | None = None
+    free_edge_region: IntArray | None = None
 
     def __post_init__(self) -> None:
         points = _points(f"points seen in frame {self.frame}", self.points)
@@ -118,6 +133,12 @@ class ObservedSurface:
             if getattr(self, name) is not None:
                 what = f"{name} seen in frame {self.frame}"
                 object.__setattr__(self, name, _curve(what, getattr(self, name)))
+        if self.free_edge_region is not None:
+            what = f"regions of the free edge seen in frame {self.frame}"
+            own = _numbers(what, self.free_edge_region, UNKNOWN, None)
+            if self.free_edge is None or own.shape != (len(self.free_edge),):
+                raise InputError(f"{what}: shape {own.shape}, expected one for each of its points")
+            object.__setattr__(self, "free_edge_region", own)
         if self.scale is not None:
             scale = np.array(self.scale, dtype=np.float64)
             if scale.shape != (len(points),) or not np.all(np.isfinite(scale) & (scale > 0)):
@@ -140,6 +161,15 @@ class ObservedSurface:
             if curve is not None:
                 offset = closest_on_loop(self.points, curve)[2]
                 keep &= np.linalg.norm(offset, axis=1) >= distance
+        return self._some(keep)
+
+    def beyond(
+        self, triangles: IntArray, vertices: FloatArray, distance: float | FloatArray
+    ) -> ObservedSurface:
+        """The same without the points nearer than ``distance`` mm to some triangles."""
+        return self._some(surface_distance(self.points, vertices, triangles) >= distance)
+
+    def _some(self, keep: BoolArray) -> ObservedSurface:
         scale = None if self.scale is None else self.scale[keep]
         return replace(self, points=self.points[keep], region=self.region[keep], scale=scale)
 
@@ -166,6 +196,10 @@ class PredictedSurface:
         Leaflet of each triangle.
     free_edge, annulus : (e,), (a,) or None
         Vertices in loop order; None if the curve is not to be compared.
+    weights : (r, n) sparse or None
+        The surface's vertices, of those that are predicted; None: they are the same.
+    width : float
+        mm, over which the surface is smoothed where it has weights.
 
     Raises
     ------
@@ -178,9 +212,17 @@ class PredictedSurface:
     region: IntArray
     free_edge: IntArray | None = None
     annulus: IntArray | None = None
+    weights: csr_array | None = None
+    width: float = 0.0
 
     def __post_init__(self) -> None:
         last = self.n_vertices - 1
+        if self.weights is not None:
+            if self.weights.shape[1] != self.n_vertices:
+                raise InputError(
+                    f"weights: shape {self.weights.shape}, expected (r, {self.n_vertices})"
+                )
+            last = self.weights.shape[0] - 1
         triangles = _numbers("triangles", self.triangles, 0, last)
         if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles):
             raise InputError(f"triangles: shape {triangles.shape}, expected (m, 3)")
@@ -202,6 +244,46 @@ class PredictedSurface:
         surface = valve.surface
         n = len(surface.vertices)
         return cls(n, surface.triangles, surface.region, valve.free_edge, valve.annulus)
+
+    def finer(self, rest: FloatArray, edge_length: float, width: float) -> PredictedSurface:
+        """The same surface drawn finer and smoothed; see `mvest.valve.geometry.refinement`.
+
+        Parameters
+        ----------
+        rest : (n, 3) mm
+            Its vertices at rest.
+        edge_length : float
+            mm.
+        width : float
+            mm, over which distances to it are smoothed.
+        """
+        both = (self.free_edge, self.annulus)
+        loops = tuple(loop for loop in both if loop is not None)
+        fine = refined(rest, self.triangles, edge_length, loops)
+        drawn = iter(fine.loops)
+        return replace(
+            self,
+            triangles=fine.triangles,
+            region=self.region[fine.parent],
+            weights=fine.weights,
+            width=width,
+            free_edge=None if self.free_edge is None else next(drawn),
+            annulus=None if self.annulus is None else next(drawn),
+        )
+
+    def drawn(self, predicted: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
+        """What belongs to the surface's vertices, or some, of what is predicted ``(n, ...)``."""
+        if self.weights is None:
+            return predicted[some]
+        flat = self.weights[some] @ predicted.reshape(len(predicted), -1)
+        return np.asarray(flat).reshape(flat.shape[0], *predicted.shape[1:])
+
+    def leaflet_along(self, loop: IntArray) -> IntArray:
+        """Leaflet of each edge ``(e,)`` of a loop on the border, from each vertex to the next."""
+        sides = np.sort(directed_edges(self.triangles), axis=1) @ [1 << 32, 1]
+        order = np.argsort(sides)
+        ends = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1) @ [1 << 32, 1]
+        return self.region[order[np.searchsorted(sides[order], ends)] % len(self.triangles)]
 
     def of(self, region: int) -> IntArray:
         """Triangles of one leaflet, of all if it is ``UNKNOWN``."""
@@ -323,9 +405,10 @@ class SurfaceObservation:
     def distance(self, fitted: FloatArray) -> FloatArray:
         """Unsigned distances ``(q,)`` mm of the last frame's points to fitted ``(f, n, 3)``."""
         seen, distance = self.seen[-1], np.empty(len(self.seen[-1].points))
+        vertices = self.surface.drawn(fitted[-1])
         for region, members in _by_region(seen):
             triangles = self.surface.of(region)
-            distance[members] = surface_distance(seen.points[members], fitted[-1], triangles)
+            distance[members] = surface_distance(seen.points[members], vertices, triangles)
         return distance
 
     def _require_counterpart(self, seen: ObservedSurface) -> None:
@@ -354,7 +437,8 @@ class SurfaceObservation:
 
     def size_of(self, seen: ObservedSurface) -> int:
         """How many numbers are observed in one of the frames."""
-        return len(seen.points) + sum(2 * len(q) for q, _ in _curves(seen, self.surface))
+        curves = _curves(seen, self.surface)
+        return len(seen.points) + sum(2 * int(kept.sum()) for _, _, kept, _ in curves)
 
     def _noise(self) -> NoiseCovariance:
         parts = []
@@ -382,16 +466,24 @@ def _of_frame(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Distances of what was seen in a frame to a predicted surface, and their derivatives."""
     surface = observation.surface
+    drawn = surface.drawn(vertices)
     h, H = np.empty(len(seen.points)), np.empty((len(seen.points), motion.shape[-1]))
     for region, members in _by_region(seen):
-        h[members], H[members] = signed_distances(
-            seen.points[members], vertices, surface.of(region), motion
-        )
+        points, triangles = seen.points[members], surface.of(region)
+        if surface.weights is None:
+            h[members], H[members] = signed_distances(points, drawn, triangles, motion)
+            continue
+        h[members], slopes = smooth_distances(points, drawn, triangles, surface.width)
+        H[members] = sum(slope @ surface.weights @ motion[:, k] for k, slope in enumerate(slopes))
     yield h, H
-    for curve, loop in _curves(seen, surface):
+    for curve, loop, kept, own in _curves(seen, surface):
         assert observation.curve_std_mm is not None
-        across = across_curve(curve, observation.curve_std_mm)
-        yield curve_offsets(curve, across, vertices[loop], motion[loop])
+        across = across_curve(curve, observation.curve_std_mm)[kept]
+        there, moved = drawn[loop], surface.drawn(motion, loop)
+        if surface.weights is None:
+            yield curve_offsets(curve[kept], across, there, moved)
+        else:
+            yield smooth_offsets(curve[kept], across, there, moved, surface.width, own)
 
 
 def surface_distance(points: FloatArray, vertices: FloatArray, triangles: IntArray) -> FloatArray:
@@ -424,10 +516,24 @@ def _by_region(seen: ObservedSurface) -> Iterator[tuple[int, BoolArray]]:
         yield int(region), seen.region == region
 
 
-def _curves(seen: ObservedSurface, surface: PredictedSurface) -> list[tuple[FloatArray, IntArray]]:
-    """The curves that are seen and the loops of vertices that they are compared with."""
-    pairs = ((seen.free_edge, surface.free_edge), (seen.annulus, surface.annulus))
-    return [(curve, loop) for curve, loop in pairs if curve is not None and loop is not None]
+def _curves(
+    seen: ObservedSurface, surface: PredictedSurface
+) -> list[tuple[FloatArray, IntArray, BoolArray, BoolArray | None]]:
+    """The curves that are seen and the loops of vertices that they are compared with.
+
+    Beside them which points are compared ``(j,)``, and on which edges each of these may be.
+    """
+    curves: list[tuple[FloatArray, IntArray, BoolArray, BoolArray | None]] = []
+    for name, region in (("free_edge", seen.free_edge_region), ("annulus", None)):
+        curve, loop = getattr(seen, name), getattr(surface, name)
+        if curve is None or loop is None:
+            continue
+        if region is None:
+            curves.append((curve, loop, np.ones(len(curve), dtype=np.bool_), None))
+        else:
+            kept = np.asarray(region != UNKNOWN)
+            curves.append((curve, loop, kept, region[kept, None] == surface.leaflet_along(loop)))
+    return curves
 
 
 def _points(what: str, values: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Frame, Role, ValveCase
@@ -61,6 +62,7 @@ from mvest.problem.expectation import Expectation, expect
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.typing import BoolArray, FloatArray, IntArray
+from mvest.valve.geometry.triangles import directed_edges
 
 __all__ = ["design_case", "expect_case", "foresee_case", "personalise_case"]
 
@@ -70,6 +72,19 @@ BORDER = 3.0
 MAX_VERTICES = 2000
 """Vertices of a frame that are compared: more, nearer to each other than errors are alike, say
 nothing new, and their correlation is factorised."""
+
+DRAWN, WIDTH = 0.3, 0.5
+"""mm, edges of the predicted surface that points are compared with, and over which it is smoothed.
+Facets as they are predicted are up to 0.1 mm off where leaflets bend, and their normals jump."""
+
+BLUR, BLURRED_MM = 1.5, 0.5
+"""Width for a first estimate, and standard deviation below which no point is then believed (mm): a
+leaflet that is some millimetres away attracts smoothly, and what is beside it does not."""
+
+SURFACE_MM = 0.1
+"""mm, standard deviation below which no single point of a surface is believed where vertices do not
+correspond: between them both surfaces are only drawn. Where a case states less, surfaces are
+compared facet by facet as they are."""
 
 BETTER = 5.0
 """How many times as well as beforehand a nuisance may be measured."""
@@ -416,7 +431,9 @@ class _Chain:
         """
         if not self.considers:
             return self.estimate(self.filter, self.observation())
-        rough = self.estimate(self._filter(max(ROUGH, self.settings.tolerance)), self.observation())
+        rough = self.estimate(
+            self._filter(max(ROUGH, self.settings.tolerance)), self.rough_observation()
+        )
         at = self.shared.start if rough.estimate is None else rough.estimate
         prediction = self.shared(at)
         if not prediction.converged:
@@ -501,6 +518,18 @@ class _Chain:
             return WeighedObservation(plain, self.errors.noise)
         return WeighedObservation(plain, self.noise()) if self.considered else plain
 
+    def rough_observation(self) -> Observed:
+        """The same, of which surfaces are seen through a blur; see `BLUR`."""
+        plain, observation = self.plain_observation(), self.observation()
+        if not self._smooth:
+            return observation
+        assert isinstance(plain, SurfaceObservation)
+        blurred = replace(plain, surface=self._surface(0.5 * BLUR, BLUR))
+        noise = observation.R
+        if isinstance(noise, NoiseFamily):
+            noise = replace(noise, resolution=max(noise.resolution, BLURRED_MM))
+        return WeighedObservation(blurred, noise)
+
     @property
     def single_errors(self) -> NoiseFamily | None:
         """What is believed of the errors of single observations, where they are learned.
@@ -516,6 +545,9 @@ class _Chain:
                 self.length(),
                 self.case.surface.vertices,
             )
+            if self._smooth:
+                resolution = max(self._family.resolution, SURFACE_MM)
+                self._family = replace(self._family, resolution=resolution)
         learned = [own for own in self.considered if own.factor > 1.0]
         known = [own.columns for own in self.considered if own.factor == 1.0]
         if known:
@@ -555,25 +587,40 @@ class _Chain:
         points = tuple(
             self._points(name, frame, scale) for name, frame in zip(names, self.fitted, strict=True)
         )
-        surface = replace(PredictedSurface.of_valve(self.model.valve), annulus=None)
-        return SurfaceObservation(points, surface, std, std, length, predicted)
+        return SurfaceObservation(points, self._surface(DRAWN, WIDTH), std, std, length, predicted)
+
+    def _surface(self, edge: float, width: float) -> PredictedSurface:
+        """The predicted surface that points are compared with; see `PredictedSurface.finer`."""
+        valve = self.model.valve
+        surface = replace(PredictedSurface.of_valve(valve), annulus=None)
+        if not self._smooth:
+            return surface
+        return surface.finer(valve.surface.vertices, edge, width)
+
+    @property
+    def _smooth(self) -> bool:
+        """Whether surfaces are compared, and not known better than they can be drawn."""
+        return not self.corresponding and self.case.uncertainty.typical_mm >= SURFACE_MM
 
     def _points(self, name: str, frame: Frame, scale: FloatArray | None) -> ObservedSurface:
         """What is compared of a frame whose vertices are not known again."""
-        uncertainty = self.case.uncertainty
-        kept = _thinned(len(frame.vertices))
+        uncertainty, region = self.case.uncertainty, _vertex_region(frame)
+        border, kept = BORDER * uncertainty.typical_mm, _thinned(len(frame.vertices))
         points = ObservedSurface(
             name,
             frame.vertices[kept],
-            _vertex_region(frame)[kept],
+            region[kept],
             frame.free_edge,
             scale=None if scale is None else scale[kept],
         )
+        far = 1.0 if points.scale is None else points.scale
+        if self._smooth:
+            # Beyond its border the surface goes on, but where it bends not as it does here.
+            inner = points.beyond(_rim(frame), frame.vertices, border * far)
+            return replace(inner, free_edge_region=_edge_region(frame, region, border))
         if self.settings.errors is not None or uncertainty.correlation_length_mm > 0:
             # Beyond a border a distance changes its sign, which correlated errors do not.
-            far = 1.0 if points.scale is None else points.scale
-            border = BORDER * uncertainty.typical_mm * far
-            near = replace(points, annulus=frame.annulus).inner(border)
+            near = replace(points, annulus=frame.annulus).inner(border * far)
             points = replace(near, annulus=None)
         return points
 
@@ -879,3 +926,20 @@ def _vertex_region(frame: Frame) -> IntArray:
     np.minimum.at(low, frame.triangles.ravel(), np.repeat(frame.region, 3))
     np.maximum.at(high, frame.triangles.ravel(), np.repeat(frame.region, 3))
     return np.where(low == high, low, UNKNOWN)
+
+
+def _edge_region(frame: Frame, region: IntArray, border: float) -> IntArray:
+    """The leaflet of each point of the free edge ``(j,)``, ``UNKNOWN`` near to where two meet.
+
+    ``border`` is how near, in mm, and ``region (q,)`` that of the vertices.
+    """
+    own = region[cKDTree(frame.vertices).query(frame.free_edge)[1]]
+    between = cKDTree(frame.vertices[region == UNKNOWN]).query(frame.free_edge)[0]
+    return np.where(between < border, UNKNOWN, own)
+
+
+def _rim(frame: Frame) -> IntArray:
+    """The border of a frame's surface, as triangles without area ``(e, 3)``."""
+    edges = np.sort(directed_edges(frame.triangles), axis=1)
+    once, count = np.unique(edges, axis=0, return_counts=True)
+    return np.asarray(once[count == 1][:, [0, 1, 1]])

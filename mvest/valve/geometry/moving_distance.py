@@ -3,17 +3,30 @@
 Exact geometry on plain arrays. A surface or curve moves with p parameters: its vertices are given
 with their derivatives ``(n, 3, p)``. The derivative is that of the distance as the parameters
 change, the closest point's own sliding included.
+
+Facets have creases, across which the derivatives jump, and a border, beyond which a distance has
+another sign. `smooth_distances` and `smooth_offsets` have neither: a filter that goes on from
+derivatives comes to an end with them, and its posterior is what it takes it for.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import area_vectors
 
-__all__ = ["across_curve", "closest_on_loop", "curve_offsets", "signed_distances"]
+__all__ = [
+    "across_curve",
+    "closest_on_loop",
+    "curve_offsets",
+    "signed_distances",
+    "smooth_distances",
+    "smooth_offsets",
+]
 
 TOUCHING = 1e-9
 """Distance in mm below which the offset from a closest point has no direction of its own."""
@@ -21,6 +34,9 @@ TOUCHING = 1e-9
 TANGENT_REACH = 6.0
 """Standard deviations of a curve's points over which its direction is taken, to each side: the
 direction is then known to 1 / (6 sqrt(2)) rad, and 1.4 % of the information across it is lost."""
+
+REACH = 5.5
+"""Widths beyond the nearest triangle from which on triangles do not count: less than 3e-7."""
 
 
 def signed_distances(
@@ -83,6 +99,62 @@ def _normals(
     return _unit(normal), zeros == 0
 
 
+def smooth_distances(
+    points: FloatArray, vertices: FloatArray, triangles: IntArray, width: float
+) -> tuple[FloatArray, list[csr_array]]:
+    """Signed distances of points to a surface that is smoothed over a width, and their derivatives.
+
+    Triangles with the area vectors a and the middles p count by ``g = exp(-|x - p|² / 2 w²)``::
+
+        d = sum g a . (x - p) / |V|,   V = sum g a,   u = V / |V|
+        dd = sum (g da . y - g a . dp + dg a . y) / |V|,   y = x - p - d u
+
+    (implicit moving least squares: Kolluri, ACM Trans. Algorithms 4 (2008) 18). It bends with the
+    surface and has neither creases where facets meet nor, beyond a border, another sign: the
+    surface goes on there as it ends. On a bend of radius r in both directions it is off by w²/r.
+
+    Parameters
+    ----------
+    points : (q, 3) mm
+    vertices : (n, 3) mm
+    triangles : (m, 3)
+        All turning one way, not larger than the width.
+    width : float
+        w, mm.
+
+    Returns
+    -------
+    distance : (q,) mm
+        Positive on the side of the normals.
+    derivative : list of three (q, n) sparse
+        By the x, y and z of the vertices.
+    """
+    corner = vertices[triangles]
+    middle, area = corner.mean(axis=1), area_vectors(vertices, triangles)
+    tree = cKDTree(middle)
+    nearest = np.asarray(tree.query(points)[0])
+    near = tree.query_ball_point(points, np.hypot(nearest, REACH * width))
+    row = np.repeat(np.arange(len(points)), [len(each) for each in near])
+    of = np.concatenate([np.asarray(each, dtype=np.int64) for each in near])
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(row, column, len(points)) for column in values.T], axis=1)
+
+    away, a = points[row] - middle[of], area[of]
+    g = np.exp(0.5 * (nearest[row] ** 2 - np.einsum("ki,ki->k", away, away)) / width**2)
+    V = total(g[:, None] * a)
+    size = np.linalg.norm(V, axis=1)
+    distance = total((g * np.einsum("ki,ki->k", a, away))[:, None])[:, 0] / size
+    y = away - (distance / size)[row, None] * V[row]
+    opposite = np.roll(corner, -1, axis=1) - np.roll(corner, -2, axis=1)
+    turned = 0.5 * np.cross(opposite[of], y[:, None])
+    slid = (np.einsum("ki,ki->k", a, y) / width**2)[:, None] * away - a
+    by_corner = (g / size[row])[:, None, None] * (turned + slid[:, None] / 3.0)
+    place = np.repeat(row, 3), triangles[of].ravel()
+    shape = (len(points), len(vertices))
+    return distance, [csr_array((by_corner[..., k].ravel(), place), shape=shape) for k in range(3)]
+
+
 def across_curve(curve: FloatArray, std: float) -> FloatArray:
     """Two unit vectors ``(j, 3, 2)`` across a closed curve as it was seen, at each of its points.
 
@@ -131,6 +203,57 @@ def curve_offsets(
     change = -moved + np.where(within[:, None, None], t[:, :, None] * along[:, None, :], 0.0)
     h = np.einsum("jki,jk->ji", across, offset)
     return h.ravel(), np.einsum("jki,jkp->jip", across, change).reshape(h.size, -1)
+
+
+def smooth_offsets(
+    curve: FloatArray,
+    across: FloatArray,
+    loop: FloatArray,
+    motion: FloatArray,
+    width: float,
+    own: BoolArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Offsets ``(2 j,)`` mm of seen points from a closed curve that is smoothed over a width.
+
+    Points p of the curve, r = x - p away, count by how near they are to the plane across the curve
+    as it was seen, of normal n, and only if the curve is not nearer elsewhere::
+
+        h = sum g A' r / sum g,   g = exp(-(n . r)² / 2 w² - |r|² / 2 (3 w)²)
+        dh = sum g (A' r - h) ((n . r) n + r / 9) . dp / w² / sum g - sum g A' dp / sum g
+
+    It bends with the curve, of which the closest point stays at a vertex or slides by turns.
+
+    Parameters
+    ----------
+    curve, across
+        See `curve_offsets`.
+    loop : (e, 3) mm
+        Points along the curve, nearer to each other than the width.
+    motion : (e, 3, p)
+    width : float
+        w, mm.
+    own : (j, e), optional
+        Which points of the curve each may be compared with.
+
+    Returns
+    -------
+    offset : (2 j,) mm
+    derivative : (2 j, p)
+    """
+    normal = np.cross(across[:, :, 0], across[:, :, 1])
+    r = curve[:, None] - loop
+    along = np.einsum("jek,jk->je", r, normal)
+    exponent = (along**2 + np.einsum("jek,jek->je", r, r) / 9.0) / (2.0 * width**2)
+    exponent = exponent if own is None else np.where(own, exponent, np.inf)
+    g = np.exp(exponent.min(axis=1, keepdims=True) - exponent)
+    g /= g.sum(axis=1, keepdims=True)
+    aside = np.einsum("jki,jek->jei", across, r)
+    h = np.einsum("je,jei->ji", g, aside)
+    turned = (along[..., None] * normal[:, None] + r / 9.0) / width**2
+    by_point = g[..., None, None] * (
+        (aside - h[:, None])[..., None] * turned[:, :, None] - across.swapaxes(1, 2)[:, None]
+    )
+    return h.ravel(), np.einsum("jeik,ekp->jip", by_point, motion).reshape(h.size, -1)
 
 
 def closest_on_loop(

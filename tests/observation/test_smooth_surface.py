@@ -1,0 +1,141 @@
+"""Surfaces that are drawn finer and smoothed: right, without creases, and differentiable."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.estimation import Prediction
+from mvest.observation.surfaces import (
+    UNKNOWN,
+    ObservedSurface,
+    PredictedSurface,
+    SurfaceObservation,
+)
+from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.moving_distance import smooth_distances, smooth_offsets
+
+VALVE = Template().valve(40, 11)
+REST = VALVE.surface.vertices
+SURFACE = PredictedSurface.of_valve(VALVE)
+FINE = SURFACE.finer(REST, 0.3, 0.5)
+
+
+def moved(m):
+    """A valve that bends and shifts with three parameters, and its derivatives."""
+    x, y, z = REST.T
+    a, b, c = m
+    shape = np.column_stack([x + np.sin(0.2 * z + a), y * np.cosh(0.3 * b), z + c + 0.05 * a * x])
+    slope = np.zeros((len(REST), 3, 3))
+    slope[:, 0, 0] = np.cos(0.2 * z + a)
+    slope[:, 1, 1] = 0.3 * y * np.sinh(0.3 * b)
+    slope[:, 2, 0] = 0.05 * x
+    slope[:, 2, 2] = 1.0
+    return shape, slope
+
+
+def model(m):
+    shape, slope = moved(m)
+    still = np.zeros((slope.size // 3, 3))
+    return Prediction(
+        np.concatenate([REST.ravel(), shape.ravel()]),
+        np.concatenate([still, slope.reshape(-1, 3)]),
+    )
+
+
+def seen(points, region, **more):
+    return ObservedSurface("closed", points, region, **more)
+
+
+def observation(surface, count=300, off=0.6, seed=1):
+    rng = np.random.default_rng(seed)
+    picked = rng.integers(0, len(SURFACE.triangles), count)
+    corners = moved(np.zeros(3))[0][SURFACE.triangles[picked]]
+    points = np.einsum("qc,qci->qi", rng.dirichlet(np.ones(3), count), corners)
+    points += off * rng.normal(size=points.shape)
+    edge = VALVE.surface.vertices[VALVE.free_edge] + off * rng.normal(size=(40, 3))
+    own = np.repeat([0, 1], 20)
+    own[[0, 19, 20, 39]] = UNKNOWN
+    only = seen(points, SURFACE.region[picked], free_edge=edge, free_edge_region=own)
+    return SurfaceObservation((only,), surface, 0.5, 0.5)
+
+
+def slope_errors(surface, step):
+    predict = observation(surface).of(model)
+    m = np.array([0.1, 0.7, -0.2])
+    exact = predict(m).jacobian
+    columns = [(predict(m + step * e).y - predict(m - step * e).y) / (2 * step) for e in np.eye(3)]
+    return np.abs(np.column_stack(columns) - exact).max()
+
+
+def test_derivatives_are_those_of_differences_everywhere():
+    # Points at all distances, beyond borders and at bends: none is left out.
+    coarse, fine = slope_errors(FINE, 1e-2), slope_errors(FINE, 2.5e-3)
+    assert fine < 2e-4
+    assert coarse / fine == pytest.approx(16.0, rel=0.3)
+    # Of facets the derivative jumps within the step.
+    assert slope_errors(SURFACE, 2.5e-3) > 0.005
+
+
+def test_points_of_the_surface_are_on_it():
+    drawn = FINE.drawn(REST)
+    bend = smooth_distances(drawn[::7], drawn, FINE.triangles, 0.5)[0]
+    assert np.sqrt(np.mean(bend**2)) < 0.03
+    up, down = (
+        smooth_distances(points, drawn, FINE.triangles, 0.5)[0]
+        for points in (normals(drawn, 0.8), normals(drawn, -0.8))
+    )
+    assert np.median(up) == pytest.approx(0.8, abs=0.03)
+    assert np.median(down) == pytest.approx(-0.8, abs=0.03)
+
+
+def normals(drawn, height):
+    """Points above the middles of every 50th triangle."""
+    a, b, c = drawn[FINE.triangles[::50]].transpose(1, 0, 2)
+    n = np.cross(b - a, c - a)
+    return (a + b + c) / 3 + height * n / np.linalg.norm(n, axis=1)[:, None]
+
+
+def test_beyond_a_border_the_surface_goes_on():
+    # A square in the plane z = 0: nothing happens where a point passes its border.
+    x, y = (v.ravel() for v in np.meshgrid(*2 * (np.linspace(0, 5, 26),)))
+    a = (np.arange(25)[:, None] * 26 + np.arange(25)).ravel()
+    triangles = np.concatenate(
+        [np.column_stack([a, a + 1, a + 27]), np.column_stack([a, a + 27, a + 26])]
+    )
+    square = np.column_stack([x, y, 0 * x])
+    points = np.array([[5.0 + t, 2.0, z] for t in (-1, 0.5, 2) for z in (-0.3, 1e-3, 2.0)])
+    distance, slopes = smooth_distances(points, square, triangles, 0.5)
+    np.testing.assert_allclose(distance, points[:, 2], atol=1e-12)
+    shifted = np.column_stack([slope @ np.ones(len(square)) for slope in slopes])
+    np.testing.assert_allclose(shifted, np.tile([0.0, 0.0, -1.0], (9, 1)), atol=1e-12)
+
+
+def test_an_edge_is_compared_with_that_of_its_own_leaflet():
+    # Two lines 1 mm apart; the point lies nearer to the second, to which it does not belong.
+    t = np.linspace(-5, 5, 101)
+    two = np.concatenate(
+        [np.column_stack([t, 0 * t, 0 * t]), np.column_stack([t[::-1], 0 * t + 1, 0 * t])]
+    )
+    point = np.array([[0.03, 0.8, 0.2]])
+    across = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])
+    still = np.zeros((202, 3, 1))
+    own = np.arange(202)[None] < 101
+    with_own = smooth_offsets(point, across, two, still, 0.5, own)[0]
+    np.testing.assert_allclose(with_own, [0.8, 0.2], atol=1e-12)
+    assert smooth_offsets(point, across, two, still, 0.5)[0][0] < 0.5
+
+
+def test_leaflets_along_the_free_edge_are_those_of_its_triangles():
+    along = FINE.leaflet_along(FINE.free_edge)
+    assert along.shape == FINE.free_edge.shape
+    for leaflet in (0, 1):
+        number = VALVE.surface.region_names[leaflet]
+        assert np.count_nonzero(along == leaflet) == len(along) // 2, number
+
+
+def test_regions_of_an_edge_and_weights_must_fit():
+    curve = REST[VALVE.free_edge]
+    with pytest.raises(InputError, match="expected one for each of its points"):
+        seen(REST, np.zeros(len(REST), int), free_edge=curve, free_edge_region=np.zeros(3, int))
+    with pytest.raises(InputError, match=r"weights: shape \(\d+, 440\), expected \(r, 441\)"):
+        PredictedSurface(441, FINE.triangles, FINE.region, weights=FINE.weights)
