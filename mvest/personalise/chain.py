@@ -614,11 +614,13 @@ class _Chain:
             scale=None if scale is None else scale[kept],
         )
         far = 1.0 if points.scale is None else points.scale
+        alike = self.settings.errors is not None or uncertainty.correlation_length_mm > 0
         if self._smooth:
-            # Beyond its border the surface goes on, but where it bends not as it does here.
-            inner = points.beyond(_rim(frame), frame.vertices, border * far)
-            return replace(inner, free_edge_region=_edge_region(frame, region, border))
-        if self.settings.errors is not None or uncertainty.correlation_length_mm > 0:
+            if alike:
+                # Beyond its border the surface goes on, but where it bends not as it does here.
+                points = points.beyond(_rim(frame), frame.vertices, border * far)
+            return replace(points, free_edge_region=_edge_region(frame, region, border))
+        if alike:
             # Beyond a border a distance changes its sign, which correlated errors do not.
             near = replace(points, annulus=frame.annulus).inner(border * far)
             points = replace(near, annulus=None)
