@@ -116,9 +116,11 @@ def check_against_runs(
       it is not out of the question. A place that is as likely as the estimate, but lies far beyond
       its intervals, is seen so.
     * The residual of linearisation q = W (h(zₖ) − h(z) − H (zₖ − z)), which grows with δ², brought
-      to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)) and
-      a = W H (zₖ − z)/δ it changes J at a distance of ± 1 by ``−(q/δ²)·(e ∓ a) + ½ |q/δ²|²``.
-      A run with derivatives tells ½ W (Hₖ − H) C u/δ of other directions u as well.
+      to one standard deviation: q/δ² (their curvature, section 7.1). With e = W (y − h(z)),
+      a = W H (zₖ − z)/δ and x = L⁻¹ (zₖ − z)/δ for a prior covariance L Lᵀ, J differs at a distance
+      of ± 1 from its Gaussian by ``½ (|a|² + |x|² − 1) − (q/δ²)·(e ∓ a) + ½ |q/δ²|²``, where what
+      is in brackets is 0 unless P counts second derivatives. A run with derivatives tells
+      ½ W (Hₖ − H) C u/δ of other directions u as well.
 
     Further, with H and e an update of the prior should lead to N(z, P) itself.
 
@@ -139,6 +141,10 @@ def check_against_runs(
     z, C = posterior.mean, posterior.factor
     e = noise.whiten(y - predicted)
     WH = noise.whiten(H)
+    # By how much the Hessian of the linearised J is more than that of the Gaussian.
+    WC = WH @ C
+    X = np.linalg.lstsq(prior.factor, C, rcond=None)[0]
+    counted = WC.T @ WC + X.T @ X - np.linalg.lstsq(C, C, rcond=None)[0]
 
     def objective(at: FloatArray, residual: FloatArray) -> float:
         x = _coordinates(prior.factor, at - prior.mean)[0]
@@ -165,11 +171,13 @@ def check_against_runs(
             times.append(max(delta, tau) / max(min(delta, tau), NEAREST) - 1.0)
         if delta <= FURTHEST:
             q = (e - residual - WH @ d) / delta**2
-            curved.append(_change_of_distance(q, e, WH @ d / delta))
+            u = u / delta
+            curved.append(_change_of_distance(q, e, WC @ u, 0.5 * float(u @ counted @ u)))
             if run.H is not None:
                 M = noise.whiten(run.H - H) @ C * (0.5 / delta)
                 for v in np.linalg.svd(M, full_matrices=False)[2]:
-                    curved.append(_change_of_distance(M @ v, e, WH @ (C @ v)))
+                    more = 0.5 * float(u @ counted @ v)
+                    curved.append(_change_of_distance(M @ v, e, WC @ v, more))
 
     checks = []
     for values, limit, what in (
@@ -200,9 +208,12 @@ def principal_points(posterior: Gaussian, count: int) -> FloatArray:
     return posterior.mean + both[: min(count, len(both))]
 
 
-def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray) -> float:
-    """Error of the distance 1 in the direction a (n,), to either side, by the curvature q (n,)."""
-    changes = [0.5 * float(q @ q) - float(q @ (e - sign * a)) for sign in (1.0, -1.0)]
+def _change_of_distance(q: FloatArray, e: FloatArray, a: FloatArray, more: float) -> float:
+    """Error of the distance 1 in the direction a (n,), to either side, by the curvature q (n,).
+
+    ``more`` is by how much the linearised J is above its Gaussian there.
+    """
+    changes = [more + 0.5 * float(q @ q) - float(q @ (e - sign * a)) for sign in (1.0, -1.0)]
     return max(abs(_signed_root(1.0 + 2.0 * change) - 1.0) for change in changes)
 
 

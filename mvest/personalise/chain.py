@@ -340,7 +340,11 @@ class _Chain:
         inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
         if self._held:
             return SchmidtFilter(inner, self._held)
-        return inner if start is None else replace(inner, start=start, max_learned=LEARNED)
+        if start is None:
+            return inner
+        # Of error samples the covariance is found otherwise.
+        second_order = self.errors is None
+        return replace(inner, start=start, max_learned=LEARNED, second_order=second_order)
 
     @property
     def _kinds(self) -> tuple[str, ...]:

@@ -42,6 +42,14 @@ one (as in Nocedal and Wright's algorithm 4.1, there 1/4). Where the neglected s
 are nearly as large as those that are kept, full steps overshoot again and again, from one side of
 the minimum to the other, and lower the objective by a third or less of what is predicted."""
 
+NEGLIGIBLE_DECREASE = 1e-3
+"""Of J by a Newton step: 0.045 standard deviations away in any direction."""
+
+LEAST_CURVATURE = 0.1
+"""Of J in units of the linearised one: intervals are at most three times as long."""
+
+MAX_HESSIANS, MAX_NEWTON_STEPS, MAX_HALVINGS = 2, 6, 5
+
 
 @dataclass(frozen=True, slots=True)
 class IteratedFilter:
@@ -90,6 +98,10 @@ class IteratedFilter:
         First iterate; None starts at the prior's mean.
     max_learned : int
         Iterates at which a noise that is not quite known is learned.
+    second_order : bool
+        Where Gauss-Newton does not come to its end, or its posterior is not that of the model's
+        runs, find the second derivatives that it neglects from 2p further runs, and with them the
+        mode and its covariance; see `_with_second_derivatives`.
     check_runs : int
         Further runs of the model at the end, at ± 1 posterior standard deviation along the widest
         axes, for `Estimate.check`; without them it rests on the runs that were made anyway.
@@ -106,6 +118,7 @@ class IteratedFilter:
     max_rejections: int = 8
     start: tuple[float, ...] | None = None
     max_learned: int = 12
+    second_order: bool = False
     check_runs: int = 0
 
     def __post_init__(self) -> None:
@@ -173,6 +186,18 @@ class IteratedFilter:
                     reason = Reason.NO_DECREASE
             if reason is not None:
                 learned = None if learner is None else learner.learned(L)
+                if self.second_order and reason is not Reason.MODEL_FAILED:
+                    check = run.check(point.prediction)
+                    if reason is not Reason.CONVERGED or not (check is None or check.holds):
+                        better = _with_second_derivatives(run, L, point, update.posterior)
+                        if better is not None:
+                            point, covariance = better
+                            innovation = run.y - point.prediction.y + point.H @ point.x
+                            update = kalman_update(unit, innovation, point.H, run.noise)
+                            P = L @ covariance @ L.T
+                            run.record(point.z, P, point.objective, update.log_likelihood)
+                            reason = Reason.CONVERGED
+                            detail = f"{iterations} iterations, then with second derivatives"
                 return run.finish(
                     reason, detail, point.prediction, innovation, update, learned=learned
                 )
@@ -228,6 +253,68 @@ class IteratedFilter:
         return None, damping, failure
 
 
+def _with_second_derivatives(
+    run: FilterRun, L: FloatArray, point: "_Point", gaussian: Gaussian
+) -> "tuple[_Point, FloatArray] | None":
+    """The minimum of J and the covariance that its own curvature gives, in coordinates x.
+
+    Gauss-Newton's Hessian leaves out ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂x²``, which of thousands of
+    observations may amount to as much as what is kept, though the model is all but linear over a
+    standard deviation. Here the Hessian is that of differences of J's exact gradients over ± one
+    standard deviation along the principal axes of a Gaussian, first of Gauss-Newton's (Nocedal and
+    Wright 2006, section 8.1); its inverse is the covariance (Laplace). Newton steps with it lead to
+    the minimum; where that is more than a standard deviation away, it is found anew there.
+
+    Returns None where a run fails, J is no valley, or its minimum is not come to.
+    """
+    covariance = gaussian.covariance
+    for _ in range(MAX_HESSIANS):
+        values, axes = np.linalg.eigh(covariance)
+        C = axes * np.sqrt(values)
+        rows = []
+        for axis in C.T:
+            ends = [_evaluate(run, L, point.x + sign * axis) for sign in (1.0, -1.0)]
+            up, down = (None if isinstance(end, Prediction) else end.slope(run) for end in ends)
+            if up is None or down is None:
+                return None
+            rows.append(0.5 * C.T @ (up - down))
+        hessian = 0.5 * (np.array(rows) + np.array(rows).T)
+        if np.linalg.eigvalsh(hessian)[0] < LEAST_CURVATURE:
+            return None
+        inverse = C @ np.linalg.inv(hessian) @ C.T
+        begun = point
+        for _ in range(MAX_NEWTON_STEPS):
+            slope = point.slope(run)
+            step = -inverse @ slope
+            if -0.5 * float(step @ slope) <= NEGLIGIBLE_DECREASE:
+                break
+            lower = _lower(run, L, point, step, slope)
+            if lower is None:
+                return None
+            point = lower
+        else:
+            return None
+        moved = np.linalg.solve(C, point.x - begun.x)
+        if float(moved @ hessian @ moved) <= 1.0:
+            return point, inverse
+        covariance = inverse
+    return None
+
+
+def _lower(
+    run: FilterRun, L: FloatArray, point: "_Point", step: FloatArray, slope: FloatArray
+) -> "_Point | None":
+    """The first point along halved steps at which J is sufficiently lower."""
+    for _ in range(MAX_HALVINGS):
+        trial = _evaluate(run, L, point.x + step)
+        if not isinstance(trial, Prediction):
+            decrease = point.objective - trial.objective
+            if decrease >= -SUFFICIENT_DECREASE * float(step @ slope):
+                return trial
+        step = 0.5 * step
+    return None
+
+
 def _more(damping: float) -> float:
     """The damping after a step that was rejected or poor."""
     return max(FIRST_DAMPING, DAMPING_FACTOR * damping)
@@ -246,6 +333,11 @@ class _Point:
     prediction: Prediction
     H: FloatArray
     objective: float
+
+    def slope(self, run: FilterRun) -> FloatArray:
+        """Derivative of J by x (p,), exact for the noise as it is now."""
+        e = run.noise.whiten(run.y - self.prediction.y)
+        return np.asarray(self.x - run.noise.whiten(self.H).T @ e)
 
 
 def _evaluate(run: FilterRun, L: FloatArray, x: FloatArray) -> _Point | Prediction:
