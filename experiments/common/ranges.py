@@ -157,7 +157,7 @@ RANGES = (
         "share share_* other_share "
         "anterior_flattening *_contraction belly_depth edge_thinning toe_strain "
         "closed_depth closures.* marginal_s *confidence dropout rate *_relaxation held_pressure "
-        "missing outliers *_off",
+        "missing outliers *_off lost_by rest_lengths",
     ),
     Range(1e-15, 1, "", "relative tolerances and steps", "*tolerance relative_step"),
     Range(-1e12, 1e12, "", "variances, in the units of any model squared", "P0 Q R linear_P0"),
