@@ -126,7 +126,7 @@ def test_the_montage_has_frames_in_rows_and_draws_the_valve_on_them(valve, volum
     words = [panel(figure, row, 0).get_ylabel() for row in (0, 1)]
     assert words[0] == "frame 0, 0 ms, closed\nconfidence 0.90"
     assert words[1] == "frame 1, 40 ms\nconfidence 0.20\nLOW CONFIDENCE"
-    assert any("Confidence below 0.6 in 1 of 2 frames: 1." in t.get_text() for t in figure.texts)
+    assert any("Confidence below 0.7 in 1 of 2 frames: 1." in t.get_text() for t in figure.texts)
     axes = panel(figure, 1, 1)
     # The open anterior leaflet in the middle section begins at its annulus, half of 28 mm away
     # but for the flattening, and hangs down by most of its length.
