@@ -10,6 +10,7 @@ import meshio
 import numpy as np
 import pytest
 
+from mvest.cases.importing.reference_heart import DATA_VARIABLE
 from mvest.cases.importing.solid import SolidOptions, import_solid
 from mvest.errors import InputError
 from mvest.valve.anatomy.dimensions import TemplateParameters
@@ -21,7 +22,7 @@ from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.io.leaflet_surfaces import read_surface
 
-HRA = Path(os.environ.get("MVEST_HRA_MITRAL", "../shared/data/hra_mitral"))
+HRA = Path(os.environ.get(DATA_VARIABLE, "../shared/data/hra_mitral"))
 """Folder with the mitral valve of the HRA reference heart, three PLY files in mm."""
 
 
@@ -114,7 +115,7 @@ def test_what_is_missing_is_asked_for_by_name(
     assert str(whole) in str(caught.value)
 
 
-@pytest.mark.skipif(not HRA.is_dir(), reason="no HRA valve; MVEST_HRA_MITRAL names its folder")
+@pytest.mark.skipif(not HRA.is_dir(), reason=f"no HRA valve; {DATA_VARIABLE} names its folder")
 def test_a_real_anatomy() -> None:
     valve = read_surface(HRA / "mitral_valve.ply")
     tips = []
