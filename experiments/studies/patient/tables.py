@@ -6,7 +6,7 @@ after its estimation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +167,10 @@ def write_patient_tables(
         if name in arrays
     }
     if fields:
-        written += save_figure_with(results / "figure3", figure3(fields), records[0].line)
+        cases = {_patient(record): record.findings.case for record in records}
+        failed = [name for name, case in cases.items() if not case.is_stated]
+        figure = figure3(fields, failed)
+        written += save_figure_with(results / "figure3", figure, records[0].line)
     return written
 
 
@@ -329,13 +332,15 @@ def distance_words(table: pd.DataFrame) -> list[str]:
     return out
 
 
-def figure3(fields: Mapping[str, CaseFields]) -> Figure:
+def figure3(fields: Mapping[str, CaseFields], failed: Collection[str] = ()) -> Figure:
     """The closed valves from the atrium, generic beside personalised, on one scale for all.
 
     Parameters
     ----------
     fields : mapping
         Name of each patient -> its arrays.
+    failed : collection of str
+        Names of those whose verdict is that there is no estimate, which is written above them.
     """
     distances = []
     for valve in fields.values():
@@ -361,7 +366,7 @@ def figure3(fields: Mapping[str, CaseFields]) -> Figure:
             colours = corner_colours(scale, distance[k], valve.triangles)
             draw_valve(axes, valve, positions[k], colours, ATRIUM, k + 1, strength=0.3)
             paint_leak(axes, valve, positions[k], k + 1)
-            title = f"{_words(name)}\n" if row == 0 else ""
+            title = f"{_words(name)}\n" if row == 0 else "NO ESTIMATE\n" * (name in failed)
             axes.set_title(f"{title}{Spread.of(distance[k])} mm", fontsize=9)
             if column == 0:
                 axes.text(

@@ -232,6 +232,13 @@ def test_figure3_has_one_scale_for_all(fields_file, monkeypatch):
     assert "(simulated)" in figure.get_suptitle()
 
 
+def test_figure3_says_where_there_is_no_estimate(fields_file):
+    fields = read_case_fields(fields_file)
+    figure = figure3({"sound": fields, "lost": fields}, ["lost"])
+    titles = [axes.get_title() for axes in figure.axes[:4]]
+    assert [title.startswith("NO ESTIMATE") for title in titles] == [False, False, False, True]
+
+
 def test_figure3_needs_distances(fields_file):
     fields = copy.copy(read_case_fields(fields_file))
     object.__setattr__(fields, "distance_fitted", None)
