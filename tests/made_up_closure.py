@@ -246,7 +246,8 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
         built.append(MadeUpClosure(free, fixed, **changes))
         return built[-1]
 
-    monkeypatch.setattr("mvest.personalise.chain.build_model", build)
+    monkeypatch.setattr("mvest.personalise.estimation.build_model", build)
+    monkeypatch.setattr("mvest.personalise.expectation.build_model", build)
     monkeypatch.setattr("mvest.personalise.considered_geometry._variations", lambda *_: [])
-    monkeypatch.setattr("mvest.personalise.chain.law_columns", lambda *_: ())
+    monkeypatch.setattr("mvest.personalise.observation_errors.law_columns", lambda *_: ())
     return built

@@ -16,8 +16,8 @@ from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
-from mvest.personalise.chain import foresee_case
 from mvest.personalise.design import design_text
+from mvest.personalise.expectation import foresee_case
 from mvest.problem.expectation import Expectation, expect, expect_of_model
 from mvest.problem.synthetic import simulate_observation
 from mvest.provenance import config_hash

@@ -184,7 +184,7 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
         belly = FIELDS["E_f.anterior"].reshape(-1, 1)
         return (ErrorColumns("open shape", 0.2 * belly),)
 
-    monkeypatch.setattr("mvest.personalise.chain.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
     for errors in (None, settings().errors):
         known = personalise_case(case, settings(errors=errors))
         doubtful = personalise_case(

@@ -82,7 +82,8 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
     monkeypatch.setattr(
-        "mvest.personalise.chain.law_columns", lambda *_: (ErrorColumns("law", column),)
+        "mvest.personalise.observation_errors.law_columns",
+        lambda *_: (ErrorColumns("law", column),),
     )
     known = personalise_case(case, settings(moduli_only=True))
     doubtful = personalise_case(case, settings(moduli_only=True, considered_law=STIFFENING))
@@ -96,7 +97,9 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
 def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    monkeypatch.setattr("mvest.personalise.chain.law_columns", lambda *_: "it did not close")
+    monkeypatch.setattr(
+        "mvest.personalise.observation_errors.law_columns", lambda *_: "it did not close"
+    )
     fit = personalise_case(case, settings(considered_law=STIFFENING))
     assert fit.unconsidered == ("it did not close",)
     grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "case"]

@@ -22,8 +22,9 @@ from mvest.personalise import (
     build_model,
     personalise_case,
 )
-from mvest.personalise.chain import _Chain, _thinned
 from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
+from mvest.personalise.estimation import CaseEstimation
+from mvest.personalise.fitted_frames import _thinned
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.model import held_state
 from mvest.problem.registration import REGISTRATION, RegisteredModel
@@ -159,8 +160,8 @@ def test_unknowns_may_come_in_any_order(monkeypatch):
 def test_a_closed_frame_is_observed_as_the_case_says(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0)
-    chain = _Chain(case, settings(), None, None)
-    R = chain.observation().R
+    estimation = CaseEstimation(case, settings(), None, None)
+    R = estimation.errors.observation().R
     # Whitening white noise of the told covariance: R = 0.09 mm² and 8 mm along the leaflets.
     points = case.surface.vertices
     gap = np.linalg.norm(points[0] - points[1])
@@ -170,7 +171,7 @@ def test_a_closed_frame_is_observed_as_the_case_says(monkeypatch):
     assert 0.5 * 0.09 < whole[0, 3] < 0.09
     assert gap < 8.0
     np.testing.assert_array_equal(
-        chain.observation().positions[0], case.frame(Role.CLOSED).vertices
+        estimation.errors.observation().positions[0], case.frame(Role.CLOSED).vertices
     )
 
 
@@ -188,8 +189,8 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
     std = np.random.default_rng(3).uniform(0.2, 0.5, n)
     told = replace(case, uncertainty=Uncertainty(std, length))
     wanted = settings(correspondence=correspondence)
-    one = _Chain(case, wanted, None, None).observation()
-    own = _Chain(told, wanted, None, None).observation()
+    one = CaseEstimation(case, wanted, None, None).errors.observation()
+    own = CaseEstimation(told, wanted, None, None).errors.observation()
     if not correspondence:
         # Points that noise may put beyond the border are left out where it is large.
         assert all(len(o.seen[0].points) > 100 for o in (one, own))
@@ -207,7 +208,9 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
     np.testing.assert_allclose(R[1], scale[:, None] * R[0] * scale, atol=1e-7)
     # The same for all is the one number, whatever it is called.
     alike = replace(case, uncertainty=Uncertainty(np.full(n, 0.3), length))
-    same = observation_noise(_Chain(alike, wanted, None, None).observation().R, 3 * n)
+    same = observation_noise(
+        CaseEstimation(alike, wanted, None, None).errors.observation().R, 3 * n
+    )
     np.testing.assert_allclose(covariance(same), R[0], rtol=1e-9, atol=1e-12)
 
 
@@ -358,8 +361,8 @@ def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, l
 
 def test_points_on_the_line_between_leaflets_are_of_either(monkeypatch):
     use(monkeypatch)
-    chain = _Chain(made_up_case(0.3), settings(correspondence=False), None, None)
-    (seen,) = chain.observation().seen
+    estimation = CaseEstimation(made_up_case(0.3), settings(correspondence=False), None, None)
+    (seen,) = estimation.errors.observation().seen
     column = np.arange(len(seen.region)) % 32
     np.testing.assert_array_equal(seen.region == UNKNOWN, (column == 0) | (column == 16))
     assert set(seen.region[(column > 0) & (column < 16)]) == {0}
@@ -497,13 +500,13 @@ def test_the_model_has_the_pressure_and_the_boundary_of_the_case():
 
 def test_a_further_frame_s_annulus_is_laid_on_the_samples_of_contact():
     case = made_up_case()
-    chain = _Chain(case, replace(settings(), mesh=SMALL), None, None)
-    contact = chain.model.contact_valve
+    estimation = CaseEstimation(case, replace(settings(), mesh=SMALL), None, None)
+    contact = estimation.model.contact_valve
     assert len(contact.annulus) == 60
     # The closed frame held is the closed frame.
-    closed = held_state(chain.model, case.frame(Role.CLOSED))
+    closed = held_state(estimation.model, case.frame(Role.CLOSED))
     np.testing.assert_allclose(closed.annulus, contact.motion.annulus[-1], atol=1e-9)
-    late = held_state(chain.model, case.held_out[0])
+    late = held_state(estimation.model, case.held_out[0])
     np.testing.assert_allclose(late.annulus - closed.annulus, [[0.1, -0.2, 0.5]] * 60, atol=1e-9)
     assert late.pressure_mmHg == 70.0
 
@@ -575,7 +578,7 @@ def use_geometry(monkeypatch):
         given = case.error_samples.vertices if vertices is None else vertices
         return GeometryErrors(2.0 * given[:, 0], given[:, 1])
 
-    monkeypatch.setattr("mvest.personalise.chain.sample_geometry", sample)
+    monkeypatch.setattr("mvest.personalise.observation_errors.sample_geometry", sample)
 
 
 @pytest.mark.parametrize(("correspondence", "std"), [(True, 0.3), (False, 0.02)])
@@ -603,17 +606,21 @@ def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
     # Prediction and frame move as one: nothing is learnt or lost by it.
     use_geometry(monkeypatch)
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
-    chain = _Chain(case, settings(*right_nuisances()), None, None)
-    start = chain.shared.start
-    chain.sample_geometry(start, chain.shared(start).y)
+    estimation = CaseEstimation(case, settings(*right_nuisances()), None, None)
+    start = estimation.shared.start
+    estimation.errors.sample_geometry(start, estimation.shared(start).y)
     each = case.error_samples.vertices[:, 1]
-    np.testing.assert_allclose(chain.geometry.predicted, 2.0 * each, atol=1e-9)
-    np.testing.assert_allclose(chain.errors.samples.T, each.reshape(len(each), -1), atol=1e-9)
+    np.testing.assert_allclose(estimation.errors.geometry.predicted, 2.0 * each, atol=1e-9)
+    np.testing.assert_allclose(
+        estimation.errors.samples.samples.T, each.reshape(len(each), -1), atol=1e-9
+    )
 
 
 def test_errors_of_frames_that_cannot_be_told_are_an_error(monkeypatch):
     use_geometry(monkeypatch)
-    monkeypatch.setattr("mvest.personalise.chain.sample_geometry", lambda *_: "no equilibrium")
+    monkeypatch.setattr(
+        "mvest.personalise.observation_errors.sample_geometry", lambda *_: "no equilibrium"
+    )
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     with pytest.raises(GeometryError, match="error samples do: no equilibrium"):
         personalise_case(case, settings(*right_nuisances()))

@@ -21,8 +21,9 @@ from experiments.studies.design.findings import Findings, Left, Tried
 from experiments.studies.design.report import design_answer, design_words, write_design
 from experiments.studies.design.settings import Corner, Settings
 from mvest.errors import ConfigurationError, GeometryError
-from mvest.personalise.chain import design_case, personalise_case
+from mvest.personalise.chain import personalise_case
 from mvest.personalise.design import ERRORS_MMHG, GROUPS, KINDS, FrameDesigns, StatedErrors
+from mvest.personalise.expectation import design_case
 from mvest.personalise.model import build_coarse
 from mvest.personalise.settings import PersonaliseSettings, PressureErrors
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient

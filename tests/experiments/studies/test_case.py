@@ -323,7 +323,8 @@ def test_an_unknown_treatment_names_the_known_ones(config):
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
     (built,) = [use(monkeypatch)]
     monkeypatch.setattr(
-        "mvest.personalise.chain.estimate", lambda *a, **k: pytest.fail("something was estimated")
+        "mvest.personalise.estimation.estimate",
+        lambda *a, **k: pytest.fail("something was estimated"),
     )
     status, out, err = run(*OWN, f"case={folder}", "check=true")
     assert status == 0, err

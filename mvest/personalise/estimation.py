@@ -1,0 +1,202 @@
+"""The estimation of a case: model, unknowns, prior and filter, and the estimates made with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mvest.cases.case import Role, ValveCase
+from mvest.closure.frames import is_frame_pressure
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
+from mvest.estimation.estimate import Estimate, Filter, OnIterate
+from mvest.estimation.filters.considered import SchmidtFilter
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.filters.paper import PaperFilter
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.sampled import SampledPosterior
+from mvest.estimation.transform import Log, to_filter
+from mvest.estimation.wrappers import SharedStart, of_some
+from mvest.personalise.fitted_frames import FittedFrames
+from mvest.personalise.geometry_errors import WeighedObservation
+from mvest.personalise.model import build_model, frames_model, with_pressures
+from mvest.personalise.observation_errors import ObservationErrors
+from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.problem import Observed, Problem
+from mvest.problem.registration import REGISTRATION, RegisteredModel
+
+__all__ = ["CaseEstimation", "OnStep"]
+
+ROUGH = 0.05
+"""Relative tolerance of an estimate about which the geometry is linearised."""
+
+LEARNED = 4
+"""Iterates at which errors are learned beside what is considered, from an estimate without it."""
+
+OnStep = Callable[[float, int], None]
+
+
+class CaseEstimation:
+    """The objects that the parts of one personalisation share."""
+
+    def __init__(
+        self,
+        case: ValveCase,
+        settings: PersonaliseSettings,
+        store: Path | None,
+        on_step: OnStep | None,
+        on_iterate: OnIterate | None = None,
+        model: ClosureModel | None = None,
+    ) -> None:
+        self.case, self.settings = case, with_pressures(case, settings)
+        settings = self.settings
+        self.closed = case.frame(Role.CLOSED)
+        if case.fitted and case.error_samples is not None:
+            raise InputError(
+                f"case {case.name}: error samples and several fitted frames; expected one closed "
+                "frame, or no samples"
+            )
+        if model is None:
+            model = build_model(case, settings, store)
+            model.on_step = on_step
+        self.model = model
+        self.frames = frames_model(case, settings, self.model)
+        self.on_iterate = on_iterate
+        free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+        # Those of the closure first, in its order; then the displacement.
+        own = [u for u in free if u.name not in REGISTRATION]
+        rigid = [u for u in free if u.name in REGISTRATION]
+        self.unknowns = (*own, *rigid)
+        self.names = tuple(u.name for u in self.unknowns)
+        self.registered = RegisteredModel(self.frames or self.model, self.names)
+        self.prior = Gaussian.from_variance(
+            np.array([u.mean for u in self.unknowns]),
+            np.array([u.std for u in self.unknowns]) ** 2,
+        )
+        self.transform = Log(tuple(u.is_positive for u in self.unknowns))
+        start = self.transform.inverse(self.transform.forward(self.prior.mean))
+        self.shared = SharedStart(self.registered, start)
+        self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
+        self.estimated = np.array([name not in self._held for name in self.names])
+        several = None if self.frames is None else self.frames.frames
+        self.fitted = FittedFrames(case, settings, self.model.valve, several)
+        self.errors = ObservationErrors(self.fitted, self.registered)
+        self.filter = self._filter(settings.tolerance)
+
+    def _filter(self, tolerance: float, start: tuple[float, ...] | None = None) -> Filter:
+        """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates."""
+        inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
+        if self._held:
+            return SchmidtFilter(inner, self._held)
+        if start is None:
+            return inner
+        # Of error samples the covariance is found otherwise.
+        second_order = self.errors.samples is None
+        return replace(inner, start=start, max_learned=LEARNED, second_order=second_order)
+
+    def knowledge(self) -> dict[str, float]:
+        """Prior standard deviations, relative of what is positive, but of pressures' errors."""
+        own = {
+            u.name: u.std / (u.mean if u.is_positive else 1.0)
+            for u in self.unknowns
+            if not is_frame_pressure(u.name)
+        }
+        return own | dict.fromkeys(self.errors.modes, 1.0)
+
+    def estimate_all(self) -> StudyResult:
+        """All unknowns, with what is considered about an estimate without it.
+
+        What its errors do depends on the moduli: with a modulus half as large the derivatives are
+        off by a quarter. So all unknowns are estimated without them first, roughly.
+        """
+        if not self.errors.considers:
+            return self.estimate(self.filter, self.errors.observation())
+        rough = self.estimate(
+            self._filter(max(ROUGH, self.settings.tolerance)), self.errors.rough_observation()
+        )
+        at = self.shared.start if rough.estimate is None else rough.estimate
+        prediction = self.shared(at)
+        if not prediction.converged:
+            self.errors.unconsidered = (prediction.reason,)
+            return rough
+        self.errors.consider(at, prediction.y)
+        if self.errors.samples is not None:
+            self.errors.sample_geometry(at, prediction.y)
+        result = self.estimate(
+            self._filter(self.settings.tolerance, tuple(at.tolist())), self.errors.observation()
+        )
+        return replace(result, seconds=rough.seconds + result.seconds)
+
+    def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
+        """All unknowns."""
+        result = estimate(self.problem(filter_), observation, on_iterate=self.on_iterate)
+        return self._widened(result, observation)
+
+    def problem(self, filter_: Filter) -> Problem:
+        """The estimation of all unknowns, without its observation."""
+        return Problem(
+            self.names,
+            self.shared,
+            self.prior,
+            filter_,
+            self.transform,
+            self.settings.mechanics.tissue,
+        )
+
+    def estimate_moduli(
+        self, filter_: Filter, observation: Observed, *, log: bool, variance: float | None = None
+    ) -> StudyResult:
+        """The moduli alone, everything else at its prior mean."""
+        moduli = np.array([k for k, u in enumerate(self.unknowns) if u.is_modulus])
+        prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
+        if variance is not None:
+            prior = Gaussian.from_variance(prior.mean, variance)
+        problem = Problem(
+            tuple(self.names[k] for k in moduli),
+            of_some(self.shared, self.shared.start, moduli, snap=1e-14),
+            prior,
+            filter_,
+            Log() if log else Log((False,) * len(moduli)),
+            self.settings.mechanics.tissue,
+        )
+        result = estimate(problem, observation, on_iterate=self.on_iterate)
+        return self._widened(result, observation)
+
+    def estimate_as_paper(self, paper: PaperSettings) -> StudyResult:
+        """The moduli alone, with the paper's filter and its independent R."""
+        filter_ = PaperFilter(paper.Q, max_iterations=paper.max_iterations)
+        observation = self.fitted.as_in_paper(paper)
+        return self.estimate_moduli(filter_, observation, log=False, variance=paper.P0)
+
+    def _widened(self, result: StudyResult, observation: Observed) -> StudyResult:
+        """The result with the covariance that the error samples give it, if there are any."""
+        filtered = result.filtered
+        weighed = self.errors.samples is not None and isinstance(observation, WeighedObservation)
+        if not weighed or filtered is None or filtered.prediction is None:
+            return result
+        covariances = np.array(filtered.transformed_iterate_covariances)
+        covariances[-1] = self.sampled_posterior(filtered).covariance
+        widened = replace(filtered, transformed_iterate_covariances=covariances)
+        return replace(result, filtered=widened)
+
+    def sampled_posterior(self, filtered: Estimate) -> SampledPosterior:
+        """Covariance of an estimate in filter coordinates, from the error samples."""
+        samples = self.errors.samples
+        assert samples is not None
+        assert filtered.prediction is not None
+        z = filtered.transformed_iterates[-1]
+        H = filtered.prediction.jacobian * filtered.transform.derivative(z)
+        prior = to_filter(filtered.transform, filtered.prior)
+        estimated = np.isin(filtered.names, np.array(self.names)[self.estimated])
+        learned = filtered.learned
+        if learned is None:
+            return samples.posterior(H, prior.covariance, estimated)
+        errors = replace(samples, base=self.errors.noise(learned))
+        posterior = errors.posterior(H, prior.covariance, estimated)
+        covariance = np.array(posterior.covariance)
+        covariance[np.ix_(estimated, estimated)] += learned.covariance
+        return replace(posterior, covariance=covariance)

@@ -1,0 +1,255 @@
+"""What is not known of the fitted frames of a case, and the noise that this is to a filter.
+
+Three things add up: errors of single points, as the case states them or as they are learned; errors
+of the frames of which the case has samples; and what is considered of geometry and law.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from mvest.cases.case import Role
+from mvest.errors import GeometryError
+from mvest.estimation.evidence import LearnedNoise
+from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
+from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
+from mvest.estimation.sampled import SampledErrors
+from mvest.observation.learned import error_family
+from mvest.personalise.considered_geometry import geometry_columns
+from mvest.personalise.considered_law import law_columns
+from mvest.personalise.fitted_frames import BLURRED_MM, SURFACE_MM, FittedFrames
+from mvest.personalise.geometry_errors import (
+    GeometryErrors,
+    WeighedObservation,
+    errors_of,
+    sample_geometry,
+)
+from mvest.problem.problem import Observed
+from mvest.problem.registration import RegisteredModel
+from mvest.typing import FloatArray
+
+__all__ = ["ObservationErrors"]
+
+KNOWN = "what is considered"
+"""Name of all columns whose size is not learned."""
+
+
+class ObservationErrors:
+    """What is not known of fitted frames, as far as it is found out.
+
+    Attributes
+    ----------
+    fitted : FittedFrames
+    registered : RegisteredModel
+        By which it is found out.
+    geometry : GeometryErrors or None
+        What the case's error samples do to the prediction.
+    samples : SampledErrors or None
+        The same, to the innovation.
+    considered : tuple of ErrorColumns
+        What geometry and law, as far as not known, do to the observation.
+    unconsidered : tuple of str
+        Why it is not known what some of it does.
+    """
+
+    def __init__(self, fitted: FittedFrames, registered: RegisteredModel) -> None:
+        self.fitted, self.registered = fitted, registered
+        self.geometry: GeometryErrors | None = None
+        self.samples: SampledErrors | None = None
+        self.considered: tuple[ErrorColumns, ...] = ()
+        self.unconsidered: tuple[str, ...] = ()
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of what is considered."""
+        return tuple(own.name for own in self.considered)
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of the columns of what is considered of the geometry."""
+        return tuple(
+            f"geometry.{k}" for k in range(sum(c.columns.shape[1] for c in self.considered))
+        )
+
+    @property
+    def considers(self) -> bool:
+        """Whether anything that is not among the unknowns widens the intervals."""
+        settings = self.fitted.settings
+        return settings.considered_geometry is not None or bool(settings.considered_law)
+
+    def consider(self, m: FloatArray, predicted: FloatArray) -> None:
+        """Find out what geometry and law, as far as not known, do to the observation at ``m``.
+
+        Parameters
+        ----------
+        m : (p,)
+        predicted : array
+            Both frames there, stacked.
+        """
+        settings, observation = self.fitted.settings, self.fitted.observation()
+        if self.considers and not settings.mechanics.protocol.equilibrium:
+            self.unconsidered = ("the closure does not end in an equilibrium",)
+            return
+        found: list[tuple[ErrorColumns, ...] | str] = []
+        if settings.considered_geometry is not None:
+            noise = self.noise(without=self.kinds)
+            found.append(
+                geometry_columns(
+                    self.fitted.case,
+                    settings.considered_geometry,
+                    self.registered,
+                    observation,
+                    noise,
+                    m,
+                    predicted,
+                )
+            )
+        if settings.considered_law:
+            found.append(
+                law_columns(settings.considered_law, self.registered, observation, m, predicted)
+            )
+        self.unconsidered = tuple(reason for reason in found if isinstance(reason, str))
+        known = [columns for columns in found if not isinstance(columns, str)]
+        if not known:
+            return  # what was found out elsewhere serves
+        self.considered = tuple(own for columns in known for own in columns)
+        if self.samples is not None:
+            self.samples = replace(self.samples, base=self.noise())
+
+    def sample_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
+        """Find out what errors of the case's frames do to the observation at ``m``.
+
+        Parameters
+        ----------
+        m : (p,)
+        predicted : array
+            Both frames there, stacked.
+        """
+        case = self.fitted.case
+        sampled = self.sampled(m, predicted)
+        if isinstance(sampled, str):
+            raise GeometryError(f"case {case.name}: what its error samples do: {sampled}")
+        self.geometry, errors = sampled
+        assert case.error_samples is not None
+        self.samples = SampledErrors(self.noise(), errors, case.error_samples.source)
+
+    def sampled(
+        self,
+        m: FloatArray,
+        predicted: FloatArray,
+        vertices: FloatArray | None = None,
+        tips: FloatArray | None = None,
+    ) -> tuple[GeometryErrors, FloatArray] | str:
+        """What error samples do to the prediction at ``m`` and to the innovation ``(n, K)``.
+
+        Parameters
+        ----------
+        m : (p,)
+        predicted : array
+            Both frames there, stacked.
+        vertices : (K, f, n, 3) mm, optional
+        tips : (K, f, t, 3) mm, optional
+            Other samples than those of the case.
+        """
+        case = self.fitted.case
+        geometry = sample_geometry(case, self.registered, m, vertices, tips)
+        if isinstance(geometry, str):
+            return geometry
+        closed = case.frame(Role.CLOSED)
+        return geometry, errors_of(self.fitted.observation(), closed, predicted, geometry)
+
+    def noise(
+        self,
+        learned: LearnedNoise | None = None,
+        *,
+        considered: float = 1.0,
+        without: Collection[str] = (),
+        stated: bool = False,
+    ) -> ObservationNoise:
+        """Noise of the observation without that of error samples.
+
+        Parameters
+        ----------
+        learned : LearnedNoise, optional
+            By which it is known, and not as it is stated.
+        considered : float
+            Factor on what is added by all that is considered.
+        without : collection of str
+            Kinds of it that are left out.
+        stated : bool
+            See `FittedFrames.observation`.
+        """
+        family = self.single_errors
+        scales: dict[str, float] = {}
+        if family is None:
+            observation = self.fitted.observation(stated=stated)
+            base = observation_noise(observation.R, len(observation.y))
+        else:
+            log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
+            first = len(family.names) - len(family.columns)
+            base = family.without_columns().at(log[:first])
+            scales = {
+                own.name: float(np.exp(one))
+                for own, one in zip(family.columns, log[first:], strict=True)
+            }
+        columns = [
+            considered * scales.get(own.name, 1.0) * own.columns
+            for own in self.considered
+            if own.name not in without
+        ]
+        return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
+
+    def observation(self) -> Observed:
+        """The closed frame, with its uncertainty and what errors of the geometry add to it."""
+        plain, single = self.fitted.observation(), self.single_errors
+        if single is not None:
+            if self.samples is not None:
+                columns = self.samples.samples / np.sqrt(self.samples.count)
+                single = single.plus(ErrorColumns("geometry", columns))
+            return WeighedObservation(plain, single)
+        if self.samples is not None:
+            return WeighedObservation(plain, self.samples.noise)
+        return WeighedObservation(plain, self.noise()) if self.considered else plain
+
+    def rough_observation(self) -> Observed:
+        """The same, of which surfaces are seen through a blur."""
+        observation = self.observation()
+        if not self.fitted.smooth:
+            return observation
+        noise = observation.R
+        if isinstance(noise, NoiseFamily):
+            noise = replace(noise, resolution=max(noise.resolution, BLURRED_MM))
+        return WeighedObservation(self.fitted.blurred(), noise)
+
+    @property
+    def single_errors(self) -> NoiseFamily | None:
+        """What is believed of the errors of single observations, where they are learned.
+
+        What is considered is added; all of it whose size is known at once, which saves quantities.
+        """
+        if self._family is None:
+            return None
+        learned = [own for own in self.considered if own.factor > 1.0]
+        known = [own.columns for own in self.considered if own.factor == 1.0]
+        if known:
+            learned.append(ErrorColumns(KNOWN, np.concatenate(known, axis=1)))
+        return replace(self._family, columns=tuple(learned))
+
+    @cached_property
+    def _family(self) -> NoiseFamily | None:
+        fitted = self.fitted
+        if fitted.settings.errors is None:
+            return None
+        family = error_family(
+            fitted.observation(),
+            fitted.settings.errors,
+            fitted.length(),
+            fitted.case.surface.vertices,
+        )
+        if not fitted.smooth:
+            return family
+        return replace(family, resolution=max(family.resolution, SURFACE_MM))
