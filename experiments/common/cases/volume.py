@@ -22,6 +22,7 @@ from mvest.cases.from_images.build import CaseTexts, case_of_sequence
 from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
 from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
+from mvest.cases.from_images.measure_bands import with_bands
 from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
 from mvest.cases.pressure_curve import PressureCurve
 from mvest.cases.tissue import GENERIC_THICKNESS
@@ -169,6 +170,7 @@ def detect_in_volume(
         settings.simulated,
     )
     accuracy = model.accuracy.at(valve.confidence)
+    rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
     corrected, errors, tip_errors = without_mean_error(
         valve, frames, accuracy.samples, accuracy.tip_samples
     )
@@ -243,7 +245,8 @@ def write_image_step(detected: DetectedValve, folder: Path) -> ImageStep:
         ),
         "measures_over_time": (
             measures_figure(detected.rows, title=name, low_confidence=detected.min_confidence),
-            "Measures of the valve over time. Hollow: frames of low confidence.",
+            "Measures of the valve over time. Hollow: frames of low confidence. Bands: where 95 % "
+            "of true ones are expected, by the detectors' errors on simulated valves.",
         ),
     }
     pictures = {}

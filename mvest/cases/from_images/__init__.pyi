@@ -8,6 +8,7 @@ from .files import write_landmarks as write_landmarks
 from .files import write_surfaces as write_surfaces
 from .frame_choice import CaseFrames as CaseFrames
 from .frame_choice import choose_frames as choose_frames
+from .measure_bands import with_bands as with_bands
 from .measures import OPEN_SHARE as OPEN_SHARE
 from .measures import closed_frame as closed_frame
 from .measures import contact_distance as contact_distance

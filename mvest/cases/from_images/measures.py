@@ -16,12 +16,20 @@ from mvest.files import write_atomically
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names
+from mvest.valve.measure.clinical import (
+    MeasuredLeaflets,
+    clinical_meaning,
+    clinical_measurements,
+    clinical_names,
+)
 
 __all__ = [
+    "BOUNDS",
     "OPEN_SHARE",
     "closed_frame",
     "contact_distance",
+    "is_open",
+    "leaflets_of",
     "measure_meaning",
     "measure_sequence",
     "write_measures",
@@ -40,6 +48,9 @@ CLOSED_ONLY = ("tenting_", "prolapse_", "billow_")
 """What is defined for closed leaflets only, by the beginning of its name."""
 
 TIPS = ("tip_0", "tip_180")
+
+BOUNDS = {"low": "lower bound", "high": "upper bound"}
+"""Endings of names of what bounds a measure."""
 
 _OWN = {
     "frame": ("", "number of the frame from 0 on"),
@@ -121,20 +132,26 @@ def _measured(
     layout = sequence.layout
     measures = clinical_measurements(
         x,
-        _leaflets(layout, thickness_mm),
+        leaflets_of(layout, thickness_mm),
         x[layout.annulus],
         tips,
         reach,
         tip_names=TIPS,
         passing_ball=passing_ball,
     )
-    orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
-    if orifice is None or area is None or orifice >= OPEN_SHARE * area:
+    if is_open(measures):
         return {name: v for name, v in measures.items() if not name.startswith(CLOSED_ONLY)}
     return measures
 
 
-def _leaflets(layout: ValveLayout, thickness_mm: float) -> _Leaflets:
+def is_open(measures: Mapping[str, float | None]) -> bool:
+    """Whether a valve of these measures is open, as it is called where they tell nothing."""
+    orifice, area = measures.get("orifice_mm2"), measures.get("annulus_area_mm2")
+    return orifice is None or area is None or orifice >= OPEN_SHARE * area
+
+
+def leaflets_of(layout: ValveLayout, thickness_mm: float) -> MeasuredLeaflets:
+    """The leaflets of a layout as they are measured."""
     thickness = np.full(layout.size, thickness_mm)
     return _Leaflets(layout.triangles, layout.region, layout.region_names, thickness)
 
@@ -158,7 +175,14 @@ def closed_frame(rows: Sequence[Row]) -> int | None:
 
 
 def measure_meaning(name: str) -> tuple[str, str]:
-    """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`."""
+    """Unit (empty for pure numbers) and meaning of an entry of `measure_sequence`.
+
+    Or of a bound of one (`mvest.cases.from_images.measure_bands`).
+    """
+    for end, words in BOUNDS.items():
+        if name.endswith(f"_{end}"):
+            unit, meaning = measure_meaning(name.removesuffix(f"_{end}"))
+            return unit, f"{words} of the 95 % band of: {meaning}"
     return _OWN[name] if name in _OWN else clinical_meaning(name)
 
 

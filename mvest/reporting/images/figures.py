@@ -97,7 +97,8 @@ def measures_figure(
     ----------
     rows : sequence of mapping
         From `mvest.cases.from_images.measure_sequence`: for each frame ``time_s``, ``confidence``
-        and the measures; None leaves a gap.
+        and the measures; None leaves a gap. Of those that have bounds
+        (`mvest.cases.from_images.with_bands`) the band is drawn, too.
     title : str
     low_confidence : float
         Frames below this are drawn hollow.
@@ -120,6 +121,9 @@ def measures_figure(
             values = table[name].to_numpy(float)
             colour, marker = COLOURS[k], MARKERS[k]
             axes.plot(time, values, color=colour, lw=1.2, label=words)
+            if f"{name}_low" in table:
+                band = [table[f"{name}_{end}"].to_numpy(float) for end in ("low", "high")]
+                axes.fill_between(time, *band, color=colour, alpha=0.16, lw=0)
             for which, face in ((sure, colour), (~sure, "white")):
                 axes.plot(
                     time[which], values[which], ls="none", marker=marker, ms=4.2, mec=colour,
@@ -127,7 +131,9 @@ def measures_figure(
                 )  # fmt: skip
         if len(panel.curves) > 1:
             axes.legend(fontsize=SMALL - 0.5, frameon=False, handlelength=1.4)
-        shown = table[[name for name, _ in panel.curves]].to_numpy(float)
+        drawn = [name for name, _ in panel.curves]
+        bounds = [f"{name}_{end}" for name in drawn for end in ("low", "high")]
+        shown = table[[*drawn, *(name for name in bounds if name in table)]].to_numpy(float)
         if not np.isfinite(shown).any():
             axes.text(
                 0.5, 0.5, "not measured in any frame", transform=axes.transAxes, ha="center",
@@ -139,7 +145,9 @@ def measures_figure(
         axes.set_xlabel("time [ms]")
     low = int((~sure).sum())
     note = f"Hollow: confidence below {low_confidence:g} ({low} of {len(sure)} frames). "
-    headline(figure, title, note + "Gaps: the shape defies the measure, such as tenting when open.")
+    banded = table.columns.str.endswith("_low").any()
+    note += "Gaps: the shape defies the measure" + (". Bands: 95 %." if banded else ".")
+    headline(figure, title, note)
     return figure
 
 

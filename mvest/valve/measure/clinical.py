@@ -21,7 +21,13 @@ from mvest.valve.measure.measurements import (
 )
 from mvest.valve.measure.passing_ball import largest_passing_ball
 
-__all__ = ["MeasuredLeaflets", "clinical_meaning", "clinical_measurements", "clinical_names"]
+__all__ = [
+    "MeasuredLeaflets",
+    "annulus_and_tips",
+    "clinical_meaning",
+    "clinical_measurements",
+    "clinical_names",
+]
 
 Numbers: TypeAlias = dict[str, float | None]
 
@@ -151,12 +157,8 @@ def clinical_measurements(
         Name with unit -> number; what the shape defies is not in it, and nothing is where the
         annulus has no plane. The first region is the anterior one.
     """
-    # The middle of a leaflet's own annulus is nearest to that leaflet.
-    first = np.unique(surface.triangles[surface.region == 0])
-    gap = np.linalg.norm(annulus[:, None] - vertices[first][None], axis=2).min(axis=1)
-    near = annulus[gap <= np.quantile(gap, 0.25)]
     try:
-        plane = annulus_plane(annulus, tips.mean(axis=0), near.mean(axis=0))
+        plane = _plane(vertices, surface, annulus, tips)
     except MvestError:
         return {}
     triangles, region = surface.triangles, np.asarray(surface.region)
@@ -174,6 +176,33 @@ def clinical_measurements(
         if len(pair) == 2:
             numbers[f"{name}_length_mm"] = leaflet_length(vertices, own, plane)
     return numbers | _tips(tips, annulus, plane, tip_names)
+
+
+def annulus_and_tips(
+    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
+) -> dict[str, float | None]:
+    """Those of `clinical_measurements` that take no leaflets, in a hundredth of the time.
+
+    Parameters
+    ----------
+    vertices, surface, annulus, tips
+        As there; of the leaflets only which side the anterior one is on.
+    """
+    try:
+        plane = _plane(vertices, surface, annulus, tips)
+    except MvestError:
+        return {}
+    return _tried(_annulus, annulus, plane) | _tips(tips, annulus, plane, ())
+
+
+def _plane(
+    vertices: FloatArray, surface: MeasuredLeaflets, annulus: FloatArray, tips: FloatArray
+) -> AnnulusPlane:
+    # The middle of a leaflet's own annulus is nearest to that leaflet.
+    first = np.unique(surface.triangles[surface.region == 0])
+    gap = np.linalg.norm(annulus[:, None] - vertices[first][None], axis=2).min(axis=1)
+    near = annulus[gap <= np.quantile(gap, 0.25)]
+    return annulus_plane(annulus, tips.mean(axis=0), near.mean(axis=0))
 
 
 def _tried(measure: Callable[..., Numbers], *shape: Any) -> Numbers:

@@ -60,6 +60,25 @@ def test_measures_over_time_have_gaps_and_hollow_frames():
         measures_figure([], title="made up")
 
 
+def test_bands_are_drawn_where_measures_have_bounds():
+    bounds = {"ap_diameter_mm_low": 20.0, "ap_diameter_mm_high": 31.0}
+    rows = [measures(0) | bounds, measures(1) | dict.fromkeys(bounds), measures(2) | bounds]
+    rows.append(measures(3) | bounds)
+    figure = measures_figure(rows, title="made up")
+    diameters = panel(figure, "Annulus diameters")
+    (band,) = diameters.collections
+    corners = np.concatenate([path.vertices for path in band.get_paths()])
+    assert (corners[:, 1].min(), corners[:, 1].max()) == (20.0, 31.0)
+    assert 50.0 not in corners[:, 0]
+    low, high = diameters.get_ylim()
+    assert low < 20.0
+    assert high > 36.0
+    assert not panel(figure, "Annulus area").collections
+    assert any("Bands: 95 %" in text.get_text() for text in figure.texts)
+    plain = measures_figure([measures(0)], title="made up")
+    assert not any("Bands" in text.get_text() for text in plain.texts)
+
+
 def volumes(setting, values):
     return [{"setting": setting, "surface_mm": value} for value in values]
 
