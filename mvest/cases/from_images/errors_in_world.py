@@ -9,6 +9,7 @@ import numpy as np
 from mvest.cases.case import ErrorSamples
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.errors import InputError
+from mvest.imaging.detection.pose import pose_of
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
@@ -17,21 +18,9 @@ __all__ = ["samples_in_world", "valve_axes", "without_mean_error"]
 
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Axes of the valve in a frame, the columns of ``(3, 3)``.
-
-    As of a moving valve: z is normal to the annulus, to the atrium; x points from phi = 180 to
-    phi = 0 within its plane, and y, which completes them, to the first leaflet.
-    """
-    layout, annulus = sequence.layout, sequence.annulus[frame]
-    about = annulus - annulus.mean(axis=0)
-    area = np.cross(about, np.roll(about, -1, axis=0)).sum(axis=0)
-    down = sequence.free_edge[frame].mean(axis=0) - annulus.mean(axis=0)
-    z = -area * np.sign(area @ down) / np.linalg.norm(area)
-    across = annulus[layout.column(0.0)] - annulus[layout.column(180.0)]
-    x = across - (across @ z) * z
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    return np.stack([x, y, z], axis=1)
+    """Axes of the valve in a frame, the columns of ``(3, 3)``: those that errors are measured in."""
+    pose = pose_of(sequence.vertices[frame], sequence.tips[frame], sequence.layout)
+    return np.asarray(pose.rotation[0])
 
 
 def samples_in_world(

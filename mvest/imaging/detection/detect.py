@@ -30,9 +30,9 @@ __all__ = [
 ]
 
 LANDMARK_STD_MM = 1.2
-RIM_STD_MM = (0.8, 0.8)
-"""mm, least standard deviation of a landmark's, a rim's and the boundary's pull: what the spread of
-votes does not tell."""
+RIM_STD_MM = 0.8
+"""mm, least standard deviation of a landmark's and a rim's pull: what the spread of votes does not
+tell."""
 
 HAND_STD_MM = (0.2, 0.03)
 """mm, of landmarks placed by hand: while the shape is fitted, and for the free displacement, which
@@ -293,6 +293,6 @@ def _seen(
         axes, off, spread = rim(frame, vertices, layout, log_scale)
         at = layout.annulus if rim.row == 0 else layout.free_edge
         # Columns are alike too, over about as many as rows are.
-        wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM[rim.row], spread)
+        wide = np.sqrt(np.sqrt(alike)) * np.hypot(RIM_STD_MM, spread)
         parts += [Pulls(at, axes[:, :, 1 + k], off[:, k], wide) for k in range(2)]
     return Pulls.joined(parts), confidence
