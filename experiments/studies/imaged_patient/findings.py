@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from experiments.common.estimates import Data, SeedRun
+from mvest.problem.verdict import NONE
 from mvest.reporting.case.findings import Cost, FrameDistances, ImageErrors, UnknownRow
 
 __all__ = ["KNOWN", "SEGMENTED", "Findings", "KnownGeometry", "Row"]
@@ -29,6 +30,13 @@ class Row:
     known_geometry: float | None
     segmented: float | None = None
     verdict: str = ""
+
+    @property
+    def as_stated(self) -> UnknownRow:
+        """The modulus, without an estimate where the verdict is that there is none."""
+        if self.verdict != NONE:
+            return self.modulus
+        return replace(self.modulus, estimate=None, std=None, low=None, high=None)
 
 
 @dataclass(frozen=True, slots=True)

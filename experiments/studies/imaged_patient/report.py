@@ -25,8 +25,8 @@ def volume_text(record: Record[Findings]) -> str:
 
 
 def moduli_of_volumes(records: Iterable[Record[Findings]]) -> list[UnknownRow]:
-    """The modulus of each leaflet of each patient."""
-    return [row.modulus for record in records for row in record.findings.rows]
+    """The modulus of each leaflet of each patient, as it is stated."""
+    return [row.as_stated for record in records for row in record.findings.rows]
 
 
 def volumes_answer(records: Mapping[str, Record[Findings]]) -> str:

@@ -15,6 +15,7 @@ from experiments.common.cases.skill import baselines, skill_words
 from experiments.common.tables import write_table
 from experiments.studies.imaged_patient.findings import Row
 from mvest.errors import InputError
+from mvest.problem.verdict import NONE
 from mvest.reporting.markup import MISSING, number
 
 __all__ = ["volume_table", "volume_words", "write_volume_tables"]
@@ -27,6 +28,18 @@ TRUTH_OF_MODULI: Final = (
     "that from known geometry and the part from the images add up to the whole. Nothing here was "
     "measured in patients."
 )
+
+
+ERRORS: Final = {
+    "from the volume": "error [%]",
+    "from a perfect segmentation": "error from a perfect segmentation [%]",
+    "from the known geometry": "error from known geometry [%]",
+    "part from the images": "part from the images [%]",
+}
+"""What sentences call the columns of errors."""
+
+OF_VOLUMES: Final = ("error [%]", "part from the images [%]")
+"""Those that do not count where the verdict is that there is no estimate."""
 
 
 def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
@@ -59,6 +72,7 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
             "95 % high [MPa]": numbers["high"],
             "inside": pd.Series([row.modulus.inside for row in rows], dtype=object),
             "verdict": [row.verdict for row in rows],
+            "error of the generic guess [%]": 100.0 * (moduli["prior_mean"] - truth) / truth,
             "error [%]": error,
             "error from a perfect segmentation [%]": segmented,
             "error from known geometry [%]": known,
@@ -68,29 +82,36 @@ def volume_table(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def volume_words(table: pd.DataFrame) -> list[str]:
-    """What a table of `volume_table` says, in numbers."""
-    known = table[table["inside"].notna()]
+    """What a table of `volume_table` says, in numbers; what the verdict denies does not count."""
+    denied = table["verdict"] == NONE
+    known = table[table["inside"].notna() & ~denied]
     inside = int(known["inside"].astype(bool).sum())
     out = [f"The 95 % interval contains the truth for {inside} of {len(known)} moduli."]
-    lost = int(table["estimate [MPa]"].isna().sum())
+    lost = int((table["estimate [MPa]"].isna() & ~denied).sum())
     if lost:
         out.append(f"For {lost} of {len(table)} moduli there is no estimate.")
-    sizes = {
-        words: table[column].abs().median()
-        for words, column in (
-            ("from the volume", "error [%]"),
-            ("from a perfect segmentation", "error from a perfect segmentation [%]"),
-            ("from the known geometry", "error from known geometry [%]"),
-            ("part from the images", "part from the images [%]"),
+    if denied.any():
+        held = table.loc[denied & table["inside"].notna(), "inside"].astype(bool)
+        out.append(
+            f"For {int(denied.sum())} of {len(table)} the verdict is that there is no estimate; "
+            f"they are not counted. (Of the {len(held)} intervals that they ended with "
+            f"{int(held.sum())} contain the truth.)"
         )
-    }
-    medians = ", ".join(f"{words} {v:.1f} %" for words, v in sizes.items() if np.isfinite(v))
+    counted = table.assign(**{column: table[column].where(~denied) for column in OF_VOLUMES})
+    medians = _medians(counted)
     if medians:
         out.append(f"Median size of the error: {medians}.")
-    by_leaflet = table["error [%]"].abs().groupby(table["modulus"], sort=False).median()
-    listed = ", ".join(f"{name} {v:.1f} %" for name, v in by_leaflet.items() if np.isfinite(v))
-    if listed:
-        out.append(f"From the volume by leaflet: {listed}.")
+    for leaflet, own in counted.groupby("modulus", sort=False):
+        stated = own[own["error [%]"].notna()]
+        if stated.empty:
+            continue
+        guess = stated["error of the generic guess [%]"].abs().median()
+        ratio = stated["error [%]"].abs().median() / guess
+        out.append(
+            f"{str(leaflet).capitalize()}: {_medians(own)}; {ratio:.2f} of the generic guess's "
+            f"{guess:.1f} % for the same patients; {int(stated['inside'].eq(True).sum())} of "
+            f"{len(stated)} inside."
+        )
     judged = table[table["verdict"] != ""]
     if len(judged):
         trusts = ", ".join(
@@ -102,6 +123,12 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     if len(known):
         out.append(f"Width of the interval over the estimate: median {width.median():.2f}.")
     return out
+
+
+def _medians(table: pd.DataFrame) -> str:
+    """Median sizes of the errors that there are, in words."""
+    sizes = {words: table[column].abs().median() for words, column in ERRORS.items()}
+    return ", ".join(f"{words} {v:.1f} %" for words, v in sizes.items() if np.isfinite(v))
 
 
 def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path]:
@@ -118,7 +145,7 @@ def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path
             "patient (simulated)": row.patient.replace("_", " "),
             "modulus": row.modulus.leaflet,
             "truth [MPa]": number(row.modulus.truth),
-            "estimate, 95 % [MPa]": interval_words(row.modulus),
+            "estimate, 95 % [MPa]": interval_words(row.as_stated),
             "verdict": row.verdict or MISSING,
             **{
                 str(name): MISSING if pd.isna(value) else f"{value:+.1f}"
@@ -137,5 +164,6 @@ def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path
         }
         for one in baselines(moduli)
     ]
-    notes = [TRUTH_OF_MODULI, skill_words(moduli), *volume_words(table)]
+    stated = [row.as_stated for row in rows]
+    notes = [TRUTH_OF_MODULI, skill_words(stated), *volume_words(table)]
     return write_table(base, table, readable, line, notes)

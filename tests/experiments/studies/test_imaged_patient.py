@@ -1,7 +1,7 @@
 """Virtual patients in volumes: what is put together of both estimations, and what is kept."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -164,8 +164,33 @@ def test_errors_of_moduli_add_up():
     assert "from the volume 22.5 %" in words[2]
     assert "from a perfect segmentation 10.0 %" in words[2]
     assert "from the known geometry 4.0 %" in words[2]
-    assert words[3] == "From the volume by leaflet: anterior 20.0 %, posterior 25.0 %."
-    assert words[4] == "Verdicts: doubtful 2 (1 inside)."
+    # The generic guess, 1 MPa, is off by 80 % of 5 and by 50 % of 2 MPa.
+    assert words[3] == (
+        "Anterior: from the volume 20.0 %, from a perfect segmentation 10.0 %, from the known "
+        "geometry 2.0 %, part from the images 16.0 %; 0.25 of the generic guess's 80.0 % for the "
+        "same patients; 1 of 1 inside."
+    )
+    assert words[4].startswith("Posterior: from the volume 25.0 %, from the known geometry 5.0 %")
+    assert "0.50 of the generic guess's 50.0 %" in words[4]
+    assert words[5] == "Verdicts: doubtful 2 (1 inside)."
+
+
+def test_what_the_verdict_denies_is_neither_stated_nor_counted(tmp_path):
+    denied = replace(MODULI[1], verdict="none")
+    rows = [MODULI[0], denied]
+    words = volume_words(volume_table(rows))
+    assert words[0] == "The 95 % interval contains the truth for 1 of 1 moduli."
+    assert words[1] == (
+        "For 1 of 2 the verdict is that there is no estimate; they are not counted. (Of the 1 "
+        "intervals that they ended with 0 contain the truth.)"
+    )
+    assert words[2].startswith("Median size of the error: from the volume 20.0 %")
+    assert not any(sentence.startswith("Posterior") for sentence in words)
+    write_volume_tables(tmp_path / "volume", rows, "line")
+    text = (tmp_path / "volume.md").read_text(encoding="utf-8")
+    assert "1.5 (1.2 to 1.8)" not in text
+    assert "1 of 2 moduli lie inside" in text
+    assert "1 without an estimate" in text
 
 
 def test_the_table_of_moduli_is_readable(tmp_path):
