@@ -87,13 +87,13 @@ format: $(DEVELOP) ## rewrite the code in the house format
 	$(BIN)/ruff format .
 
 dashboard: $(INSTALLED) ## MLflow's pages, on the comparison of the last sweep (PORT=5000)
-	$(BIN)/python -m experiments.runner.dashboard $(if $(PORT),--port $(PORT))
+	$(BIN)/python -m experiments.runner.tracking.dashboard $(if $(PORT),--port $(PORT))
 
 sync: $(INSTALLED) ## upload to MLflow what is on disk and not there yet
-	$(BIN)/python -m experiments.runner.sync
+	$(BIN)/python -m experiments.runner.tracking.sync
 
 screenshot: $(INSTALLED) ## the picture of the dashboard in results/ (needs Chromium)
-	$(BIN)/python -m experiments.runner.screenshot
+	$(BIN)/python -m experiments.runner.tracking.screenshot
 
 slurm-check: $(DEVELOP) ## a sweep through a real Slurm, with jobs that die (tests/slurm/setup.sh starts one, as root)
 	$(BIN)/python -m pytest tests/slurm -p no:xdist -o python_files='check_*.py'

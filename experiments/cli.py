@@ -17,7 +17,7 @@ from pathlib import Path
 
 from experiments.common.places import EXPERIMENTS
 from experiments.console import Parser
-from experiments.runner.interruption import interruptible
+from experiments.runner.jobs.interruption import interruptible
 from mvest import __version__
 from mvest.errors import MvestError
 
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser.add_argument("folder", type=Path, metavar="FOLDER")
             return _collect(parser.parse_args(rest).folder)
         case "dashboard":
-            from experiments.runner.dashboard import main as dashboard
+            from experiments.runner.tracking.dashboard import main as dashboard
 
             return dashboard(rest)
         case _:
@@ -111,7 +111,7 @@ def _help() -> str:
 
 def _table(rest: list[str]) -> int:
     """Write all estimates of a folder as one table, and what its columns mean."""
-    from experiments.runner.estimate_table import write_estimates
+    from experiments.runner.collecting.estimate_table import write_estimates
 
     parser = Parser("mvest table", description=COMMANDS["table"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of runs, or results/")
@@ -127,7 +127,7 @@ def _table(rest: list[str]) -> int:
 
 def _crate(rest: list[str]) -> int:
     """Describe what made the results in a folder."""
-    from experiments.runner.crate import write_crate
+    from experiments.runner.collecting.crate import write_crate
 
     parser = Parser("mvest crate", description=COMMANDS["crate"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, or results/")
@@ -141,8 +141,8 @@ def _crate(rest: list[str]) -> int:
 
 def _worker(rest: list[str]) -> int:
     """Run a shard of a sweep; what becomes of its jobs is recorded, and no failure of this."""
-    from experiments.runner.drain import Shard, drain_shard
-    from experiments.runner.plan import Plan
+    from experiments.runner.execution.drain import Shard, drain_shard
+    from experiments.runner.planning.plan import Plan
 
     parser = Parser("mvest worker", description=COMMANDS["worker"])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the sweep, in outputs/")

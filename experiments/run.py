@@ -21,11 +21,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments.common.config import register
 from experiments.common.places import CONF
-from experiments.runner.folder import FailedRunError, nothing_empty
-from experiments.runner.interruption import interruptible
+from experiments.runner.jobs.folder import FailedRunError, nothing_empty
+from experiments.runner.jobs.interruption import interruptible
+from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
-from experiments.runner.request import Request
-from experiments.runner.tracking import track_job
+from experiments.runner.tracking.upload import track_job
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -87,9 +87,9 @@ def run_alone(config: DictConfig) -> None:
         If the computation found no estimate; the run is recorded all the same.
     """
     # Imports every study, for seconds: not where only help is asked for.
-    from experiments.runner.check import require_admissible
-    from experiments.runner.compose import plan_run
-    from experiments.runner.job import run_job
+    from experiments.runner.execution.check import require_admissible
+    from experiments.runner.execution.job import run_job
+    from experiments.runner.planning.compose import plan_run
 
     with nothing_empty(Path(HydraConfig.get().runtime.output_dir), Path(config.paths.outputs)):
         request = Request.of(config)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.results.keep import RECORDS, regenerate
 from experiments.results.page import write_report
-from experiments.runner.interruption import interruptible
+from experiments.runner.jobs.interruption import interruptible
 from experiments.sweeps.report import read_sweeps, write_sweep
 from mvest.errors import MvestError
 

@@ -124,6 +124,9 @@ NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments"
 NEVER_IN_EXPERIMENTS = ("tests",)
 STUDIES, IN_COMMON = "experiments.studies", "experiments.common"
 """A study's room imports of the experiments itself and what all have in common, no other study."""
+RUNNER = "experiments.runner"
+RUNNER_ROOMS = ("jobs", "planning", "collecting", "tracking", "execution")
+"""In the runner a room imports none that comes after it; what lies in none of them comes last."""
 
 IMPORT_NAME = {
     "hydra-core": ("hydra", "omegaconf"),
@@ -179,6 +182,11 @@ def imports(source: str, module: str, is_package: bool = False) -> Iterator[Impo
             yield Import(node.lineno, name, node not in deferred)
 
 
+def runner_level(module: str) -> int:
+    room = module.removeprefix(RUNNER + ".").split(".")[0]
+    return RUNNER_ROOMS.index(room) if room in RUNNER_ROOMS else len(RUNNER_ROOMS)
+
+
 def import_violations(source: str, module: str, is_package: bool = False) -> list[str]:
     """Import-direction rules that a module's source breaks, one message each."""
     if not within(module, "mvest"):
@@ -198,6 +206,9 @@ def import_violations(source: str, module: str, is_package: bool = False) -> lis
             broken.append(f"{module}:{line} imports {name}")
         elif within(module, STUDIES) and within(name, "experiments"):
             if not within(name, station) and not within(name, IN_COMMON):
+                broken.append(f"{module}:{line} imports {name}")
+        elif within(module, RUNNER) and within(name, RUNNER):
+            if runner_level(name) > runner_level(module):
                 broken.append(f"{module}:{line} imports {name}")
         elif within(name, "mvest"):
             inside = station != "mvest" and within(name, station)
@@ -267,9 +278,12 @@ def test_conf_is_data() -> None:
         ("experiments.run", "from tests.valve import shapes"),
         # A study knows no other, nor what runs or publishes it.
         ("experiments.studies.a.study", "from experiments.studies.ab.report import words"),
-        ("experiments.studies.a.study", "def f():\n    import experiments.runner.job"),
+        ("experiments.studies.a.study", "def f():\n    import experiments.runner.execution.job"),
         ("experiments.studies.a.report", "from experiments.results.keep import publish"),
         ("experiments.studies.a.report", "from experiments import studies"),
+        # What a job is does not depend on how jobs are run or logged.
+        ("experiments.runner.jobs.folder", "from experiments.runner.tracking import store"),
+        ("experiments.runner.execution.job", "def f():\n    import experiments.runner.sweep"),
         # The package's face imports lazily, nothing here imports the face, and a new station has to
         # be given its place.
         ("mvest", "from mvest.errors import MvestError"),
@@ -305,6 +319,7 @@ def test_a_wrong_import_is_seen(module: str, source: str) -> None:
             "experiments.studies.a.study",
             "from experiments.common.study import Study\nfrom experiments.studies.a import report",
         ),
+        ("experiments.runner.execution.job", "from experiments.runner.tracking import store"),
         # A name that only begins alike is another package.
         ("mvest.problem.estimate", "import hydrate, mlflower, testslide"),
     ],

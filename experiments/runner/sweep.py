@@ -16,17 +16,17 @@ from experiments.common.progress import announce_compilation
 from experiments.common.ranges import require_in_range
 from experiments.common.study import load_study
 from experiments.results.page import write_report
-from experiments.runner import slurm
-from experiments.runner.check import require_admissible
-from experiments.runner.collect import NOT_RUN, collect, read_ends
-from experiments.runner.compose import make_plan
-from experiments.runner.drain import drain_here, drain_inline
-from experiments.runner.folder import nothing_empty, require_writable
-from experiments.runner.plan import Plan
-from experiments.runner.progress import SweepBar
-from experiments.runner.summary import SWEEP
-from experiments.runner.sync import log_sweep, open_early
-from experiments.runner.tracking import Store
+from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
+from experiments.runner.execution import slurm
+from experiments.runner.execution.check import require_admissible
+from experiments.runner.execution.drain import drain_here, drain_inline
+from experiments.runner.jobs.folder import nothing_empty, require_writable
+from experiments.runner.planning.compose import make_plan
+from experiments.runner.planning.plan import Plan
+from experiments.runner.planning.progress import SweepBar
+from experiments.runner.tracking.store import Store
+from experiments.runner.tracking.summary import SWEEP
+from experiments.runner.tracking.sync import log_sweep, open_early
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError

@@ -34,7 +34,7 @@ sys.exit(main())
 DRAIN = """
 import sys
 from experiments.cli import main
-from experiments.runner import guard
+from experiments.runner.execution import guard
 guard.WORKER = (sys.executable, sys.argv.pop(1))
 sys.exit(main(sys.argv[1:]))
 """

@@ -126,7 +126,8 @@ def test_words_alone_load_nothing(arguments, tmp_path):
 
 def test_an_estimate_loads_neither_tables_nor_figures_nor_cases(tmp_path):
     code = (
-        "import sys\nimport experiments.run, experiments.runner.check, experiments.runner.job\n"
+        "import sys\nimport experiments.run\n"
+        "from experiments.runner.execution import check, job\n"
         "from experiments.common.study import load_study\nload_study('twin')\n"
         "heavy = {'matplotlib', 'pandas', 'mlflow', 'mvest.personalise.chain'} & set(sys.modules)\n"
         "assert not heavy, heavy"

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from experiments.results.page import write_report
-from experiments.runner.screenshot import look_at
+from experiments.runner.tracking.screenshot import look_at
 from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
 from mvest.reporting.case.report import write_case_report
 from tests.experiments.results.test_report import publish

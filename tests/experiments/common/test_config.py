@@ -6,7 +6,7 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.common.build import build_filter, build_twin, truth_mesh
 from experiments.common.config import hash_of, register
 from experiments.common.schema import build
-from experiments.runner.request import as_published
+from experiments.runner.jobs.request import as_published
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
 from tests.places import CONF

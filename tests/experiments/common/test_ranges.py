@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from experiments.common.config import Config, plain, register
 from experiments.common.ranges import ANY, RANGES, range_of, require_in_range
 from experiments.common.study import load_settings, study_names
-from experiments.runner.request import Request
+from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION

@@ -13,7 +13,7 @@ from types import ModuleType
 
 from experiments.common.record import Outcome
 from experiments.common.study import Study
-from experiments.runner import worker
+from experiments.runner.execution import worker
 from experiments.studies.twin.settings import Settings
 
 

@@ -58,12 +58,14 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     from experiments import cli
-    from experiments.runner import guard, sync, tracking
+    from experiments.runner.execution import guard
+    from experiments.runner.tracking import sync
+    from experiments.runner.tracking import upload as uploading
 
     def upload(*given, **named):
         client = given[0].client
         client.set_terminated = lambda *_, **__: hold()
-        return tracking.upload(*given, **named)
+        return uploading.upload(*given, **named)
 
     if stage() == "uploading":
         sync.upload = upload

@@ -3,8 +3,8 @@
 import json
 from pathlib import Path
 
-from experiments.runner import comparison
-from experiments.runner.compared import compared
+from experiments.runner.collecting import comparison
+from experiments.runner.jobs.compared import compared
 from mvest.reading.json_file import read_mapping
 
 

@@ -305,8 +305,11 @@ FAILURES = {
     "table": ("pandas.DataFrame.to_csv", RuntimeError("quotes\nare open")),
     "page": ("experiments.studies.twin.report.markdown_rows", KeyError("name")),
     "words": ("experiments.studies.twin.study.text_table", "a\ud800".encode),
-    "results": ("experiments.runner.job._publish", InputError("records are damaged")),
-    "marker": ("experiments.runner.job.mark_done", OSError(28, "No space left on device")),
+    "results": ("experiments.runner.execution.job._publish", InputError("records are damaged")),
+    "marker": (
+        "experiments.runner.execution.job.mark_done",
+        OSError(28, "No space left on device"),
+    ),
 }
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.tracking import open_store
+from experiments.runner.tracking.store import open_store
 from tests.places import ROOT
 from tests.processes import alive, gone, linux, until
 

@@ -15,11 +15,14 @@ from pathlib import Path
 import pytest
 
 from experiments.run import main
-from experiments.runner import guard, limits, progress, sweep
-from experiments.runner.folder import mark_done, write_failure
-from experiments.runner.plan import Plan, PlannedJob
-from experiments.runner.progress import SweepBar
-from experiments.runner.request import Request
+from experiments.runner import sweep
+from experiments.runner.execution import guard
+from experiments.runner.jobs import limits
+from experiments.runner.jobs.folder import mark_done, write_failure
+from experiments.runner.jobs.request import Request
+from experiments.runner.planning import progress
+from experiments.runner.planning.plan import Plan, PlannedJob
+from experiments.runner.planning.progress import SweepBar
 from experiments.studies.twin import study
 from mvest.provenance import sealed, write_json
 from tests.places import ROOT
@@ -445,7 +448,10 @@ def worker_of(folder: Path) -> int:
             try:
                 here = (place / "cwd").readlink() == folder
                 busy = here and (place / "fd" / "1").readlink().name == "log.txt"
-                if busy and b"experiments.runner.worker" in (place / "cmdline").read_bytes():
+                if (
+                    busy
+                    and b"experiments.runner.execution.worker" in (place / "cmdline").read_bytes()
+                ):
                     return int(place.name)
             except OSError:
                 continue

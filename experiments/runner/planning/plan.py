@@ -1,0 +1,302 @@
+"""What a sweep will run: its jobs, which of them are done, and how long the others will take.
+
+The plan on disk is the one queue of a sweep. Whoever works on it, processes of this machine, tasks
+of Slurm or shards under any other scheduler, differs only by the part of its list that it takes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
+
+from experiments.common.record import model_of_values
+from experiments.runner.jobs.compared import compared
+from experiments.runner.jobs.folder import RESULT
+from experiments.runner.jobs.request import Request
+from mvest.errors import InputError
+from mvest.provenance import git_state, write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.text import one_line
+
+__all__ = ["PLAN", "Plan", "PlannedJob"]
+
+PLAN = "plan.json"
+"""File in a sweep's folder with the jobs that it consists of."""
+
+MAX_READ = 500
+"""Results that are read to estimate a time."""
+
+
+class Attempt(NamedTuple):
+    """What an earlier attempt at a job ended with, and the commit that it was computed by."""
+
+    reason: str
+    commit: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedJob:
+    """One job of a sweep.
+
+    Attributes
+    ----------
+    config_hash : str
+    folder : Path
+    overrides : tuple of str
+    values : dict
+        The resolved configuration.
+    attempt : Attempt or None
+        An earlier one.
+    done : bool
+    publish_as : str or None
+        Name of its own record in the results; None where they are not to be touched.
+    """
+
+    config_hash: str
+    folder: Path
+    overrides: tuple[str, ...]
+    values: dict[str, Any]
+    attempt: Attempt | None
+    done: bool
+    publish_as: str | None = None
+
+    @property
+    def request(self) -> Request:
+        """What a worker is asked for."""
+        return Request(self.values, self.config_hash, self.folder, self.publish_as)
+
+    @property
+    def short_hash(self) -> str:
+        """What files call it."""
+        return self.config_hash[:16]
+
+    @property
+    def label(self) -> str:
+        """What sets the job apart, for a line of text."""
+        return ", ".join(_texts(self.values["factors"])) or " ".join(self.overrides)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All jobs of a sweep, in order.
+
+    Attributes
+    ----------
+    name : str
+        Of the configuration.
+    folder : Path
+        Of the sweep.
+    sweep : dict
+        The configuration's ``sweep``, empty for jobs swept on the command line.
+    jobs : tuple of PlannedJob
+    workers : int
+        Jobs that run at a time; 1 where it is not known.
+    publish : bool or None
+        Whether the results take the sweep over; None: they are not to.
+    written_ns : int or None
+        When the plan was written; None: it was not.
+    """
+
+    name: str
+    folder: Path
+    sweep: dict[str, Any]
+    jobs: tuple[PlannedJob, ...]
+    workers: int
+    publish: bool | None = None
+    written_ns: int | None = None
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """A configuration, for what all jobs are told alike: where to write, track and publish."""
+        return self.jobs[0].values
+
+    @property
+    def to_run(self) -> list[PlannedJob]:
+        """Jobs that are missing, have failed, or are to be run again."""
+        return [job for job in self.jobs if job.values["force"] or not job.done]
+
+    def write(self) -> Plan:
+        """Write ``plan.json`` into the sweep's folder; returns the plan as it was written.
+
+        Of the configurations the first one is written whole, of the others what differs.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        created = time.gmtime()
+        first = self.jobs[0].values
+        jobs = [
+            {
+                "hash": job.short_hash,
+                "folder": os.path.relpath(job.folder, self.folder),
+                "name": name,
+                "overrides": list(job.overrides),
+                "factors": job.values["factors"],
+                "row": job.values["row"],
+                "repeats": job.values.get("repeats", 1),
+                "config_hash": job.config_hash,
+                "publish_as": job.publish_as,
+                "values": {k: v for k, v in job.values.items() if v is not first.get(k, job)},
+                "without": [key for key in first if key not in job.values],
+            }
+            for job, name in zip(self.jobs, self.names(), strict=True)
+        ]
+        sweep_id = f"{time.strftime('%Y%m%d-%H%M%S', created)}-{uuid.uuid4().hex[:4]}"
+        try:
+            before = read_mapping(self.folder / PLAN)
+            # The same jobs, perhaps with more of them, are the same sweep that goes on.
+            if {job["hash"] for job in before["jobs"]} <= {job["hash"] for job in jobs}:
+                sweep_id = before["sweep_id"]
+        except (InputError, KeyError, TypeError):
+            # The first sweep here.
+            pass
+        write_json(
+            self.folder / PLAN,
+            {
+                "sweep": self.sweep.get("name", self.name),
+                "size": self.sweep.get("size"),
+                "sweep_id": sweep_id,
+                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", created),
+                "name": self.name,
+                "settings": self.sweep,
+                "publish": self.publish,
+                # Paths in a configuration are relative to where the command was typed.
+                "directory": Path.cwd(),
+                "values": first,
+                "jobs": jobs,
+            },
+        )
+        return replace(self, written_ns=(self.folder / PLAN).stat().st_mtime_ns)
+
+    @classmethod
+    def read(cls, folder: Path) -> Plan:
+        """The plan in a sweep's folder, its jobs as if none had been run.
+
+        The process then works where the sweep was planned.
+
+        Raises
+        ------
+        InputError
+            If there is none, or it was written by another version or on another machine.
+        """
+        place = folder.resolve() / PLAN
+        if not place.is_file():
+            raise InputError(f"no sweep is planned in {folder}")
+        try:
+            data = read_mapping(place)
+            directory = str(data["directory"])
+            if not os.access(directory, os.X_OK):
+                raise InputError(f"directory {one_line(directory, 80)} cannot be entered")
+            os.chdir(directory)
+            first = data["values"]
+            jobs = tuple(
+                PlannedJob(
+                    job["config_hash"],
+                    place.parent / job["folder"],
+                    tuple(job["overrides"]),
+                    {k: v for k, v in first.items() if k not in job["without"]} | job["values"],
+                    None,
+                    False,
+                    job["publish_as"],
+                )
+                for job in data["jobs"]
+            )
+            written = place.stat().st_mtime_ns
+            settings, publish = data["settings"], data["publish"]
+            return cls(data["name"], place.parent, settings, jobs, 1, publish, written)
+        except OSError as error:
+            raise InputError(f"no sweep is planned in {folder}: {error}") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            why = one_line(error, 160)
+            raise InputError(f"{place} is no plan of this version: {why}") from error
+
+    def names(self) -> list[str]:
+        """What sets each job apart from all others, in a few words."""
+        factors = [_texts(job.values["factors"]) for job in self.jobs]
+        shared = set(factors[0]).intersection(*factors)
+        found = [", ".join(text for text in texts if text not in shared) for texts in factors]
+        common: dict[str, set[str]] = {}
+        for name, job in zip(found, self.jobs, strict=True):
+            common[name] = common.get(name, set(job.overrides)).intersection(job.overrides)
+        names = []
+        for name, job in zip(found, self.jobs, strict=True):
+            own = [line for line in job.overrides if line not in common[name]]
+            names.append(", ".join(filter(None, [name, *own])) or str(job.values["row"]))
+        return names
+
+    def summary(self) -> str:
+        """How much is done and how much is left, in one line."""
+        left, done = self.to_run, sum(job.done for job in self.jobs)
+        failed = sum(job.attempt is not None and not job.done for job in self.jobs)
+        size = f" ({self.sweep['size']})" if "size" in self.sweep else ""
+        text = f"{self.name}{size}: {len(self.jobs)} jobs, {done} done, {failed} failed before, "
+        return f"{text}{len(left)} to run{self._stale()}; {self.estimate()}"
+
+    def listing(self) -> str:
+        """Every job with its state, one line each."""
+        run_again = {job.config_hash for job in self.to_run}
+        return "\n".join(
+            f"  {'run ' if job.config_hash in run_again else 'done'}  {job.short_hash}  "
+            f"{job.label}"
+            + (f"  [failed before: {job.attempt.reason}]" if job.attempt and not job.done else "")
+            for job in self.jobs
+        )
+
+    def estimate(self) -> str:
+        """How long the jobs that are left will take, from what finished ones took."""
+        left = self.to_run
+        if not left:
+            return "nothing left"
+        spent = _recorded_seconds(self.folder.parent, self)
+        times = [
+            fmean(spent[kind]) * job.values.get("repeats", 1)
+            for job in left
+            if (kind := json.dumps(asdict(model_of_values(job.values)))) in spent
+        ]
+        if not times:
+            return "time unknown: no job of this kind has finished yet"
+        total = _duration(fmean(times) * len(left) / min(self.workers, len(left)))
+        rest = f" (from {len(times)} of a known kind)" if len(times) < len(left) else ""
+        return f"about {total}, {self.workers} at a time{rest}"
+
+    def _stale(self) -> str:
+        """A remark on results that other code than the present one computed."""
+        present = git_state(Path(__file__).resolve().parent)["sha"]
+        commits = [job.attempt.commit for job in self.jobs if job.done and job.attempt]
+        other = sum(sha != present for sha in commits)
+        return f" ({other} of the done ones by another commit; force=true redoes)" if other else ""
+
+
+def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
+    """Kind of job -> seconds for one seed, from what finished in the folders of all runs."""
+    found: dict[str, list[float]] = {}
+    places = sorted(
+        folders.glob(f"*/*/{RESULT}"), key=lambda place: place.parent.parent != plan.folder
+    )
+    for place in places[:MAX_READ]:
+        try:
+            record = compared(read_mapping(place), str(place))
+        except InputError:
+            # Not a result of this version: it tells no time.
+            continue
+        if record.converged and record.model is not None:
+            seconds = record.seconds_total / len(record.findings.repeats)
+            found.setdefault(json.dumps(asdict(record.model)), []).append(seconds)
+    return found
+
+
+def _texts(factors: Mapping[str, Any]) -> list[str]:
+    return [f"{name}={value}" for name, value in factors.items()]
+
+
+def _duration(seconds: float) -> str:
+    """Seconds, minutes or hours, whichever reads best."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

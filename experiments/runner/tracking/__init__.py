@@ -1,0 +1,1 @@
+"""MLflow: its store, what is uploaded to it, and its pages."""

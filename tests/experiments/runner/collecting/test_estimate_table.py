@@ -1,0 +1,101 @@
+"""The table of all estimates: its rows, its types, its dictionary, and what it refuses."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pandas import read_csv, read_parquet
+
+from experiments.cli import main
+from experiments.common.record import write_record
+from experiments.runner.collecting.estimate_table import COLUMNS, estimate_table, write_estimates
+from mvest.errors import InputError
+from mvest.provenance import sealed, write_json
+from tests.experiments.runner.tracking.test_tracking import swept
+from tests.experiments.studies.made_up import made_up
+
+UNKNOWN = {
+    "name": "E_f.anterior", "label": "E_f anterior", "unit": "MPa", "kind": "modulus",
+    "treatment": "estimated", "prior_mean": 6.0, "prior_std": 3.0, "estimate": 5.0, "std": 0.5,
+    "low": 4.1, "high": 6.2, "truth": 4.0,
+}  # fmt: skip
+NUISANCE = UNKNOWN | {"name": "pressure_scale", "unit": "", "kind": "nuisance", "truth": None}
+
+
+def record(folder: Path, findings: dict | None, **changes) -> Path:
+    folder.mkdir(parents=True)
+    write_record(folder / "result.json", made_up(findings, **changes))
+    return folder
+
+
+def test_a_row_for_each_unknown_of_a_case(tmp_path: Path) -> None:
+    case = {"about": {"simulated": True}, "unknowns": [UNKNOWN, NUISANCE],
+            "verdict": {"trust": "limited"}}  # fmt: skip
+    record(tmp_path / "a", {"estimate": [5.0], "std": [0.5], "case": case},
+           parameters=("E_f.anterior",))  # fmt: skip
+    table = estimate_table(tmp_path)
+    assert list(table.columns) == [column.name for column in COLUMNS]
+    assert list(table["parameter"]) == ["E_f.anterior", "pressure_scale"]
+    first = table.iloc[0]
+    assert (first["unit"], first["kind"], first["low"], first["high"]) == (
+        "MPa", "modulus", 4.1, 6.2,
+    )  # fmt: skip
+    # 5 instead of 4.
+    assert first["relative_error"] == pytest.approx(0.25)
+    assert bool(first["simulated"])
+    assert first["verdict"] == "limited"
+    assert first["record"] == "a/result.json"
+    assert np.isnan(table["relative_error"][1])
+
+
+def test_failures_are_rows_and_other_records_are_none(tmp_path: Path) -> None:
+    record(tmp_path / "died", None, status="failed", reason="it\nbuckled")
+    record(tmp_path / "other", {"gap_mm": 1.0})
+    table = estimate_table(tmp_path)
+    assert set(table["record"]) == {"died/result.json"}
+    assert set(table["status"]) == {"failed"}
+    assert set(table["reason"]) == {"it buckled"}
+    assert table["estimate"].isna().all()
+
+
+def test_a_sweep_stands_for_its_jobs(tmp_path: Path) -> None:
+    record(tmp_path / "sweep" / "jobs" / "a", {"estimate": [1.0, 2.0], "std": [0.1, 0.1]})
+    write_json(tmp_path / "sweep" / "sweep.json", sealed(swept("ab")))
+    table = estimate_table(tmp_path)
+    assert set(table["record"]) == {"sweep/sweep.json"}
+    # Two parameters of two seeds of the first job, and of the lost second one.
+    assert len(table) == 6
+    assert list(table["seed"]) == [1, 1, 2, 2, 1, 1]
+
+
+def test_both_forms_hold_the_same_and_the_dictionary_all_columns(tmp_path: Path, capsys) -> None:
+    write_json(tmp_path / "sweep.json", sealed(swept("ab")))
+    for name in ("t.csv", "t.parquet"):
+        assert main(["table", str(tmp_path), str(tmp_path / name)]) == 0
+    assert str(tmp_path / "t.columns.csv") in capsys.readouterr().out
+    text, binary = read_csv(tmp_path / "t.csv"), read_parquet(tmp_path / "t.parquet")
+    assert list(text.columns) == list(binary.columns)
+    assert text["estimate"].to_numpy() == pytest.approx(binary["estimate"].to_numpy(), nan_ok=True)
+    assert json.loads(text["factors"][0]) == {"noise": 0.0, "R": [0.1, 0.2]}
+    with (tmp_path / "t.columns.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["column"] for row in rows] == list(text.columns)
+    assert all(row["meaning"] and row["type"] for row in rows)
+    # Every number has a unit, its own or that of its row.
+    assert all(row["unit"] for row in rows if row["type"] == "number")
+
+
+def test_what_is_refused(tmp_path: Path, capsys) -> None:
+    with pytest.raises(InputError, match="no record of a run or sweep"):
+        estimate_table(tmp_path)
+    with pytest.raises(InputError, match="there is no such folder"):
+        estimate_table(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"ends with .csv or .parquet"):
+        write_estimates(tmp_path, tmp_path / "t.xlsx")
+    place = record(tmp_path / "a", {"estimate": [1.0, 2.0], "std": [0.1, 0.1]}) / "result.json"
+    place.write_text(place.read_text().replace("1.0", "1.5", 1))
+    assert main(["table", str(tmp_path), str(tmp_path / "t.csv")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not (tmp_path / "t.csv").exists()

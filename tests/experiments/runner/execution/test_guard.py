@@ -1,0 +1,308 @@
+"""A process apart: its death, its time and its memory cost its own job, and it leaves with us."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import experiments.runner.execution.worker as worker_module
+from experiments.common.record import SCHEMA, Outcome, stamp, write_record
+from experiments.runner.execution.guard import WorkerProcess, run_apart
+from experiments.runner.execution.job import FailedRunError
+from experiments.runner.jobs.folder import finished_record, is_done, last_record, lock, mark_done
+from experiments.runner.jobs.request import Request
+from mvest.errors import ConfigurationError
+from mvest.provenance import THREAD_VARIABLES, sealed, write_json
+from tests.places import ROOT
+
+OBEDIENT = """
+import json, os, sys, time
+for line in sys.stdin:
+    request = json.loads(line)
+    order = request["values"]["order"]
+    if "signal" in order: os.kill(os.getpid(), order["signal"])
+    if "exit" in order: os._exit(order["exit"])
+    if "sleep" in order: time.sleep(order["sleep"])
+    said = {"pid": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
+    with open(os.path.join(request["folder"], "said.json"), "w") as file: json.dump(said, file)
+    print(json.dumps({"reason": order.get("reason"), "healthy": order.get("healthy", True)}))
+    sys.stdout.flush()
+"""
+"""A worker that does as it is told."""
+
+
+@pytest.fixture
+def worker():
+    found = WorkerProcess((sys.executable, "-c", OBEDIENT))
+    yield found
+    found.close()
+
+
+def request(folder: Path, **order) -> Request:
+    values = {
+        **{
+            "study": "twin",
+            "name": "a",
+            "title": "b",
+            "row": "c",
+            "table": "d",
+            "paper": None,
+            "seed": 1,
+        },
+        **{"parameters": ["x"], "factors": {"k": 1}, "truth": {"values": [1.0]}},
+        **{"filter": {"initial": [2.0], "mode": "paper"}, "observation": {"noise_mm": 0.0}},
+        **{"mechanics": {"element": "hex18"}, "tracking": {"enabled": False}, "force": False},
+        **{"mesh": {"columns": 1, "rows": 1, "layers": 1, "source": "structured"}},
+        "time_limit_s": order.pop("limit", None),
+        "memory_limit_gb": None,
+        "order": order,
+    }
+    return Request(values, "0" * 64, folder)
+
+
+def converged(asked: Request, config_hash: str = "0" * 64) -> dict:
+    record = stamp(asked.values, config_hash, Outcome(findings={"estimate": [1.0]}), 0.0)
+    return sealed(asdict(record))
+
+
+def said(folder: Path) -> dict:
+    return json.loads((folder / "said.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("order", "reason"),
+    [
+        ({"signal": int(signal.SIGKILL)}, "killed by signal 9 (SIGKILL"),
+        ({"signal": int(signal.SIGSEGV)}, "killed by signal 11 (SIGSEGV)"),
+        ({"exit": 3}, "exit status 3"),
+        ({"exit": 0}, "exit status 0"),
+        ({"sleep": 60, "limit": 0.2}, "time limit of 0.2 s"),
+        ({"reason": "it buckled"}, "it buckled"),
+        ({"reason": "out of memory", "healthy": False}, "out of memory"),
+        ({}, "it left no record"),
+    ],
+)
+def test_whatever_ends_a_job_costs_its_own_row(worker, tmp_path, order, reason):
+    asked = request(tmp_path / "job", **order)
+    record = run_apart(asked, worker)
+    assert record["status"] == "failed"
+    assert reason in record["reason"]
+    assert record["factors"] == {"k": 1}
+    assert record["findings"] is None
+    assert last_record(asked.folder, asked.config_hash) == record
+    assert not is_done(asked.folder)
+    # The next job finds a process at its service.
+    assert worker.run(request(tmp_path / "job")) is None
+
+
+def test_a_healthy_process_is_kept_and_another_is_replaced(worker, tmp_path):
+    def pid(**order) -> int:
+        worker.run(request(tmp_path, **order))
+        return said(tmp_path)["pid"]
+
+    first = pid()
+    assert pid() == first
+    assert pid(reason="inadmissible") == first
+    assert pid(reason="out of memory", healthy=False) == first
+    second = pid()
+    assert second != first
+    os.kill(second, signal.SIGKILL)
+    # Found dead between two jobs, it costs none.
+    while Path(f"/proc/{second}").exists() and worker._program.process.poll() is None:
+        time.sleep(0.01)
+    assert pid() not in (first, second)
+
+
+def test_a_process_without_a_job_leaves_by_itself_and_a_busy_one_does_not(tmp_path):
+    left = tmp_path / "left"
+    leaving = f"\nimport pathlib; time.sleep(0.2); pathlib.Path({str(left)!r}).touch()"
+    for order, stays in (({}, True), ({"sleep": 60}, False)):
+        left.unlink(missing_ok=True)
+        found = WorkerProcess((sys.executable, "-c", OBEDIENT + leaving))
+        found.run(request(tmp_path, **order), time_limit_s=3.0)
+        found.close()
+        assert left.exists() is stays
+
+
+def test_threads_are_capped_whatever_the_user_has_set(worker, tmp_path, monkeypatch):
+    for name in THREAD_VARIABLES:
+        monkeypatch.setenv(name, "7")
+    worker.run(request(tmp_path))
+    assert said(tmp_path)["threads"] == "1"
+
+
+def test_what_is_done_is_not_run_again_unless_forced(worker, tmp_path):
+    asked = request(tmp_path, signal=9)
+    done = converged(asked)
+    write_json(tmp_path / "result.json", done)
+    mark_done(tmp_path)
+    assert run_apart(asked, worker) == done
+    asked.values["force"] = True
+    assert run_apart(asked, worker)["status"] == "failed"
+    assert not is_done(tmp_path)
+
+
+def test_the_mark_of_another_configuration_does_not_count(worker, tmp_path):
+    write_json(tmp_path / "result.json", converged(request(tmp_path), "1" * 64))
+    mark_done(tmp_path)
+    assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
+
+
+def test_a_result_that_was_changed_is_computed_again_with_a_note(worker, tmp_path, capsys):
+    asked = request(tmp_path)
+    done = converged(asked)
+    mark_done(tmp_path)
+    write_json(tmp_path / "result.json", done | {"findings": {"estimate": [6.0, 2.0]}})
+    assert last_record(tmp_path, "0" * 64) is None
+    run_apart(asked, worker)
+    assert said(tmp_path), "the worker was asked"
+    assert capsys.readouterr().err.splitlines() == [
+        f"note: {tmp_path / 'result.json'}: its content is not what was written (SHA-256 does not "
+        "match); it is computed again"
+    ]
+
+
+def test_other_arrays_beside_a_result_are_not_its_own(tmp_path):
+    np.savez(tmp_path / "fields.npz", x=np.ones(3))
+    asked = request(tmp_path)
+    outcome = Outcome(findings=None)
+    write_record(tmp_path / "result.json", stamp(asked.values, asked.config_hash, outcome, 0.0))
+    mark_done(tmp_path)
+    assert last_record(tmp_path, "0" * 64) is not None
+    np.savez(tmp_path / "fields.npz", x=np.zeros(3))
+    assert last_record(tmp_path, "0" * 64) is None
+
+
+def test_a_converged_record_without_its_mark_is_no_result(tmp_path):
+    record = converged(request(tmp_path))
+    write_json(tmp_path / "result.json", record)
+    assert last_record(tmp_path, "0" * 64) is None
+    mark_done(tmp_path)
+    assert last_record(tmp_path, "0" * 64) == record
+    write_json(tmp_path / "result.json", sealed(record | {"schema": SCHEMA - 1}))
+    assert last_record(tmp_path, "0" * 64) is None, "a layout that nothing here reads"
+
+
+@pytest.mark.parametrize("order", [{"signal": int(signal.SIGKILL)}, {"reason": "no space left"}])
+def test_what_was_computed_outlives_whatever_ends_the_job_after_it(worker, tmp_path, order, capsys):
+    asked = request(tmp_path, **order)
+    record = converged(asked)
+    write_json(tmp_path / "result.json", record)
+    assert run_apart(asked, worker) == record
+    assert "the same command writes what is missing" in capsys.readouterr().err
+    assert last_record(tmp_path, "0" * 64) is None, "of which not everything is written"
+    asked.values["force"] = True
+    assert run_apart(asked, worker)["status"] == "failed"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("{}", "[]", "", "null", "NaN", "[" * 9999, '"\\ud800"', '{"schema": 2}'),
+        *('{"schema": 2, "status": "converged"}', '{"schema": 2, "provenance": 3}'),
+        '{"schema": ' + "9" * 5000 + "}",
+    ],
+)
+def test_a_damaged_result_is_none(worker, tmp_path, content):
+    (tmp_path / "result.json").write_text(content)
+    mark_done(tmp_path)
+    assert last_record(tmp_path, "0" * 64) is None
+    assert finished_record(tmp_path, "0" * 64) is None
+    assert run_apart(request(tmp_path, exit=3), worker)["status"] == "failed"
+
+
+def test_a_second_process_waits_for_the_folder(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from experiments.runner.jobs.folder import lock\n"
+        "with lock(Path(sys.argv[1])): print('in', flush=True); sys.stdin.read()"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert other.stdout.readline() == "in\n"
+        with pytest.raises(TimeoutError), lock(tmp_path).acquire(timeout=0.1):
+            pass
+        # The lock falls with whoever held it, however it ended.
+        other.kill()
+        other.communicate()
+        with lock(tmp_path).acquire(timeout=30):
+            pass
+    finally:
+        other.kill()
+        other.communicate()
+
+
+LONG = """
+import os, sys
+from pathlib import Path
+from dataclasses import replace
+from experiments.runner.execution import worker
+from experiments.studies.twin import study
+def run(job):
+    Path("pid").write_text(str(os.getpid()))
+    while True: sum(range(1000))
+study.STUDY = replace(study.STUDY, run=run)
+worker.main()
+"""
+"""The real worker, in the middle of a computation that never ends."""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for the process in /proc")
+def test_a_process_ends_with_the_one_that_started_it(tmp_path):
+    code = (
+        "import sys, json; from pathlib import Path\n"
+        "from experiments.runner.execution.guard import WorkerProcess\n"
+        "from experiments.runner.jobs.request import Request\n"
+        "values = {'study': 'twin', 'factors': {}, 'figures': False}\n"
+        "asked = Request(values, '0' * 64, Path.cwd())\n"
+        "WorkerProcess((sys.executable, 'long.py')).run(asked)"
+    )
+    (tmp_path / "long.py").write_text(LONG)
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    place = tmp_path / "pid"
+    while not (place.exists() and place.read_text()):
+        assert parent.poll() is None
+        time.sleep(0.05)
+    child = Path("/proc") / place.read_text() / "stat"
+    parent.kill()
+    parent.wait()
+    for _ in range(600):
+        if not child.exists() or child.read_text().split(") ")[1][0] == "Z":
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("the process outlived the one that started it")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason", "healthy"),
+    [
+        (ConfigurationError("mesh.rows = 0"), "mesh.rows = 0", True),
+        (FailedRunError("it buckled", Path("a")), None, True),
+        (MemoryError(), "out of memory", False),
+        (OSError(28, "No space left on device", "a/b"), "a/b: No space left on device", True),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero", False),
+    ],
+)
+def test_the_worker_answers_whatever_a_job_raises(tmp_path, monkeypatch, error, reason, healthy):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr(worker_module, "compute", fail)
+    answered = worker_module.answer(request(tmp_path))
+    refused = {"refused": True} if isinstance(error, ConfigurationError) else {}
+    assert answered == {"reason": reason, "healthy": healthy, **refused}

@@ -1,0 +1,249 @@
+"""Shards: other schedulers work on a planned sweep, are killed, and nothing is done twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from experiments import cli
+from experiments.common.estimates import SeedRun
+from experiments.run import main
+from experiments.runner.collecting import collect
+from experiments.runner.execution import guard
+from experiments.runner.execution.drain import Shard
+from experiments.runner.planning.plan import Plan
+from mvest.errors import ConfigurationError, InputError
+from mvest.provenance import sealed
+from tests.places import ROOT
+
+FAKE = str(Path(__file__).parents[1] / "fake_worker.py")
+PLAN = (
+    "sweep=debug", "filter.initial=[5,3]", "sweep.small.seed='range(0,12)'", "detach=true",
+    "tracking.enabled=false",
+)  # fmt: skip
+FOLDER = Path("outputs/sweep_debug")
+
+WORKER = """
+import signal
+import sys
+# Tests run in the background of a shell inherit that an interrupt is ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from experiments import cli
+from experiments.runner.execution import guard
+guard.WORKER = (sys.executable, sys.argv.pop(1))
+sys.exit(cli.main(sys.argv[1:]))
+"""
+"""``mvest`` whose jobs take no time."""
+
+
+@pytest.fixture
+def planned(tmp_path, monkeypatch, capsys):
+    """A sweep of twelve jobs, planned in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(guard, "WORKER", (sys.executable, FAKE))
+    monkeypatch.setattr(sys, "argv", ["experiments.run", *PLAN])
+    assert main() == 0
+    assert "mvest worker outputs/sweep_debug --shard I/N" in capsys.readouterr().out
+    assert not list(FOLDER.glob("*/result.json")), "detached, nothing runs here"
+
+
+def runs() -> list[int]:
+    place = Path("runs")
+    return sorted(map(int, place.read_text().split())) if place.exists() else []
+
+
+def mvest(*arguments: str, **settings) -> subprocess.Popen[str]:
+    places = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    return subprocess.Popen(
+        [sys.executable, "-c", WORKER, FAKE, *arguments],
+        env=os.environ | {"PYTHONPATH": places},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        **settings,
+    )
+
+
+def until(condition) -> None:
+    stop = time.monotonic() + 120.0
+    while not condition():
+        assert time.monotonic() < stop, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the processes in /proc")
+def test_an_interrupted_sweep_stops_at_once_and_records_nothing_of_what_ran(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("wait-4").touch()
+    Path("wait-5").touch()
+    sweep = mvest("run", *PLAN[:3], PLAN[4], "hydra.launcher.n_jobs=2", stdin=subprocess.DEVNULL)
+    until(lambda: {4, 5} <= set(runs()))
+    os.kill(sweep.pid, signal.SIGINT)
+    out, _ = sweep.communicate(timeout=60)
+    assert sweep.returncode == 130, out
+    assert "4 of 12 jobs done, 0 without an estimate, 8 not finished" in out
+    assert runs() == list(range(6)), "nothing begins after that"
+    here = [place for place in Path("/proc").glob("[0-9]*") if is_in(place, tmp_path)]
+    assert not here, "a process was left behind"
+
+    Path("wait-4").unlink()
+    Path("wait-5").unlink()
+    again = mvest("run", *PLAN[:3], PLAN[4], "hydra.launcher.n_jobs=2")
+    out, _ = again.communicate(timeout=120)
+    assert again.returncode == 0, out
+    assert "12 of 12 jobs done (4 before)" in out
+    assert runs() == sorted([*range(12), 4, 5])
+
+
+def is_in(process: Path, folder: Path) -> bool:
+    """Whether a process that lives, not this one, works in a folder."""
+    try:
+        lives = (process / "stat").read_text().rsplit(") ", 1)[1][0] != "Z"
+        return lives and int(process.name) != os.getpid() and (process / "cwd").readlink() == folder
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "2", "2/0", "a/b", "-1/4"])
+def test_what_is_no_shard_is_refused(text):
+    with pytest.raises(ConfigurationError, match="shard"):
+        Shard.parse(text)
+
+
+@pytest.mark.parametrize("count", [1, 3, 5, 12, 20])
+def test_shards_share_a_list_out(count):
+    jobs = tuple(range(12))
+    parts = [Shard(index, count).of(jobs) for index in range(1, count + 1)]
+    assert sorted(job for part in parts for job in part) == list(jobs)
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_a_plan_is_read_as_it_was_written(planned, monkeypatch, tmp_path):
+    read = Plan.read(FOLDER)
+    assert [job.values["seed"] for job in read.jobs] == list(range(12))
+    for job in read.jobs:
+        # What names it follows from its configuration, so all of that came through.
+        assert guard.Request(job.values, job.config_hash, job.folder) == job.request
+        assert job.config_hash[:16] == job.folder.name
+        assert cli.Path.cwd() == tmp_path
+    from experiments.common.config import hash_of
+
+    assert [hash_of(job.values) for job in read.jobs] == [job.config_hash for job in read.jobs]
+    # From wherever it is read, a job finds its files.
+    monkeypatch.chdir("/")
+    assert Plan.read(tmp_path / FOLDER).jobs[0].folder == read.jobs[0].folder
+    assert Path.cwd() == tmp_path
+    with pytest.raises(InputError, match="no sweep is planned in"):
+        Plan.read(tmp_path)
+
+
+def test_two_shards_at_once_do_every_job_once(planned, capsys):
+    shards = [mvest("worker", str(FOLDER), "--shard", f"{k}/2") for k in (1, 2)]
+    said = [shard.communicate(timeout=120)[0] for shard in shards]
+    assert [shard.returncode for shard in shards] == [0, 0], said
+    assert ["6 jobs, 0 without an estimate" in text for text in said] == [True, True]
+    assert runs() == list(range(12))
+    assert cli.main(["collect", str(FOLDER)]) == 0
+    assert "12 of 12 jobs done" in capsys.readouterr().out
+    found = json.loads((FOLDER / "sweep.json").read_text())
+    assert [job["runs"][0]["seed"] for job in found["jobs"]] == list(range(12))
+    assert found["jobs"][7]["runs"][0]["estimate"] == [6.7, 2.0]
+    # Nothing is left for anyone, and what was appended agrees with the records.
+    again = mvest("worker", str(FOLDER), "--shard", "1/1")
+    again.communicate(timeout=120)
+    assert runs() == list(range(12))
+    for path in (FOLDER / collect.ENDS).iterdir():
+        path.unlink()
+    assert cli.main(["collect", str(FOLDER)]) == 0
+    from_records = json.loads((FOLDER / "sweep.json").read_text())
+    assert from_records["jobs"] == found["jobs"]
+
+
+def test_the_same_shard_started_twice_does_no_job_twice(planned):
+    shards = [mvest("worker", str(FOLDER), "--shard", "1/1") for _ in range(2)]
+    said = [shard.communicate(timeout=120)[0] for shard in shards]
+    assert [shard.returncode for shard in shards] == [0, 0], said
+    assert runs() == list(range(12))
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="a worker ends as Linux lets it")
+def test_a_killed_shard_loses_the_job_in_flight_and_a_second_one_finishes(planned, capsys):
+    Path("wait-6").touch()
+    shard = mvest("worker", str(FOLDER), "--shard", "1/2")
+    until(lambda: 6 in runs())
+    os.kill(shard.pid, signal.SIGKILL)
+    shard.communicate()
+    # Half of a line, as if the disk had been slower than the signal.
+    (ends,) = (FOLDER / collect.ENDS).iterdir()
+    with ends.open("a") as file:
+        file.write('\n{"hash": "abc", "sta')
+    done = {path: path.stat().st_mtime_ns for path in FOLDER.glob("*/done")}
+    assert len(done) == 3, "seeds 0, 2 and 4 are kept"
+    assert cli.main(["collect", str(FOLDER)]) == 1
+    assert "3 of 12 jobs done, 0 without an estimate, 9 not finished" in capsys.readouterr().out
+
+    Path("wait-6").unlink()
+    shards = [mvest("worker", str(FOLDER), "--shard", f"{k}/2") for k in (1, 2)]
+    said = [one.communicate(timeout=120)[0] for one in shards]
+    assert [one.returncode for one in shards] == [0, 0], said
+    assert runs() == sorted([*range(12), 6])
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+    assert cli.main(["collect", str(FOLDER)]) == 0
+    assert "12 of 12 jobs done" in capsys.readouterr().out
+
+
+def test_a_job_that_dies_costs_its_shard_nothing_else(planned, capsys):
+    Path("kill-4").touch()
+    assert cli.main(["worker", str(FOLDER)]) == 0
+    assert "12 jobs, 1 without an estimate" in capsys.readouterr().out
+    assert cli.main(["collect", str(FOLDER)]) == 1
+    found = json.loads((FOLDER / "sweep.json").read_text())
+    assert found["jobs"][4]["reason"].startswith("killed by signal 9")
+    assert sum(job["status"] == "converged" for job in found["jobs"]) == 11
+    # The same command runs what failed, and nothing else.
+    assert cli.main(["worker", str(FOLDER)]) == 0
+    assert runs() == sorted([*range(12), 4])
+
+
+def test_jobs_that_are_forced_run_again_once(planned, monkeypatch):
+    assert cli.main(["worker", str(FOLDER)]) == 0
+    monkeypatch.setattr(sys, "argv", ["experiments.run", *PLAN, "force=true"])
+    assert main() == 0
+    for _ in range(2):
+        assert cli.main(["worker", str(FOLDER), "--shard", "1/2"]) == 0
+    assert cli.main(["worker", str(FOLDER), "--shard", "2/2"]) == 0
+    assert runs() == sorted([*range(12)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("worker", "nowhere"), "no sweep is planned in nowhere"),
+        (("worker", str(FOLDER), "--shard", "3/2"), "shard 3/2"),
+        (("collect", "nowhere"), "no sweep is planned in nowhere"),
+    ],
+)
+def test_a_wrong_share_is_one_clear_line(planned, capsys, arguments, words):
+    assert cli.main(list(arguments)) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert words in err
+    assert len(err.splitlines()) == 1
+
+
+def test_an_end_that_was_changed_is_left_aside(tmp_path):
+    run = SeedRun(seed=1, status="converged", reason="", estimate=(6.0,))
+    end = collect.End(hash="abc", status="converged", reason="", runs=(run,))
+    place = tmp_path / collect.ENDS / "one.jsonl"
+    place.parent.mkdir()
+    line = json.dumps(sealed(asdict(end)))
+    place.write_text(f"\n{line}\n")
+    assert collect.read_ends(tmp_path) == {"abc": end}
+    place.write_text(f"\n{line.replace('6.0', '5.9')}\n")
+    assert collect.read_ends(tmp_path) == {}

@@ -1,0 +1,240 @@
+"""The sweeps' configurations: every job of every size composes, and says what sets it apart."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from experiments.common.build import build_filter, build_twin
+from experiments.common.cases.blind import SECRET
+from experiments.common.config import hash_of, register
+from experiments.common.estimates import SeedRun
+from experiments.common.ranges import require_in_range
+from experiments.common.record import Outcome
+from experiments.common.schema import build
+from experiments.common.study import Job
+from experiments.common.virtual_patients import PatientSettings
+from experiments.runner.jobs.limits import TIME_LIMIT_S
+from experiments.runner.planning.compose import expand, grids, make_plan
+from experiments.runner.plugins import register_plugins
+from experiments.studies.twin.findings import Findings
+from experiments.studies.twin.settings import Settings
+from experiments.studies.twin.study import run_twin
+from mvest.errors import MvestError
+from tests.places import CONF
+
+SWEEPS = ("initial_guess", "covariance", "noise", "discrepancy", "filter")
+
+DEBUG = (
+    "mesh=coarse",
+    "observation.columns=24",
+    "observation.rows=7",
+    "mechanics.contact_points.columns=48",
+    "mechanics.contact_points.rows=20",
+    "mechanics.protocol.pressure_mmHg=5.0",
+    "mechanics.protocol.ramp=0.1",
+    "mechanics.protocol.dt=0.05",
+    "mechanics.protocol.end=0.1",
+    "mechanics.protocol.equilibrium=false",
+    "filter.max_iterations=3",
+)
+"""Any job in seconds: the settings of the quick check."""
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+def jobs(name: str, size: str) -> list[list[str]]:
+    config = compose("config", [f"sweep={name}", f"sweep.size={size}"], return_hydra_config=True)
+    assert config.hydra.mode.name == "MULTIRUN"
+    return expand(grids(config), [], GlobalHydra.instance().config_loader())
+
+
+def composed(*overrides: str) -> tuple[str, dict]:
+    config = compose("config", list(overrides))
+    plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return hash_of(config), plain  # type: ignore[return-value]
+
+
+@pytest.fixture
+def configuration():
+    register()
+    register_plugins()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield
+
+
+@pytest.mark.parametrize("size", ["small", "full"])
+@pytest.mark.parametrize("name", SWEEPS)
+def test_every_job_composes_and_is_told_apart(configuration, name: str, size: str) -> None:
+    planned = jobs(name, size)
+    # Composing takes a tenth of a second: the last job and a regular choice of the others.
+    chosen = [*planned[: -1 : len(planned) // 12 + 1], planned[-1]]
+    hashes, seen = set(), {}
+    for overrides in chosen:
+        config_hash, config = composed(f"sweep={name}", f"sweep.size={size}", *overrides)
+        hashes.add(config_hash)
+        assert config["name"] == config["table"] == f"sweep_{name}"
+        assert config["sweep"]["name"] == config["sweep"]["kind"] == name
+        assert config["title"]
+        assert config["publish"]
+        assert config["factors"]
+        assert all(isinstance(v, str | int | float) for v in config["factors"].values())
+        # Jobs that differ in the seed only are one cell of a table.
+        cell = json.dumps([config["factors"], config["mesh"]["columns"]])
+        assert seen.setdefault(cell, config["row"]) == config["row"]
+        build_filter(config["filter"], tuple(config["parameters"]))
+    assert len(hashes) == len(chosen)
+    rows = {json.dumps(overrides) for overrides in planned}
+    assert len(rows) == len(planned)
+
+
+@pytest.mark.parametrize(("name", "step"), [("covariance", 9), ("discrepancy", 4), ("filter", 5)])
+def test_jobs_composed_one_after_another_are_as_each_alone(configuration, name, step) -> None:
+    config = compose("config", [f"sweep={name}"], return_hydra_config=True)
+    loader = GlobalHydra.instance().config_loader()
+    # Groups, values within what a group chose, and values on the command line.
+    said = [f"sweep={name}", "seed=3,1", "filter.initial=[5.0,3.0],[9,6.0]"]
+    plan = make_plan(config, loader, said)
+    assert len({job.config_hash for job in plan.jobs}) == len(plan.jobs)
+    for job in plan.jobs[::step]:
+        config_hash, values = composed(*job.overrides)
+        # Which a job by itself does not have.
+        values["time_limit_s"] = TIME_LIMIT_S
+        assert json.dumps(job.values, sort_keys=True) == json.dumps(values, sort_keys=True)
+        assert job.config_hash == config_hash
+        assert job.folder == Path("outputs") / f"sweep_{name}" / config_hash[:16]
+
+
+@pytest.mark.parametrize("size", ["small", "full"])
+def test_no_seed_is_used_twice_in_a_cell(configuration, size: str) -> None:
+    used: dict[str, list[int]] = {}
+    for overrides in jobs("noise", size):
+        told = dict(line.split("=", 1) for line in overrides)
+        seed, repeats = int(told.pop("seed")), int(told.pop("repeats"))
+        used.setdefault(json.dumps(told), []).extend(range(seed, seed + repeats))
+    assert all(len(seeds) == len(set(seeds)) for seeds in used.values())
+    white = [seeds for cell, seeds in used.items() if '"observation.noise_mm": "0.5"' in cell]
+    assert max(map(len, white)) >= (100 if size == "small" else 200)
+
+
+def test_at_least_36_starts_cover_the_range_in_both_modes(configuration) -> None:
+    _, config = composed("sweep=initial_guess")
+    assert config["observation"]["noise_mm"] == 0.0
+    assert config["truth"]["label"] == "same model"
+    starts: dict[str, list] = {}
+    for overrides in jobs("initial_guess", "small"):
+        told = dict(line.split("=", 1) for line in overrides)
+        start = [float(told[f"filter.initial.{k}"]) for k in range(2)]
+        starts.setdefault(told["filter"], []).append(start)
+    assert set(starts) == {"iterated_log", "paper"}
+    for found in starts.values():
+        assert len(found) >= 36
+        assert np.min(found, axis=0).tolist() == [1.0, 0.5]
+        assert np.max(found, axis=0).tolist() == [12.0, 8.0]
+
+
+def test_the_truth_of_a_discrepancy_is_another_one_and_its_key_too(configuration, tmp_path) -> None:
+    keys = {}
+    for overrides in jobs("discrepancy", "small"):
+        _, config = composed("sweep=discrepancy", *overrides, *DEBUG, f"paths.outputs={tmp_path}")
+        twin = build_twin(config)
+        keys[config["truth"]["label"]] = twin.source.key
+        assert twin.model.settings.tissue["anterior"].reading == "A"
+        assert twin.model.fixed == {}
+        if config["truth"]["label"] == "Poisson reading C":
+            assert {t.reading for t in twin.truth_model.settings.tissue.values()} == {"C"}
+        if config["truth"]["label"] == "pressure +10 %":
+            assert twin.truth_model.fixed == {"pressure_scale": 1.1}
+        if config["truth"]["label"] == "E_f/E_perp +20 %":
+            assert twin.truth_model.settings.tissue["anterior"].ratio == 3.181
+            assert twin.model.settings.tissue["anterior"].ratio == pytest.approx(2.651, abs=1e-3)
+    assert len(keys) == len(set(keys.values())) == 12
+
+
+def ran(overrides: tuple[str, ...], folder: Path) -> Outcome[Findings]:
+    config_hash, config = composed(*overrides)
+    return run_twin(Job(config, Settings(), folder, config_hash))
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_a_job_of_each_sweep_runs(configuration, tmp_path, name: str) -> None:
+    overrides = jobs(name, "small")[-1]
+    settings = (*DEBUG, "repeats=2", f"paths.outputs={tmp_path}", "filter.R=1e-4")
+    job = (f"sweep={name}", *overrides, *settings)
+    outcome = ran(job, tmp_path / "job")
+    assert not (tmp_path / "job").exists(), "nothing is drawn, so nothing is kept to draw"
+    found = outcome.findings
+    json.dumps(asdict(found), allow_nan=False)
+    seed = composed(*job)[1]["seed"]
+    assert [entry.seed for entry in found.repeats] == [seed, seed + 1]
+    for entry in found.repeats:
+        assert np.shape(entry.estimate) == np.shape(entry.bound) == (2,)
+        assert len(entry.iterates) == len(entry.iterate_std) == entry.iterations + 1
+    assert found.first.reason == outcome.reason
+
+
+def test_seeds_give_the_same_alone_and_in_a_batch(configuration, tmp_path) -> None:
+    settings = ("sweep=noise", "observation.noise_mm=0.01", *DEBUG, f"paths.outputs={tmp_path}")
+
+    def run(seed: int, repeats: int) -> list[SeedRun]:
+        outcome = ran((*settings, f"seed={seed}", f"repeats={repeats}"), tmp_path)
+        return [replace(entry, seconds=None) for entry in outcome.findings.repeats]
+
+    together = run(3, 3)
+    assert run(4, 1) == together[1:2]
+    assert run(4, 2) == together[1:]
+    assert len(set(together)) == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("repeats=0", "repeats = 0"),
+        ("truth.reading=Z", "expected one of A, C"),
+        ("+truth.ratio.septal=1.0", "region 'septal'"),
+        ("+truth.fixed.presure_scale=1.1", "truth.fixed: unknown parameter 'presure_scale'"),
+        ("observation.noise_mm=-1", "noise of -1.0 mm"),
+        ("observation.correlated_mm=-1", "noise of -1.0 mm"),
+        ("observation.dropout_mm=-1", "drop-out within -1.0 mm"),
+        ("observation.annulus_offset_mm=[1,2]", "three finite numbers"),
+        ("filter.R_correlation_mm=-1", "correlation length of -1.0 mm"),
+        ("continuation_reach=-1", "reach of a continuation = -1.0"),
+    ],
+)
+def test_a_wrong_setting_is_refused_before_anything_runs(configuration, override, words) -> None:
+    _, config = composed(*DEBUG, override)
+    with pytest.raises(MvestError, match=words):
+        build_twin(config)
+
+
+def test_each_world_changes_what_its_estimator_is_not_given(configuration) -> None:
+    worlds = sorted(path.stem for path in (CONF / "world").glob("*.yaml"))
+    config = compose("config", ["sweep=calibration"], return_hydra_config=True)
+    planned = expand(grids(config), [], GlobalHydra.instance().config_loader())
+    assert len(planned) == 20 * len(worlds)
+    # A seed is a valve in all worlds, so that a sweep that is not at its end has all of them.
+    assert {line.partition("=")[2] for job in planned[: len(worlds)] for line in job
+            if line.startswith("world=")} == set(worlds)  # fmt: skip
+    assert all("seed=2001" in job for job in planned[: len(worlds)])
+    alone = composed("sweep=calibration", "world=reference", "row=r")[1]
+    made, labels = [], set()
+    for world in worlds:
+        config = composed("sweep=calibration", f"world={world}", "row=r")[1]
+        require_in_range(config)
+        made.append(build(PatientSettings, config["patient"]))
+        labels.add(made[-1].world)
+        # All else, and with it what the estimator is given, is the same.
+        assert {key: value for key, value in config.items() if key not in SECRET} == {
+            key: value for key, value in alone.items() if key not in SECRET
+        }
+    simulations = {repr(one.simulation) for one in made}
+    assert len(simulations) == len(labels) == len(worlds)

@@ -1,0 +1,162 @@
+"""What a reader sees: MLflow's pages on a real sweep, in a real browser; and how they end."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from experiments.runner.tracking import dashboard, screenshot
+from mvest.errors import InputError
+from tests.places import ROOT
+from tests.processes import until
+
+pytestmark = pytest.mark.slow
+
+PATHS = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory) -> Path:
+    """A real sweep of four jobs."""
+    place = tmp_path_factory.mktemp("sweep")
+    subprocess.run(
+        [sys.executable, "-m", "experiments.run", "-m", "sweep=debug"],
+        cwd=place, env=os.environ | {"PYTHONPATH": PATHS}, check=True, timeout=600,
+    )  # fmt: skip
+    return place / "outputs"
+
+
+@pytest.fixture(scope="module")
+def shown(outputs) -> str:
+    """The comparison's page as it is drawn."""
+    compared = dashboard.last_comparison(outputs)
+    try:
+        with dashboard.serving(compared.place, outputs, 0, quiet=True) as (address, _):
+            return screenshot.look_at(compared.page(address), "--dump-dom")
+    except InputError as error:
+        if "not installed" in str(error):
+            pytest.skip(str(error))
+        raise
+
+
+def test_the_page_compares_every_run_and_calls_it_by_what_differs(shown, outputs) -> None:
+    jobs = json.loads((outputs / "sweep_debug" / "plan.json").read_text())["jobs"]
+    assert f"Comparing {len(jobs)} Runs" in shown
+    runs = set(dashboard.last_comparison(outputs).runs)
+    assert set(re.findall(r"/runs/([0-9a-f]{32})", shown)) == runs
+    assert len(runs) == len(jobs) == 4
+    for job in jobs:
+        assert job["name"] in shown
+        assert job["hash"] not in job["name"]
+
+
+def test_its_axes_are_settings_that_differ_and_the_error(shown) -> None:
+    axes = re.findall(r'class="axis-title"[^>]*>([^<]*)<', shown)
+    # P0 and the noise are the same in all of them: they have no axis.
+    assert axes == ["initial.anterior", "initial.posterior", "seed", "error.mean"]
+    # Numbers along the axes, not names: a setting that MLflow takes for text has no scale.
+    ticks = [text.replace("−", "-") for text in re.findall(r"<text[^>]*>([\d.−-]+)</text>", shown)]
+    assert {5.0, 4.0, 3.0, 2.0, 1.0} <= {float(tick) for tick in ticks}
+
+
+def test_the_picture_is_made(outputs, shown, tmp_path) -> None:
+    assert screenshot.main([str(outputs), "--to", str(tmp_path / "page.png")]) == 0
+    assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.fixture(scope="module")
+def address(outputs) -> Iterator[str]:
+    """Of a server on the sweep, whatever the login shell says of whom to answer."""
+    place = dashboard.last_comparison(outputs).place
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MLFLOW_SERVER_ALLOWED_HOSTS", "*")
+        patch.setenv("MLFLOW_SERVER_CORS_ALLOWED_ORIGINS", "*")
+        patch.setenv("MLFLOW_SERVER_DISABLE_SECURITY_MIDDLEWARE", "true")
+        with dashboard.serving(place, outputs, 0, quiet=True) as (at, _):
+            yield at
+
+
+def asked(address: str, *, host: str, origin: str = "", path: str = "experiments/search") -> int:
+    """Status of the answer to a request for data, as a page of another origin would send it."""
+    headers = {"Host": host, "Content-Type": "application/json"}
+    headers |= {"Origin": origin} if origin else {}
+    body = b'{"max_results": 1}'
+    wanted = urllib.request.Request(f"{address}/api/2.0/mlflow/{path}", body, headers)
+    try:
+        with urllib.request.urlopen(wanted, timeout=30.0) as answer:
+            return answer.status
+    except urllib.error.HTTPError as refused:
+        return refused.code
+
+
+@pytest.mark.parametrize("name", dashboard.HOSTS)
+def test_its_own_page_is_answered(address, name) -> None:
+    own = f"{name}:{address.rpartition(':')[2]}"
+    assert asked(address, host=own) == 200
+    assert asked(address, host=own, origin="http://" + own) == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["192.168.evil.com", "10.0.0.1", "evil.com", "localhost", "0.0.0.0:{port}"]
+)
+def test_no_name_that_leads_there_is(address, host) -> None:
+    host = host.format(port=address.rpartition(":")[2])
+    assert asked(address, host=host) == 403
+    assert asked(address, host=host, origin="http://" + host) == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.com", "http://192.168.evil.com", "null"])
+def test_no_page_from_elsewhere_changes_anything(address, origin) -> None:
+    assert asked(address, host=address.removeprefix("http://"), origin=origin) == 403
+
+
+def listening(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [(signal.SIGTERM, 0), (signal.SIGINT, 0), (signal.SIGHUP, 0), (signal.SIGKILL, -9)],
+)
+def test_a_stopped_dashboard_leaves_no_server_behind(outputs, tmp_path, end, status) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = ("-m", "experiments.runner.tracking.dashboard", str(outputs), "--port", str(port))
+    with (tmp_path / "said").open("w") as said:
+        shown = subprocess.Popen(
+            [sys.executable, *command],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": PATHS, "BROWSER": "true"},
+            stdout=said,
+            stderr=said,
+        )
+    try:
+        while not listening(port):
+            assert shown.poll() is None, (tmp_path / "said").read_text()
+            time.sleep(0.1)
+        shown.send_signal(end)
+        assert shown.wait(timeout=60) == status
+    finally:
+        shown.kill()
+        shown.wait()
+    until(lambda: not listening(port), 5.0)
+
+
+def test_a_server_that_ends_is_not_waited_for(outputs) -> None:
+    with (
+        pytest.raises(InputError, match="did not start"),
+        dashboard.serving("nonsense://place", outputs, 0, quiet=True),
+    ):
+        pytest.fail("it cannot serve this")

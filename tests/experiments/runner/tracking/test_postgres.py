@@ -1,0 +1,129 @@
+"""PostgreSQL as the tracking store, with eight processes writing at once."""
+
+import json
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from experiments.runner.collecting import comparison
+from experiments.runner.jobs.compared import compared
+from tests.experiments.runner.tracking.test_tracking import make_config, make_job
+from tests.places import ROOT
+
+pytestmark = pytest.mark.slow
+
+PROCESSES, JOBS = 8, 10
+
+UPLOAD = """
+import sys
+import tempfile
+from pathlib import Path
+from experiments.runner.tracking.store import open_store
+from experiments.runner.tracking.upload import upload
+uri, outputs, *jobs = sys.argv[1:]
+store = open_store(uri, Path(outputs), "debug")
+for job in jobs:
+    upload(store, Path(job), "sweep-1")
+"""
+
+
+def program(name: str) -> str:
+    """PostgreSQL's own programs are seldom on the path."""
+    places = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    found = shutil.which(name, path=os.pathsep.join([os.environ["PATH"], *map(str, places)]))
+    if found is None:
+        pytest.skip(f"PostgreSQL's {name} is not installed (Debian: apt install postgresql)")
+    return found
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder that may be given to another account: pytest's own are closed to all others."""
+    with tempfile.TemporaryDirectory(prefix="mvest-postgres-") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def server(place) -> Iterator[str]:
+    """A throw-away cluster on the loopback address: its address for MLflow."""
+    pytest.importorskip("psycopg", reason="the extra postgres is not installed")
+    initdb, pg_ctl = program("initdb"), program("pg_ctl")
+    account: dict = {}
+    if os.getuid() == 0:
+        # The server refuses to run as root.
+        try:
+            user = pwd.getpwnam("postgres")
+        except KeyError:
+            pytest.skip("PostgreSQL runs under an account of its own, and there is no postgres")
+        os.chown(place, user.pw_uid, user.pw_gid)
+        account = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    data, options = place / "data", f"-p {port} -k {place} -c listen_addresses=127.0.0.1"
+
+    def run(*command: str) -> None:
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=place, **account)
+
+    run(initdb, "-D", str(data), "-U", "mlflow", "-A", "trust", "-E", "UTF8", "--no-sync")
+    run(pg_ctl, "-D", str(data), "-o", options, "-l", str(place / "log"), "-w", "start")
+    try:
+        yield f"postgresql+psycopg://mlflow@127.0.0.1:{port}/postgres"
+    finally:
+        run(pg_ctl, "-D", str(data), "-m", "immediate", "stop")
+
+
+def test_eight_processes_lose_nothing(server, tmp_path) -> None:
+    config = make_config(tmp_path, tracking={"enabled": True, "uri": server})
+    jobs = [
+        make_job(tmp_path, f"p{process}j{job}", config)
+        for process in range(PROCESSES)
+        for job in range(JOBS)
+    ]
+    # Also the tables are made by whoever comes first, with the others waiting.
+    uploads = [
+        subprocess.Popen(
+            [sys.executable, "-c", UPLOAD, server, str(tmp_path), *map(str, jobs[k::PROCESSES])],
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for k in range(PROCESSES)
+    ]
+    said = [upload.communicate(timeout=300)[1] for upload in uploads]
+    assert [upload.returncode for upload in uploads] == [0] * PROCESSES, said
+
+    import psycopg
+
+    address = server.replace("+psycopg", "")
+    with psycopg.connect(address) as connection:
+
+        def count(query: str) -> int:
+            return connection.execute(query).fetchone()[0]
+
+        runs = PROCESSES * JOBS
+        assert count("select count(*) from experiments where name = 'debug'") == 1
+        assert count("select count(*) from runs where status = 'FINISHED'") == runs
+        found = connection.execute("select value from tags where key = 'folder'").fetchall()
+        assert sorted(name for (name,) in found) == sorted(job.name for job in jobs)
+        config, data = (
+            json.loads((jobs[0] / name).read_text()) for name in ("config.json", "result.json")
+        )
+        record = compared(data, "the first job")
+        for table, column, expected in (
+            ("params", "run_uuid", comparison.parameters(config, record.parameters)),
+            ("metrics", "run_uuid", comparison.metrics(record)),
+            ("inputs", "destination_id", comparison.inputs(config, record)),
+        ):
+            each = connection.execute(f"select count(*) from {table} group by {column}").fetchall()
+            assert [number for (number,) in each] == [len(expected)] * runs, table
+    receipts = {json.loads((job / "tracked.json").read_text())["run_id"] for job in jobs}
+    assert len(receipts) == runs
