@@ -21,6 +21,7 @@ __all__ = [
     "page",
     "parameter_label",
     "percent",
+    "provenance_of",
     "write_drawn",
     "write_each",
     "write_report",
@@ -84,6 +85,12 @@ def cautions(records: Sequence[Record[Any]]) -> list[str]:
         text if len(named) == len(records) else f"{'; '.join(named)}: {text}"
         for text, named in rows.items()
     ]
+
+
+def provenance_of(records: Sequence[Record[Any]]) -> str:
+    """Where the first of several records came from, and how many there are besides."""
+    lines = sorted({record.line for record in records})
+    return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
 
 
 def _saved(base: Path, figure: Figure, line: str) -> list[Path]:

@@ -36,6 +36,7 @@ from mvest.reporting.case.findings import (
     ModuliAlone,
     ModulusRow,
     Narrower,
+    PosteriorCheck,
     UnknownRow,
     WhitenessTest,
 )
@@ -191,6 +192,7 @@ def _case_findings(
         verdict=judge(
             replace(indications_of(fit, gate), unlike=image_step.unlike if image_step else "")
         ),
+        posterior=_posterior(result),
     )
 
 
@@ -244,6 +246,14 @@ def fields_of(fit: Personalised) -> dict[str, Any]:
         | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
         | {name: values.astype(np.float32) for name, values in reals.items()}
     )
+
+
+def _posterior(result: StudyResult) -> PosteriorCheck | None:
+    check = None if result.filtered is None else result.filtered.check
+    if check is None:
+        return None
+    value = check.value if np.isfinite(check.value) else None
+    return PosteriorCheck(check.compared, value, check.limit)
 
 
 def _about(case: ValveCase) -> About:

@@ -24,8 +24,8 @@ from experiments.common.cases.skill import (
     share_bounds,
 )
 from experiments.common.record import Record
+from experiments.common.report import provenance_of
 from experiments.common.tables import write_table
-from experiments.studies.patient.tables import provenance_of
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.case.findings import UnknownRow
 from mvest.reporting.figures import save_figure_with

@@ -19,11 +19,10 @@ from experiments.common.cases.skill import (
     skill_words,
 )
 from experiments.common.record import Record
-from experiments.common.report import cautions
+from experiments.common.report import cautions, provenance_of
 from experiments.common.tables import write_table
 from experiments.studies.patient.tables import (
     distance_words,
-    provenance_of,
     table3,
     verdict_word,
     without_estimate,

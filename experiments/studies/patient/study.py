@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import template_of
-from experiments.common.build import mechanics_of
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.findings import Findings, Revealed
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.cases.report import case_text, write_case_run
 from experiments.common.expectation import expect_own
 from experiments.common.gate import gate_of
+from experiments.common.patient_store import PatientPlace, make_patient
 from experiments.common.record import NOT_GATED, Outcome
 from experiments.common.schema import build
-from experiments.common.store import Store
 from experiments.common.study import Job, Section, Study
-from experiments.common.virtual_patients import (
-    PatientSettings,
-    draw_patient_values,
-    first_that_closes,
-    require_patient,
-)
+from experiments.common.virtual_patients import PatientSettings
 from experiments.studies.patient.calibration import calibration_answer
 from experiments.studies.patient.report import (
     arrays_of_patient,
@@ -37,31 +30,14 @@ from experiments.studies.patient.report import (
 )
 from experiments.studies.patient.settings import Settings
 from experiments.studies.patient.tables import PATIENTS
-from mvest.cases.writer import write_case
-from mvest.errors import InputError
-from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.findings import FrameDistances, ModuliAlone, ToTruth, UnknownRow
 from mvest.reporting.findings import Spread
-from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.typing import FloatArray
 
-__all__ = ["STUDY", "PatientPlace", "make_patient", "reveal", "run_patient"]
+__all__ = ["STUDY", "reveal", "run_patient"]
 
 Values = Mapping[str, Any]
-
-HIDDEN, POSITIONS = "hidden.json", "positions.npz"
-MAX_DRAWS = 5
-"""Anatomies that are drawn, one after another, until one closes."""
-
-
-@dataclass(frozen=True, slots=True)
-class PatientPlace:
-    """Where a virtual patient lies: the folder that an estimator is given, and the sealed one."""
-
-    case: Path
-    hidden: Path
 
 
 def run_patient(job: Job[Settings]) -> Outcome[Findings]:
@@ -72,63 +48,6 @@ def run_patient(job: Job[Settings]) -> Outcome[Findings]:
     gate = NOT_GATED if patient.variation else gate_of(job.values)
     estimated = estimate_blindly(job.values, job.folder, place.case, place.hidden, gate)
     return reveal(estimated, place, job.folder / FIELDS, patient, job.values["seed"])
-
-
-def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
-    """Simulate the configured patient, unless that was done: where it lies.
-
-    Raises
-    ------
-    MvestError
-        If the configuration is inadmissible or the valve does not close.
-    """
-    patient = require_patient(patient)
-    described = {
-        "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
-        "valve": values["valve"],
-        "mechanics": values["mechanics"],
-        "seed": values["seed"],
-    }
-    store = Store(values["paths"]["outputs"])
-    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
-
-    def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
-        _write(root, *made, described)
-
-    return entry.get_or_make(lambda: _simulate(values, patient), write)
-
-
-def _place(root: Path) -> PatientPlace:
-    place = PatientPlace(root / "case", root / "hidden")
-    read_mapping(place.hidden / HIDDEN)
-    return place
-
-
-def _simulate(values: Values, patient: PatientSettings) -> tuple[VirtualPatient, int]:
-    """A patient, and how many anatomies were drawn for it."""
-    rng = np.random.default_rng(values["seed"])
-    hidden = draw_patient_values(patient, rng)
-    mechanics = mechanics_of(values)
-    return first_that_closes(
-        template_of(values),
-        patient.variation,
-        MAX_DRAWS if patient.variation else 1,
-        rng,
-        lambda drawn: simulate_patient(
-            patient.name, patient.description, drawn, hidden, patient.simulation, mechanics, rng
-        ),
-    )
-
-
-def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> None:
-    folder = root / "hidden"
-    folder.mkdir(parents=True)
-    write_case(root / "case", made.case)
-    arrays: dict[str, Any] = dict(made.hidden.positions)
-    np.savez_compressed(folder / POSITIONS, **arrays)
-    values = dict(made.hidden.values)
-    about = {"values": values, "made_from": dict(described), "anatomies_drawn": draws}
-    write_json(folder / HIDDEN, about)
 
 
 def reveal(
@@ -147,11 +66,7 @@ def reveal(
     InputError
         If the patient hides nothing.
     """
-    try:
-        hidden = read_mapping(place.hidden / HIDDEN)
-        positions = read_npz(place.hidden / POSITIONS)
-    except InputError as error:
-        raise InputError(f"{place.hidden} does not hold what a patient hides: {error}") from error
+    hidden, positions = place.truth()
     truth, case = hidden["values"], estimated.findings.case
     moduli = []
     for modulus in case.moduli:

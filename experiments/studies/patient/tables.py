@@ -20,7 +20,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import baselines, prior_alone, skill_words
 from experiments.common.record import Record
-from experiments.common.report import cautions
+from experiments.common.report import cautions, provenance_of
 from experiments.common.tables import write_table
 from mvest.errors import InputError
 from mvest.problem.verdict import NONE
@@ -37,7 +37,6 @@ __all__ = [
     "POPULATION",
     "distance_words",
     "in_order",
-    "provenance_of",
     "table2",
     "table3",
     "verdict_word",
@@ -394,9 +393,3 @@ def _patient(record: Record[Findings]) -> str:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def provenance_of(records: Sequence[Record[Findings]]) -> str:
-    """Where the first of several records came from, and how many there are besides."""
-    lines = sorted({record.line for record in records})
-    return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")

@@ -14,7 +14,8 @@ from mvest.problem.verdict import NONE, Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
 __all__ = ["About", "CaseFindings", "Cost", "ErrorRow", "FrameDistances", "ImageErrors",
-           "ImageStep", "ModuliAlone", "ModulusRow", "Narrower", "Picture", "ToTruth",
+           "ImageStep", "ModuliAlone", "ModulusRow", "Narrower", "Picture", "PosteriorCheck",
+           "ToTruth",
            "UnknownRow", "VolumeAbout", "WhitenessTest"]  # fmt: skip
 
 MODULUS, NUISANCE = "modulus", "nuisance"
@@ -157,6 +158,24 @@ class WhitenessTest:
 
 
 @dataclass(frozen=True, slots=True)
+class PosteriorCheck:
+    """How far two things differ that are alike in a Gaussian posterior, and how far they may.
+
+    See `mvest.estimation.check`; of several the one that is furthest beyond its limit. The value is
+    None where it could not be told.
+    """
+
+    compared: str
+    value: float | None
+    limit: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the interval means what it says."""
+        return self.value is not None and self.value <= self.limit
+
+
+@dataclass(frozen=True, slots=True)
 class Narrower:
     """What knowing something more would do to the SD of the logarithm of a modulus."""
 
@@ -255,6 +274,8 @@ class CaseFindings:
         Largest distance of the fitted closed valve from the one closed anew.
     verdict : Verdict or None
         How far the estimate may be believed; None where it was not judged.
+    posterior : PosteriorCheck or None
+        None where it was not checked.
     """
 
     about: About
@@ -284,6 +305,7 @@ class CaseFindings:
     settings: Mapping[str, Any] = field(default_factory=dict)
     image_step: ImageStep | None = None
     verdict: Verdict | None = None
+    posterior: PosteriorCheck | None = None
 
     @property
     def title(self) -> str:

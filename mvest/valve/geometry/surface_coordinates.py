@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
+from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import directed_edges, unit_rows
 
 __all__ = [
@@ -45,6 +46,8 @@ MIN_WEIGHT = 0.05
 0.58."""
 MAX_ROUNDS = 10
 """How often they are raised, each time round the triangles that still fold over."""
+OUTSIDE = 0.01
+"""Of the way around, beyond which a point is outside the surface and not a rounding error of s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,32 +347,36 @@ def _perpendicular_to_gradient(
 def _locate_in_plane(
     corners: FloatArray, points: FloatArray, period: float
 ) -> tuple[IntArray, FloatArray]:
-    centre = corners.mean(axis=1)
-    shift = np.array([period, 0.0])
-    tree = cKDTree(np.vstack([centre - shift, centre, centre + shift]))
-    m = len(centre)
+    """Triangle ``(n,)`` and weights ``(n, 3)`` of points in a strip that repeats itself.
+
+    Nearly always one of the nearest dozen triangles has the point; long ones beside small ones may
+    be farther away, and the closest is then found among all.
+    """
+    m, shift = len(corners), np.array([period, 0.0])
+    repeated = np.concatenate([corners - shift, corners, corners + shift])
     triangle = np.zeros(len(points), dtype=np.int64)
     weights = np.zeros((len(points), 3))
     best = np.full(len(points), -np.inf)
-    for k in (12, min(60, 3 * m)):
-        todo = np.flatnonzero(best < -1e-9)
-        if not todo.size:
-            break
-        _, candidates = tree.query(points[todo], k=min(k, 3 * m))
-        for column in np.atleast_2d(candidates).T:
-            index = column % m
-            offset = (column // m - 1)[:, None] * shift
-            w = _barycentric(corners[index] + offset[:, None, :], points[todo])
-            worst = w.min(axis=1)
-            better = worst > best[todo]
-            rows = todo[better]
-            best[rows], triangle[rows], weights[rows] = worst[better], index[better], w[better]
-    if np.any(best < -0.5):
-        raise InputError(
-            f"{np.sum(best < -0.5)} points lie outside the surface (coordinate s must be in [0, 1])"
+    _, candidates = cKDTree(repeated.mean(axis=1)).query(points, k=min(12, 3 * m))
+    for column in np.atleast_2d(candidates).T:
+        w = _barycentric(repeated[column], points)
+        worst = w.min(axis=1)
+        better = worst > best
+        best[better], triangle[better], weights[better] = worst[better], column[better], w[better]
+    todo = np.flatnonzero(best < -1e-9)
+    if todo.size:
+        flat = np.pad(repeated.reshape(-1, 2), ((0, 0), (0, 1)))
+        found = closest_points(
+            np.pad(points[todo], ((0, 0), (0, 1))), flat, np.arange(9 * m).reshape(-1, 3)
         )
+        if np.any(found.distance > OUTSIDE * period):
+            raise InputError(
+                f"{np.sum(found.distance > OUTSIDE * period)} points lie outside the surface "
+                "(coordinate s must be in [0, 1])"
+            )
+        triangle[todo], weights[todo] = found.triangle, found.barycentric
     weights = np.maximum(weights, 0.0)
-    return triangle, weights / weights.sum(axis=1, keepdims=True)
+    return triangle % m, weights / weights.sum(axis=1, keepdims=True)
 
 
 def _barycentric(corner: FloatArray, point: FloatArray) -> FloatArray:

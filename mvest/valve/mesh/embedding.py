@@ -139,11 +139,18 @@ def embed(
     size = np.linalg.norm(np.ptp(mesh.nodes[mesh.elements[host]], axis=1), axis=1)
     distance = np.maximum(best, 0.0) * size / 2
     far = np.flatnonzero(np.isfinite(distance) & (distance > tolerance))
-    if far.size:
-        # Elements are thin: across the leaflet the same violation is less of a distance.
-        nearest = reference.shape(reference.inside(local[far]))
-        at = np.einsum("ka,kai->ki", nearest, mesh.nodes[mesh.elements[host[far]]])
-        distance[far] = np.minimum(distance[far], np.linalg.norm(points[far] - at, axis=1))
+    for c in range(n_try if far.size else 0):
+        # Elements are thin: a point beyond a face is nearer to its element than the same violation
+        # beyond an end would be.
+        e = near[far, c]
+        xi, error = _invert(mesh, e, points[far])
+        at = np.einsum(
+            "ka,kai->ki", reference.shape(reference.inside(xi)), mesh.nodes[mesh.elements[e]]
+        )
+        away = np.where(error < 1e-8, np.linalg.norm(points[far] - at, axis=1), np.inf)
+        better = away < distance[far]
+        nearer = far[better]
+        distance[nearer], host[nearer], local[nearer] = away[better], e[better], xi[better]
     if not np.all(distance <= tolerance):
         i = int(np.argmax(distance))
         raise GeometryError(

@@ -16,6 +16,7 @@ HAVING = {
     "patient": "patients",
     "imaging": "imaging",
     "world": "calibration",
+    "door": "surfaces",
 }
 """Group that only some studies have -> an experiment of one that has it."""
 

@@ -37,6 +37,7 @@ HAVING = {
     "patient": "patients",
     "imaging": "imaging",
     "world": "calibration",
+    "door": "surfaces",
 }
 
 EXAMPLE = {"REGION": "anterior", "FAMILY or tipN": "tip1", "REGION.K": "anterior.3", "": ""}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from experiments.common import patient_store
 from experiments.common.cases.blind import SECRET, read_estimate
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import PersonalSettings
@@ -49,7 +50,7 @@ def settings_in(values):
 
 
 def make_patient(values):
-    return patient.make_patient(values, settings_in(values))
+    return patient_store.make_patient(values, settings_in(values))
 
 
 def run(values, folder):
@@ -73,7 +74,7 @@ def simulated(monkeypatch):
         calls.append(arguments)
         return made_up_patient(*arguments)
 
-    monkeypatch.setattr(patient, "simulate_patient", simulate)
+    monkeypatch.setattr(patient_store, "simulate_patient", simulate)
     return calls
 
 
@@ -152,7 +153,7 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
             raise GeometryError("does not close")
         return made_up_patient(name, description, template, *rest)
 
-    monkeypatch.setattr(patient, "simulate_patient", simulate)
+    monkeypatch.setattr(patient_store, "simulate_patient", simulate)
     place = make_patient(config_of(tmp_path, "patient=drawn", "seed=7"))
     assert len(set(map(repr, shapes))) == 3
     assert json.loads((place.hidden / "hidden.json").read_text())["anatomies_drawn"] == 3
@@ -160,7 +161,7 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
     for overrides, tries in (("patient=drawn", 5), ("patient=prolapse", 1)):
         shapes.clear()
         monkeypatch.setattr(
-            patient,
+            patient_store,
             "simulate_patient",
             lambda *a: shapes.append(a) or (_ for _ in ()).throw(GeometryError("does not close")),
         )
@@ -171,7 +172,7 @@ def test_anatomies_are_drawn_until_one_closes(tmp_path, monkeypatch):
 
 def test_a_study_of_patients_needs_one():
     with pytest.raises(ConfigurationError, match="patient is not given"):
-        patient.make_patient({}, None)
+        patient_store.make_patient({}, None)
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(

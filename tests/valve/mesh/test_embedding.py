@@ -140,6 +140,20 @@ def test_the_distance_from_a_thin_element_is_one_across_it(name):
         embed(mesh, above, tolerance=0.35)
 
 
+def test_a_point_beyond_a_thin_element_is_its_own_and_not_the_neighbours():
+    # Two cells of 10 x 10 x 0.4 mm, of which the second gets thinner from where they meet.
+    nodes, elements = box("hex18", (2, 1, 1), (20.0, 10.0, 0.4))
+    nodes[:, 2] = (nodes[:, 2] - 0.2) * np.where(nodes[:, 0] > 10, 1 - 0.08 * (nodes[:, 0] - 10), 1)
+    mesh = SolidMesh(
+        nodes, elements, "hex18", np.zeros(2, dtype=int), ("tissue",),
+        np.tile([1.0, 0.0, 0.0], (len(nodes), 1)), np.zeros((0, 9), dtype=int),
+    )  # fmt: skip
+    # 0.1 mm above the first cell, half a cell beyond its face; 2 mm before the second, which is
+    # less of one.
+    point = embed(mesh, np.array([[8.0, 5.0, 0.3]]))
+    assert point.host.tolist() == [0]
+
+
 @pytest.mark.parametrize(
     ("points", "message"),
     [

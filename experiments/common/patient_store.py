@@ -1,0 +1,115 @@
+"""Virtual patients on disk: simulated once, the case apart from what it hides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.common.anatomy import template_of
+from experiments.common.build import mechanics_of
+from experiments.common.store import Store
+from experiments.common.virtual_patients import (
+    PatientSettings,
+    draw_patient_values,
+    first_that_closes,
+    require_patient,
+)
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reading.npz import read_npz
+from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
+from mvest.typing import FloatArray
+
+__all__ = ["PatientPlace", "make_patient"]
+
+Values = Mapping[str, Any]
+
+HIDDEN, POSITIONS = "hidden.json", "positions.npz"
+MAX_DRAWS = 5
+"""Anatomies that are drawn, one after another, until one closes."""
+
+
+@dataclass(frozen=True, slots=True)
+class PatientPlace:
+    """Where a virtual patient lies: the folder that an estimator is given, and the sealed one."""
+
+    case: Path
+    hidden: Path
+
+    def truth(self) -> tuple[dict[str, Any], dict[str, FloatArray]]:
+        """What the case does not say, and frame -> ``(n, 3)`` mm of where its vertices truly were.
+
+        Raises
+        ------
+        InputError
+            If the patient hides nothing.
+        """
+        try:
+            return read_mapping(self.hidden / HIDDEN), read_npz(self.hidden / POSITIONS)
+        except InputError as error:
+            raise InputError(
+                f"{self.hidden} does not hold what a patient hides: {error}"
+            ) from error
+
+
+def make_patient(values: Values, patient: PatientSettings | None) -> PatientPlace:
+    """Simulate the configured patient, unless that was done: where it lies.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or the valve does not close.
+    """
+    patient = require_patient(patient)
+    described = {
+        "patient": {k: v for k, v in values["patient"].items() if not k.startswith("paper")},
+        "valve": values["valve"],
+        "mechanics": values["mechanics"],
+        "seed": values["seed"],
+    }
+    store = Store(values["paths"]["outputs"])
+    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+
+    def write(root: Path, made: tuple[VirtualPatient, int]) -> None:
+        _write(root, *made, described)
+
+    return entry.get_or_make(lambda: _simulate(values, patient), write)
+
+
+def _place(root: Path) -> PatientPlace:
+    place = PatientPlace(root / "case", root / "hidden")
+    read_mapping(place.hidden / HIDDEN)
+    return place
+
+
+def _simulate(values: Values, patient: PatientSettings) -> tuple[VirtualPatient, int]:
+    """A patient, and how many anatomies were drawn for it."""
+    rng = np.random.default_rng(values["seed"])
+    hidden = draw_patient_values(patient, rng)
+    mechanics = mechanics_of(values)
+    return first_that_closes(
+        template_of(values),
+        patient.variation,
+        MAX_DRAWS if patient.variation else 1,
+        rng,
+        lambda drawn: simulate_patient(
+            patient.name, patient.description, drawn, hidden, patient.simulation, mechanics, rng
+        ),
+    )
+
+
+def _write(root: Path, made: VirtualPatient, draws: int, described: Values) -> None:
+    folder = root / "hidden"
+    folder.mkdir(parents=True)
+    write_case(root / "case", made.case)
+    arrays: dict[str, Any] = dict(made.hidden.positions)
+    np.savez_compressed(folder / POSITIONS, **arrays)
+    values = dict(made.hidden.values)
+    about = {"values": values, "made_from": dict(described), "anatomies_drawn": draws}
+    write_json(folder / HIDDEN, about)

@@ -1,0 +1,1 @@
+"""What moduli come from surfaces as other programs and segmentations bring them."""
