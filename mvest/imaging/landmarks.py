@@ -11,7 +11,14 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = ["ANNULUS_LABELS", "LANDMARKS", "landmark_vertices", "landmarks", "slicerheart_labels"]
+__all__ = [
+    "ANNULUS_LABELS",
+    "LANDMARKS",
+    "TIPS",
+    "landmark_vertices",
+    "landmarks",
+    "slicerheart_labels",
+]
 
 _ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
     "commissure_0": (0.0, 0),
@@ -25,11 +32,12 @@ _ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
     "annulus_225": (225.0, 0),
     "annulus_315": (315.0, 0),
 }
-_TIPS: Final = ("tip_0", "tip_180")
+TIPS: Final = ("tip_0", "tip_180")
+"""Names of the papillary tips."""
 
 ANNULUS_LABELS: Final = "AnnulusLabelsMarkup"
 """What SlicerHeart calls its list of labelled points."""
-LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *_TIPS)
+LANDMARKS: Final[tuple[str, ...]] = (*_ON_LEAFLETS, *TIPS)
 """Every name, in the order of `landmarks`: those on the leaflets, then the papillary tips."""
 
 
@@ -65,7 +73,7 @@ def landmarks(sequence: ValveSequence, frame: int) -> dict[str, FloatArray]:
         raise InputError(f"landmarks: frame {frame}, expected 0 to {len(sequence.times) - 1}")
     vertices = sequence.vertices[frame]
     positions = {name: vertices[v].copy() for name, v in landmark_vertices(sequence.layout).items()}
-    for name, tip in zip(_TIPS, sequence.tips[frame], strict=True):
+    for name, tip in zip(TIPS, sequence.tips[frame], strict=True):
         positions[name] = tip.copy()
     return positions
 

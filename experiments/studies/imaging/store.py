@@ -33,6 +33,7 @@ from mvest.imaging.learning.training import (
     Draft,
     Samples,
     draft_of,
+    samples_of,
     train_stage,
     volume_samples,
 )
@@ -267,14 +268,7 @@ class ImagingStore:
             began, cpu_s = time.monotonic(), 0.0
             boosters: dict[str, Boosters] = {}
             calls = (
-                (
-                    name,
-                    np.concatenate([part[name][0] for part in samples]),
-                    np.concatenate([part[name][1] for part in samples]),
-                    self.training,
-                    self.seed,
-                )
-                for name in STAGES
+                (name, *samples_of(name, samples), self.training, self.seed) for name in STAGES
             )
             with PartBar(f"detectors from {volumes} volumes", len(STAGES), "stage") as bar:
                 grown = in_processes(train_stage, calls, self.processes)

@@ -18,7 +18,7 @@ __all__ = ["samples_in_world", "valve_axes", "without_mean_error"]
 
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
-    """Axes of the valve in a frame, the columns of ``(3, 3)``: those that errors are measured in."""
+    """Axes of the valve in a frame, the columns of ``(3, 3)``, in which errors are measured."""
     pose = pose_of(sequence.vertices[frame], sequence.tips[frame], sequence.layout)
     return np.asarray(pose.rotation[0])
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.files import write_atomically
+from mvest.imaging.landmarks import TIPS
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
@@ -46,8 +47,6 @@ is half of that in an annulus of 800 mm².
 
 CLOSED_ONLY = ("tenting_", "prolapse_", "billow_")
 """What is defined for closed leaflets only, by the beginning of its name."""
-
-TIPS = ("tip_0", "tip_180")
 
 BOUNDS = {"low": "lower bound", "high": "upper bound"}
 """Endings of names of what bounds a measure."""

@@ -53,6 +53,7 @@ __all__ = [
     "draft_of",
     "draw_samples",
     "render_frame",
+    "samples_of",
     "train_model",
     "train_stage",
     "volume_samples",
@@ -133,10 +134,7 @@ def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) 
     """The search that is learned from the first volumes alone."""
 
     def grown(name: str) -> Boosters:
-        x = np.concatenate([part[name][0] for part in samples])
-        return train_stage(
-            name, x, np.concatenate([part[name][1] for part in samples]), settings, seed
-        )
+        return train_stage(name, *samples_of(name, samples), settings, seed)
 
     refine = tuple(grown(f"pose_refine_{k}") for k in range(len(REFINEMENTS)))
     return Draft(
@@ -252,6 +250,14 @@ def volume_samples(
     return draw_samples(seen.frame, true, shape, settings.samples, rng, draft)
 
 
+def samples_of(
+    name: str, parts: Sequence[Samples]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Samples of one stage ``(P, F)``, ``(P, outputs)``, those of all volumes one after another."""
+    x, y = zip(*(part[name] for part in parts), strict=True)
+    return np.concatenate(x), np.concatenate(y)
+
+
 def train_stage(
     name: str,
     x: NDArray[np.float32],
@@ -259,13 +265,14 @@ def train_stage(
     settings: TrainingSettings,
     seed: int,
 ) -> Boosters:
-    """Trees of one stage from its samples, those of all volumes one after another.
+    """Trees of one stage from its samples.
 
     Parameters
     ----------
     name : str
         One of :data:`mvest.imaging.detection.trained_model.STAGES`.
     x, y : (P, F), (P, outputs)
+        From :func:`samples_of`.
     settings : TrainingSettings
     seed : int
         Of the training.
@@ -320,16 +327,7 @@ def train_model(
         for sample in side_by_side(volume_samples, volumes, processes):
             samples.append(sample)
             tell("volumes", len(samples), settings.volumes)
-    stages = (
-        (
-            name,
-            np.concatenate([part[name][0] for part in samples]),
-            np.concatenate([part[name][1] for part in samples]),
-            settings,
-            seed,
-        )
-        for name in STAGES
-    )
+    stages = ((name, *samples_of(name, samples), settings, seed) for name in STAGES)
     boosters = {}
     grown = side_by_side(train_stage, stages, processes)
     for k, (name, found_boosters) in enumerate(zip(STAGES, grown, strict=True)):
