@@ -71,7 +71,9 @@ class ConsideredGeometry:
     insertions_mm : float
         Of each coordinate of where a chord ends, along the leaflet.
     rest_lengths : float
-        Relative, of the rest length of each chord, beside a factor on all of them.
+        Relative, of the rest length of each chord that was laid out by the shape of the frames,
+        beside a factor on all of them. Those that a case states are as long as it says, up to that
+        factor.
     thickness : float
         Relative, of each leaflet.
     fibre_degrees : float
@@ -210,7 +212,7 @@ def _variations(
         moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
         moves = moves.reshape(-1, *moves.shape[2:])
         kinds.append(("insertions", geometry.insertions(moves), 1.0))
-    if considered.rest_lengths:
+    if considered.rest_lengths and case.chordae_follow:
         changes = considered.rest_lengths * np.eye(len(case.valve.chordae))
         kinds.append(("rest lengths", geometry.rest_lengths(changes), 1.0))
     if considered.thickness:

@@ -23,6 +23,7 @@ from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerh
 from mvest.cases.paths import CASE_FILE
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError
+from mvest.problem.registration import displace
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.io.leaflet_surfaces import write_surface
@@ -43,7 +44,13 @@ class Arrived:
     closed: Frame
 
 
-def arrive(case: ValveCase, positions: FloatArray, door: DoorSettings, folder: Path) -> Arrived:
+def arrive(
+    case: ValveCase,
+    positions: FloatArray,
+    registration: FloatArray,
+    door: DoorSettings,
+    folder: Path,
+) -> Arrived:
     """What becomes of a virtual patient's geometry on its way through a door.
 
     Parameters
@@ -52,6 +59,8 @@ def arrive(case: ValveCase, positions: FloatArray, door: DoorSettings, folder: P
         Of the patient, whose vertices correspond.
     positions : ndarray
         ``(n, 3)`` mm, where these truly were in the closed frame.
+    registration : ndarray
+        ``(6,)`` by which they are displaced against the annulus and the tips that the case states.
     door : DoorSettings
     folder : Path
         Empty; what is exported and imported is left there.
@@ -67,6 +76,10 @@ def arrive(case: ValveCase, positions: FloatArray, door: DoorSettings, folder: P
     drawn = closed.vertices if door.seen_with_errors else positions
     true = replace(closed, vertices=positions)
     closed = replace(closed, vertices=drawn, free_edge=drawn[case.free_edge], corresponds=False)
+    if door.kind in IMPORTED:
+        # Leaflets, annulus and tips are drawn in one image.
+        tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
+        closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
     return DOORS[door.kind](Arrived(case, opened, true), closed, door, folder)
 
 
@@ -85,7 +98,7 @@ def _slicerheart(patient: Arrived, closed: Frame, door: DoorSettings, folder: Pa
         float(surface.thickness[surface.vertex_region == k].mean())
         for k in range(len(surface.region_names))
     ]
-    frames = [("MD", _in_lps(case, patient.opened)), ("MS", _in_lps(case, closed))]
+    frames = [("MD", _in_lps(patient.opened)), ("MS", _in_lps(closed))]
     landmarks = landmarks_on(patient.opened.annulus)
     write_slicerheart(export, frames, surface.region_names, thickness, landmarks)
     options = SlicerheartOptions(pressure_mmHg=closed.pressure_mmHg, std_mm=door.std_mm)
@@ -96,7 +109,7 @@ def _labels(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -
     if door.voxel_mm is None:
         raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
     file, surface = folder / "open.nii.gz", patient.case.surface
-    opened, closed = (_in_lps(patient.case, frame) for frame in (patient.opened, closed))
+    opened, closed = (_in_lps(frame) for frame in (patient.opened, closed))
     normals = smooth_vertex_normals(opened.vertices, opened.triangles)
     write_label_map(file, opened, normals, surface.thickness, door.voxel_mm)
     tips = tuple(opened.papillary_tips.ravel().tolist())
@@ -131,14 +144,14 @@ def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) ->
     return read_case(folder)
 
 
-def _in_lps(case: ValveCase, frame: Frame) -> Frame:
-    """A frame as it is drawn in an image: LPS, annulus on the leaflets, the left tip first."""
+def _in_lps(frame: Frame) -> Frame:
+    """A frame in the axes of an image, LPS, the left tip first."""
     tips = frame.papillary_tips[np.argsort(frame.papillary_tips[:, 0])]
     return replace(
         frame,
         vertices=_moved(frame.vertices),
-        annulus=_moved(frame.vertices[case.annulus]),
-        free_edge=_moved(frame.vertices[case.free_edge]),
+        annulus=_moved(frame.annulus),
+        free_edge=_moved(frame.free_edge),
         papillary_tips=_moved(tips),
     )
 
@@ -148,10 +161,12 @@ def _moved(points: FloatArray) -> FloatArray:
 
 
 def _posed(patient: Arrived, case: ValveCase) -> Arrived:
-    true = (_in_lps(patient.case, frame) for frame in (patient.opened, patient.closed))
+    true = (_in_lps(frame) for frame in (patient.opened, patient.closed))
     return Arrived(replace(case, simulated=True), *true)
 
 
+IMPORTED = ("slicerheart", "labels")
+"""Kinds whose geometry is drawn in images."""
 DOORS: dict[str, Callable[[Arrived, Frame, DoorSettings, Path], Arrived]] = {
     "vertices": _vertices,
     "surfaces": _surfaces,

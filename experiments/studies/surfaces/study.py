@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.common.cases import findings as of_cases
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.settings import PersonalSettings
@@ -23,6 +25,7 @@ from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
+from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import MODULUS, UnknownRow
 
 __all__ = ["STUDY", "run_surfaces"]
@@ -46,7 +49,10 @@ def run_surfaces(job: Job[Settings]) -> Outcome[Findings]:
         # Of an earlier run.
         shutil.rmtree(job.folder / name, ignore_errors=True)
     (job.folder / "door").mkdir()
-    arrived = arrive(patient, positions[CLOSED], job.settings.door, job.folder / "door")
+    registration = np.array([hidden["values"][name] for name in REGISTRATION])
+    arrived = arrive(
+        patient, positions[CLOSED], registration, job.settings.door, job.folder / "door"
+    )
     case = write_case(job.folder / "case", arrived.case)
     before = _cpu_of_children()
     estimated = _estimated(job.values, job.folder, case, place.hidden)
