@@ -7,11 +7,11 @@ import pytest
 
 import experiments
 import mvest
-from experiments.common import build
+from experiments.common.building import anatomy, closure, patient_store
+from experiments.common.building.truth import MADE_BY
 from experiments.studies.imaged_patient import study as imaged_patient
 from experiments.studies.imaging import store as imaging_store
 from experiments.studies.imaging import trials
-from experiments.studies.patient import study as patient
 from mvest.errors import InputError
 from mvest.simulation.motion.population import draw_population
 from mvest.source import SOURCES, Sources, source_key
@@ -239,8 +239,8 @@ def test_a_process_has_the_code_with_which_it_began(code):
 
 
 def test_only_what_is_ours_has_a_key():
-    assert source_key(build, build.build_mesh) == source_key(build, build.build_mesh)
-    assert source_key(build.build_mesh) != source_key(build.closure_model)
+    assert source_key(closure, anatomy.build_mesh) == source_key(closure, anatomy.build_mesh)
+    assert source_key(anatomy.build_mesh) != source_key(closure.closure_model)
     with pytest.raises(InputError, match="pathlib is no module of mvest or experiments"):
         source_key(Path)
 
@@ -256,11 +256,11 @@ FORWARD = {
 
 
 def test_what_is_kept_knows_what_makes_it():
-    truth = reached(*build.MADE_BY)
+    truth = reached(*MADE_BY)
     assert truth >= FORWARD | {"mvest.valve.mesh.tetrahedral._tetwild_worker"}
     assert not [name for name in truth if name.startswith(("mvest.imaging", "mvest.reporting"))]
     assert not [name for name in truth if name.startswith("mvest.estimation.filters")]
-    one = reached(patient._simulate, patient._write)
+    one = reached(patient_store._simulate, patient_store._write)
     assert one >= FORWARD | {"mvest.simulation.virtual_patient", "mvest.cases.writer"}
     assert not [name for name in one if name.startswith(("mvest.personalise", "mvest.imaging"))]
     assert reached(draw_population) >= FORWARD | {"mvest.imaging.layout"}

@@ -17,7 +17,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.anatomy import ValveFolderConfig, folder_hash
+from experiments.common.building.anatomy import ValveFolderConfig, folder_hash
 from experiments.common.schema import schema, with_contents
 from experiments.common.study import load_settings, study_names
 from mvest.estimation.filters.ensemble import EnsembleFilter

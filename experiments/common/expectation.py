@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import Twin, build_filter, build_twin
+from experiments.common.building.filters import build_filter
+from experiments.common.building.twin import Twin, build_twin
+from experiments.common.building.whole_cycle import cycle_model, stored_cycle
 from experiments.common.progress import SolveBar
 from experiments.common.schema import build
-from experiments.common.whole_cycle import cycle_model, stored_cycle
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart

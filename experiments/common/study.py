@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import experiments.studies
-from experiments.common.record import Outcome, Record
+from experiments.common.records.record import Outcome, Record
 from mvest.errors import ConfigurationError
 
 __all__ = ["Check", "Job", "Section", "Study", "load_settings", "load_study", "study_names"]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from experiments.common.record import FIELDS, Record, read_record, write_record
+from experiments.common.records.record import FIELDS, Record, read_record, write_record
 from experiments.common.study import Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from experiments.common.estimates import Paper, SeedRun
-from experiments.common.findings import Vector
-from experiments.common.record import Model, Provenance, Status
+from experiments.common.records.estimates import Paper, SeedRun
+from experiments.common.records.findings import Vector
+from experiments.common.records.record import Model, Provenance, Status
 from mvest.errors import InputError
 
 __all__ = ["SCHEMA", "Cost", "Sweep", "SweepJob", "check_sweep"]

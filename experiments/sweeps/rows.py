@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.common.estimates import SeedRun, Spread
-from experiments.common.record import HASH_DIGITS
+from experiments.common.records.estimates import SeedRun, Spread
+from experiments.common.records.record import HASH_DIGITS
 from experiments.sweeps.collected import Cost, Sweep, SweepJob
 from mvest.typing import FloatArray
 

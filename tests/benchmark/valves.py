@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from experiments.common.anatomy import guide_of
+from experiments.common.building.anatomy import guide_of
 from mvest.closure.model import ClosureModel
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.integrate import simulate

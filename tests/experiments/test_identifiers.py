@@ -11,7 +11,7 @@ import pytest
 
 from experiments.common.cases.report import write_case_run
 from experiments.common.config import hash_of, without_places
-from experiments.common.record import stamp, write_record
+from experiments.common.records.record import stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.case.settings import Settings

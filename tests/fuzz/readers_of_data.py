@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.record import read_record, write_record
+from experiments.common.records.record import read_record, write_record
 from experiments.runner.planning.plan import Plan
 from mvest.cases.case import ErrorSamples
 from mvest.cases.error_file import write_error_samples

@@ -3,7 +3,7 @@
 import copy
 from typing import Any
 
-from experiments.common.record import Record, record_from
+from experiments.common.records.record import Record, record_from
 from experiments.studies.twin.findings import Findings
 
 RECORD: dict[str, Any] = {

@@ -26,7 +26,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.cases.volume import run_volume
-from experiments.common.record import NOT_GATED, Outcome
+from experiments.common.records.record import NOT_GATED, Outcome
 from experiments.common.schema import build
 from mvest.errors import InputError, MvestError
 from mvest.processes import run

@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy import sparse
 
-from experiments.common.estimate_record import identified_of, innovation_of, seed_run
-from experiments.common.estimates import Data, SeedRun
-from experiments.common.findings import vector
-from experiments.common.record import NOT_GATED, Mesh, Model, Outcome, has_passed
+from experiments.common.records.estimate_record import identified_of, innovation_of, seed_run
+from experiments.common.records.estimates import Data, SeedRun
+from experiments.common.records.findings import vector
+from experiments.common.records.record import NOT_GATED, Mesh, Model, Outcome, has_passed
 from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
 from mvest.closure.frames import ERROR, OFFSET

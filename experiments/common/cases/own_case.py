@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import mechanics_of
+from experiments.common.building.closure import mechanics_of
 from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar
-from experiments.common.record import NOT_GATED, Outcome
+from experiments.common.records.record import NOT_GATED, Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts

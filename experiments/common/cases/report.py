@@ -9,7 +9,7 @@ from typing import Any
 
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import FIELDS
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from mvest.files import write_atomically
 from mvest.problem.verdict import NONE
 from mvest.reporting.case.findings import CaseFindings, FrameDistances, UnknownRow

@@ -15,7 +15,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.own_case import run_case
 from experiments.common.cases.settings import ImagedSettings, PersonalSettings
 from experiments.common.progress import PartBar
-from experiments.common.record import Outcome
+from experiments.common.records.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence

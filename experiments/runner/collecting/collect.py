@@ -14,8 +14,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from experiments.common.estimates import Paper, SeedRun
-from experiments.common.record import Record, Status, here_and_now, model_of_values
+from experiments.common.records.estimates import Paper, SeedRun
+from experiments.common.records.record import Record, Status, here_and_now, model_of_values
 from experiments.runner.jobs.compared import Compared, last_compared
 from experiments.runner.jobs.folder import is_done, result_time
 from experiments.runner.planning.plan import Plan, PlannedJob

@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from experiments.common.findings import Vector
-from experiments.common.record import Record
+from experiments.common.records.findings import Vector
+from experiments.common.records.record import Record
 from experiments.runner.jobs.compared import Compared
 from mvest.provenance import config_hash
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from experiments.common.record import HASH_DIGITS, Record, require_written
+from experiments.common.records.record import HASH_DIGITS, Record, require_written
 from experiments.runner.jobs.compared import Compared, compared
 from mvest.errors import InputError
 from mvest.files import sha256_of

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.common.estimates import SeedRun, Spread
-from experiments.common.record import Provenance, require_written
+from experiments.common.records.estimates import SeedRun, Spread
+from experiments.common.records.record import Provenance, require_written
 from experiments.runner.jobs.compared import compared
 from experiments.sweeps.collected import Sweep, check_sweep
 from mvest.errors import InputError, cannot_write

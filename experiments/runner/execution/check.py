@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.common.build import mechanics_of, truth_mesh
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.truth import truth_mesh
 from experiments.common.study import load_study
 from experiments.runner.tracking.store import require_no_password
 from mvest.errors import ConfigurationError

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.config import hash_of, without_places
-from experiments.common.record import Record, record_from, stamp, write_record
+from experiments.common.records.record import Record, record_from, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Check, Job, Study, load_study, study_names
 from experiments.results.keep import arrays_of, publish

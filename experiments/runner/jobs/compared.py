@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.common.estimates import Data, SeedRun
-from experiments.common.record import Record, record_from
+from experiments.common.records.estimates import Data, SeedRun
+from experiments.common.records.record import Record, record_from
 from experiments.runner.jobs.folder import last_record
 
 __all__ = ["Compared", "compared", "last_compared"]

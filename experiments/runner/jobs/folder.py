@@ -15,7 +15,7 @@ from typing import Any
 from filelock import FileLock
 
 from experiments.common.config import without_places
-from experiments.common.record import (
+from experiments.common.records.record import (
     SCHEMA,
     Outcome,
     record_from,

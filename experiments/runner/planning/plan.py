@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from experiments.common.record import model_of_values
+from experiments.common.records.record import model_of_values
 from experiments.runner.jobs.compared import compared
 from experiments.runner.jobs.folder import RESULT
 from experiments.runner.jobs.request import Request

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.common.record import SCHEMA, Record, require_written
+from experiments.common.records.record import SCHEMA, Record, require_written
 from experiments.runner.collecting.comparison import inputs, metrics, parameters
 from experiments.runner.jobs.compared import Compared, compared
 from experiments.runner.jobs.folder import is_done

@@ -11,7 +11,7 @@ from experiments.common.cases.own_case import meshes_of, read_configured, run_ca
 from experiments.common.cases.report import case_text, write_cases
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.expectation import expect_own
-from experiments.common.record import Outcome
+from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job, Study
 from experiments.studies.case.settings import Settings

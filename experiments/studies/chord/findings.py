@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.common.findings import Rows, Vector, rows, vector
-from experiments.common.record import Status
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
+from experiments.common.records.findings import Rows, Vector, rows, vector
+from experiments.common.records.record import Status
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.consistency import nees
 from mvest.typing import FloatArray

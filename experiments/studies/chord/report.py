@@ -7,8 +7,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.common.record import Record
-from experiments.common.report import parameter_label, percent
+from experiments.common.records.record import Record
+from experiments.common.records.report import parameter_label, percent
 from experiments.studies.chord.findings import Findings, Fit
 from mvest.reporting.figures import COLOURS, MARKERS
 

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.common.expectation import expect_cycle
-from experiments.common.findings import vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
-from experiments.common.progress import say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
-from experiments.common.study import Job, Section, Study
-from experiments.common.whole_cycle import (
+from experiments.common.building.gate import gate_of
+from experiments.common.building.whole_cycle import (
     Bound,
     CycleEstimator,
     closed_frame,
     iterated_from,
     true_cycle,
 )
+from experiments.common.expectation import expect_cycle
+from experiments.common.progress import say
+from experiments.common.records.findings import vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
+from experiments.common.study import Job, Section, Study
 from experiments.studies.chord.findings import Findings, Fit
 from experiments.studies.chord.report import chord_answer, chord_figure, chord_table, chord_words
 from experiments.studies.chord.settings import Settings

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.report import write_report
+from experiments.common.records.record import Record
+from experiments.common.records.report import write_report
 from mvest.closure.measures import StepMeasures
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz

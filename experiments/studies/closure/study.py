@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from experiments.common.anatomy import anatomy_of
-from experiments.common.build import closure_model
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
+from experiments.common.building.anatomy import anatomy_of
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import gate_of
 from experiments.common.progress import SolveBar
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.closure.report import (
     Findings,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Rows, Vector
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
+from experiments.common.records.findings import Rows, Vector
 
 __all__ = ["Along", "Band", "Curve", "Drift", "Findings", "Frame", "Steps"]
 

@@ -7,9 +7,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.report import parameter_label, percent
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
+from experiments.common.records.record import Record
+from experiments.common.records.report import parameter_label, percent
 from experiments.studies.cycle.findings import Along, Drift, Findings
 from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.markup import number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from experiments.common.cycle_settings import CycleSettings
+from experiments.common.building.cycle_settings import CycleSettings
 
 __all__ = ["Settings"]
 

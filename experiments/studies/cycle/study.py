@@ -9,17 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import build_filter
-from experiments.common.cycle_settings import CycleSettings
-from experiments.common.expectation import expect_cycle
-from experiments.common.findings import finite, rows, vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
-from experiments.common.study import Job, Section, Study
-from experiments.common.whole_cycle import (
+from experiments.common.building.cycle_settings import CycleSettings
+from experiments.common.building.filters import build_filter
+from experiments.common.building.gate import gate_of
+from experiments.common.building.whole_cycle import (
     Bound,
     closed_frame,
     cycle_model,
@@ -27,6 +20,13 @@ from experiments.common.whole_cycle import (
     stored_frames,
     true_cycle,
 )
+from experiments.common.expectation import expect_cycle
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
+from experiments.common.records.findings import finite, rows, vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
+from experiments.common.study import Job, Section, Study
 from experiments.studies.cycle.findings import Along, Band, Curve, Drift, Findings, Frame, Steps
 from experiments.studies.cycle.report import cycle_answer, cycle_figure, cycle_table, cycle_words
 from experiments.studies.cycle.settings import Settings

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.report import heading
+from experiments.common.records.record import Record
+from experiments.common.records.report import heading
 from experiments.studies.design.findings import Findings, Tried
 from mvest.files import write_atomically
 from mvest.personalise.design import ERRORS_MMHG, HALF, KIND_WORDS

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import template_of
-from experiments.common.build import mechanics_of
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.virtual_patients import draw_patient_values
 from experiments.common.cases.own_case import settings_of
-from experiments.common.forward import outcome_of
 from experiments.common.progress import say
-from experiments.common.record import NOT_GATED, Outcome
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import NOT_GATED, Outcome
 from experiments.common.study import Job, Section, Study
-from experiments.common.virtual_patients import draw_patient_values
 from experiments.studies.design.findings import Findings, Left, Tried
 from experiments.studies.design.report import design_answer, design_words, write_design
 from experiments.studies.design.settings import Corner, Settings

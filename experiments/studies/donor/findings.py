@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.common.estimates import Data, Identified, Innovation, Spread
-from experiments.common.findings import Rows, Vector
-from experiments.common.record import Status
+from experiments.common.records.estimates import Data, Identified, Innovation, Spread
+from experiments.common.records.findings import Rows, Vector
+from experiments.common.records.record import Status
 from mvest.problem.estimate import Modulus
 
 __all__ = ["Distances", "Findings", "Row"]

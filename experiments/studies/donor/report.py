@@ -12,8 +12,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from experiments.common.record import Record
-from experiments.common.report import write_drawn
+from experiments.common.records.record import Record
+from experiments.common.records.report import write_drawn
 from experiments.studies.donor.findings import Distances, Findings
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz

@@ -16,17 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import build_filter, mechanics_of
-from experiments.common.estimate_record import (
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.filters import build_filter
+from experiments.common.progress import SolveBar
+from experiments.common.records.estimate_record import (
     identified_of,
     innovation_of,
     seed_run,
 )
-from experiments.common.estimates import Data
-from experiments.common.findings import vector
-from experiments.common.progress import SolveBar
-from experiments.common.record import Mesh, Outcome
-from experiments.common.report import answer_of_main
+from experiments.common.records.estimates import Data
+from experiments.common.records.findings import vector
+from experiments.common.records.record import Mesh, Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.donor.findings import (
     Distances,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.estimates import Innovation, Spread
-from experiments.common.findings import Rows, Vector
+from experiments.common.records.estimates import Innovation, Spread
+from experiments.common.records.findings import Rows, Vector
 
 __all__ = ["Findings", "Program"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.external.findings import Findings
 from mvest.reporting.figures import iterates_figure
 from mvest.reporting.markup import MISSING, markdown_rows, with_std

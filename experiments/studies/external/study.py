@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import build_filter
-from experiments.common.estimate_record import innovation_of
-from experiments.common.findings import rows, vector
+from experiments.common.building.filters import build_filter
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.record import Outcome
-from experiments.common.report import write_each
+from experiments.common.records.estimate_record import innovation_of
+from experiments.common.records.findings import rows, vector
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import write_each
 from experiments.common.schema import build
 from experiments.common.study import Job, Study
 from experiments.studies.external.findings import Findings, Program

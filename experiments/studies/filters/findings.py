@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Vector
+from experiments.common.records.findings import Vector
 
 __all__ = ["Estimated", "Findings", "OwnCheck", "Problem", "Repeats", "SurrogateFit"]
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from experiments.common.build import build_twin
-from experiments.common.record import Mesh
+from experiments.common.building.twin import build_twin
+from experiments.common.records.record import Mesh
 from experiments.studies.filters.settings import FilterProblem, SurrogateDesign
 from mvest.errors import ConfigurationError
 from mvest.estimation.filters.surrogate import Region, Surrogate, affordable_degree, fit_surrogate

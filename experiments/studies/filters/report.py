@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.findings import Vector
-from experiments.common.record import Model, Record
-from experiments.common.report import axis_label, write_each
+from experiments.common.records.findings import Vector
+from experiments.common.records.record import Model, Record
+from experiments.common.records.report import axis_label, write_each
 from experiments.studies.filters.findings import Estimated, Findings, Problem
 from mvest.reporting.style import BAD, GOOD, SMALL, headline, panels
 

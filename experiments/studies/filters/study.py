@@ -13,12 +13,13 @@ import numpy as np
 import scipy
 from pydantic import TypeAdapter
 
-from experiments.common.build import MADE_BY, filter_of
-from experiments.common.findings import vector
+from experiments.common.building.filters import filter_of
+from experiments.common.building.store import Store
+from experiments.common.building.truth import MADE_BY
 from experiments.common.progress import SolveBar, say
-from experiments.common.record import Mesh, Outcome
-from experiments.common.report import answer_of_main
-from experiments.common.store import Store
+from experiments.common.records.findings import vector
+from experiments.common.records.record import Mesh, Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.filters.findings import (
     Estimated,

@@ -8,8 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.common.places import ANATOMIES
-from experiments.common.record import Record
-from experiments.common.report import percent
+from experiments.common.records.record import Record
+from experiments.common.records.report import percent
 from experiments.studies.gate.findings import Findings, Limits
 from mvest.files import write_atomically
 

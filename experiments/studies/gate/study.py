@@ -6,10 +6,10 @@ import sys
 
 import numpy as np
 
-from experiments.common.build import closure_model
-from experiments.common.forward import outcome_of
-from experiments.common.gate import anatomy_digest
-from experiments.common.record import Outcome
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import anatomy_digest
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
 from experiments.common.study import Job, Section, Study
 from experiments.studies.gate.findings import Findings, Followed, Limits, Row
 from experiments.studies.gate.report import gate_answer, gate_words, write_gate

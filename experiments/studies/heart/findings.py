@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.estimates import Data
-from experiments.common.findings import Vector
+from experiments.common.records.estimates import Data
+from experiments.common.records.findings import Vector
 from mvest.closure.measures import StepMeasures
 
 __all__ = ["Asked", "Closed", "Findings", "Measure", "MeshRow", "TwinRow"]

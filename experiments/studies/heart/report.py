@@ -11,8 +11,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.report import parameter_label, write_drawn
+from experiments.common.records.record import Record
+from experiments.common.records.report import parameter_label, write_drawn
 from experiments.studies.heart.findings import Findings
 from mvest.errors import InputError
 from mvest.reading.npz import read_npz

@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import anatomy_of, build_mesh, folder_hash
-from experiments.common.build import build_twin, closure_model
-from experiments.common.estimates import Data
-from experiments.common.findings import finite, vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import anatomy_digest
+from experiments.common.building.anatomy import anatomy_of, build_mesh, folder_hash
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import anatomy_digest
+from experiments.common.building.twin import build_twin
 from experiments.common.progress import SolveBar
-from experiments.common.record import FAILED_GATE, PASSED_GATE, Outcome
-from experiments.common.report import answer_of_main
+from experiments.common.records.estimates import Data
+from experiments.common.records.findings import finite, vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import FAILED_GATE, PASSED_GATE, Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.heart.findings import Asked, Closed, Findings, Measure, MeshRow, TwinRow
 from experiments.studies.heart.report import heart_answer, heart_words, write_heart

@@ -12,8 +12,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from experiments.common.record import Record
-from experiments.common.report import axis_label
+from experiments.common.records.record import Record
+from experiments.common.records.report import axis_label
 from experiments.studies.identifiability.findings import Findings, Joint, Profile
 from mvest.reporting.figures import COLOURS, MARKERS
 from mvest.reporting.style import SMALL, headline, panels, plain_number

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.cases.skill import GENERIC, PRIOR, PRIOR_STD
-from experiments.common.record import Record
-from experiments.common.report import page
+from experiments.common.records.record import Record
+from experiments.common.records.report import page
 from experiments.studies.identifiability.figures import identifiability_figures
 from experiments.studies.identifiability.findings import Findings, Profile
 from mvest.files import write_atomically

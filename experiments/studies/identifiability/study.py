@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import closure_model
-from experiments.common.findings import finite, vector
-from experiments.common.forward import outcome_of
+from experiments.common.building.closure import closure_model
 from experiments.common.progress import SolveBar, say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main
+from experiments.common.records.findings import finite, vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.identifiability.figures import designs_answer
 from experiments.studies.identifiability.findings import Design, Expected, Findings, Joint, Profile

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.common.cases.skill import HALF, log_width
-from experiments.common.tables import write_table
+from experiments.common.records.tables import write_table
 from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
 from mvest.reporting.case.findings import Cost, UnknownRow
 from mvest.reporting.figures import save_figure_with

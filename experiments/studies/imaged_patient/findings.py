@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from experiments.common.estimates import Data, SeedRun
+from experiments.common.records.estimates import Data, SeedRun
 from mvest.problem.verdict import NONE
 from mvest.reporting.case.findings import Cost, FrameDistances, ImageErrors, UnknownRow
 

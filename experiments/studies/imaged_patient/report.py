@@ -8,7 +8,7 @@ from pathlib import Path
 from experiments.common.cases.blind import ESTIMATE, read_estimate
 from experiments.common.cases.report import estimation_text, write_case_run
 from experiments.common.cases.skill import skill_words
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.imaged_patient.budget import with_unseen, write_budget
 from experiments.studies.imaged_patient.findings import KNOWN, SEGMENTED, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from experiments.common.building.virtual_patients import EchoSettings, PatientSettings
 from experiments.common.cases.settings import ImagedSettings, PersonalSettings
-from experiments.common.virtual_patients import EchoSettings, PatientSettings
 
 __all__ = ["Settings"]
 

@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import template_of
-from experiments.common.build import mechanics_of
-from experiments.common.cases import findings as of_cases
-from experiments.common.cases.blind import estimate_blindly
-from experiments.common.record import Outcome, Status
-from experiments.common.store import Store
-from experiments.common.study import Job, Section, Study
-from experiments.common.virtual_patients import (
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.store import Store
+from experiments.common.building.virtual_patients import (
     EchoSettings,
     PatientSettings,
     draw_patient_values,
     first_that_closes,
     require_patient,
 )
+from experiments.common.cases import findings as of_cases
+from experiments.common.cases.blind import estimate_blindly
+from experiments.common.records.record import Outcome, Status
+from experiments.common.study import Job, Section, Study
 from experiments.studies.imaged_patient.findings import (
     KNOWN,
     SEGMENTED,

@@ -12,7 +12,7 @@ import pandas as pd
 
 from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import baselines, skill_words
-from experiments.common.tables import write_table
+from experiments.common.records.tables import write_table
 from experiments.studies.imaged_patient.findings import Row
 from mvest.errors import InputError
 from mvest.problem.verdict import NONE

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from experiments.common.findings import Vector
+from experiments.common.records.findings import Vector
 from mvest.imaging.layout import ValveLayout
 
 __all__ = ["Accuracy", "Confidences", "Correlations", "Coverage", "DetectedVolume", "Evaluation",

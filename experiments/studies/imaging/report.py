@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.tables import write_table
+from experiments.common.records.record import Record
+from experiments.common.records.tables import write_table
 from experiments.studies.imaging.findings import Accuracy, Confidences, Evaluation, Findings
 from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_table
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE

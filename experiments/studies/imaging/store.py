@@ -18,9 +18,9 @@ import numpy as np
 from joblib.externals.loky import get_reusable_executor
 from numpy.typing import NDArray
 
-from experiments.common.build import mechanics_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.store import Store, key_of
 from experiments.common.progress import PartBar
-from experiments.common.store import Store, key_of
 from experiments.studies.imaging.findings import Spent
 from experiments.studies.imaging.parallel import in_processes
 from experiments.studies.imaging.settings import ImagingSettings

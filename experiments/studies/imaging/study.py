@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.record import Outcome, Record
-from experiments.common.report import answer_of_main
+from experiments.common.records.record import Outcome, Record
+from experiments.common.records.report import answer_of_main
 from experiments.common.schema import build
 from experiments.common.study import Job, Section, Study
 from experiments.studies.imaging.evaluation import findings_of, tested_of

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from experiments.common.tables import write_table
+from experiments.common.records.tables import write_table
 from experiments.studies.imaging.findings import DetectedVolume, Evaluation
 from mvest.errors import InputError
 from mvest.reporting.images.figures import LIMITS_MM, SETTINGS

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Vector, vector
-from experiments.common.record import Status
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
+from experiments.common.records.findings import Vector, vector
+from experiments.common.records.record import Status
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.information.consistency import nees

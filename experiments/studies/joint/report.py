@@ -9,8 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
-from experiments.common.report import parameter_label, percent
+from experiments.common.records.record import Record
+from experiments.common.records.report import parameter_label, percent
 from experiments.studies.joint.findings import Findings, Fit, Frame, MeshError, Pass
 from mvest.estimation.information.consistency import chi_square_band
 from mvest.reporting.figures import COLOURS, MARKERS

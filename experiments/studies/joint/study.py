@@ -7,15 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.expectation import expect_cycle
-from experiments.common.findings import vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
-from experiments.common.progress import say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
-from experiments.common.study import Job, Section, Study
-from experiments.common.whole_cycle import (
+from experiments.common.building.gate import gate_of
+from experiments.common.building.whole_cycle import (
     Bound,
     CycleEstimator,
     MeshShift,
@@ -25,6 +18,13 @@ from experiments.common.whole_cycle import (
     stored_cycle,
     true_cycle,
 )
+from experiments.common.expectation import expect_cycle
+from experiments.common.progress import say
+from experiments.common.records.findings import vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
+from experiments.common.study import Job, Section, Study
 from experiments.studies.joint.findings import (
     Findings,
     Fit,

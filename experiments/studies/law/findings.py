@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from experiments.common.findings import Rows, Vector
+from experiments.common.records.findings import Rows, Vector
 
 __all__ = ["Band", "Curves", "Distance", "Excised", "Findings", "Fit", "Parameter", "Sample",
            "Stretches"]  # fmt: skip

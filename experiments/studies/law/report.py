@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.law.findings import Findings
 from mvest.reporting.figures import COLOURS
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import Twin, build_twin
-from experiments.common.findings import rows, vector
-from experiments.common.forward import outcome_of
+from experiments.common.building.twin import Twin, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
+from experiments.common.records.findings import rows, vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.law.findings import (
     Band,

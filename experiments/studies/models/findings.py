@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Rows, Vector
+from experiments.common.records.findings import Rows, Vector
 from experiments.studies.models.sheet.sheet import Sheet
 
 __all__ = ["Apart", "Difference", "Findings", "Row"]

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.models.findings import Apart, Difference, Findings
 from experiments.studies.models.sheet.sheet import Sheet
 from mvest.reporting.figures import COLOURS, MARKERS

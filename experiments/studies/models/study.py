@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 import mvest
-from experiments.common.build import build_filter
-from experiments.common.findings import rows, vector
+from experiments.common.building.filters import build_filter
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar, say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
+from experiments.common.records.findings import rows, vector
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
 from experiments.common.study import Job, Section, Study
 from experiments.studies.models.findings import Apart, Difference, Findings, Row
 from experiments.studies.models.report import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Vector
-from experiments.common.record import Status
+from experiments.common.records.findings import Vector
+from experiments.common.records.record import Status
 from mvest.mechanics.settings import ModulusField, StiffPatch
 
 __all__ = ["Compared", "Findings", "Fit", "Places"]

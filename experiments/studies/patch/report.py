@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.patch.findings import Findings
 
 __all__ = ["patch_answer", "patch_figure", "patch_table", "patch_words"]

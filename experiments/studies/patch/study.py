@@ -13,18 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import template_of
-from experiments.common.build import mechanics_of
-from experiments.common.cycle_settings import CycleSettings
-from experiments.common.expectation import expect_cycle
-from experiments.common.findings import vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
-from experiments.common.progress import say
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main, write_each
-from experiments.common.study import Job, Section, Study
-from experiments.common.whole_cycle import (
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.cycle_settings import CycleSettings
+from experiments.common.building.gate import gate_of
+from experiments.common.building.whole_cycle import (
     CycleEstimator,
     cycle_model,
     finer_steps,
@@ -32,6 +25,13 @@ from experiments.common.whole_cycle import (
     shift_by_check_mesh,
     stored_cycle,
 )
+from experiments.common.expectation import expect_cycle
+from experiments.common.progress import say
+from experiments.common.records.findings import vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main, write_each
+from experiments.common.study import Job, Section, Study
 from experiments.studies.patch.findings import Compared, Findings, Fit, Places
 from experiments.studies.patch.report import patch_answer, patch_figure, patch_table, patch_words
 from experiments.studies.patch.settings import PatchSettings, Settings

@@ -23,9 +23,9 @@ from experiments.common.cases.skill import (
     score,
     share_bounds,
 )
-from experiments.common.record import Record
-from experiments.common.report import provenance_of
-from experiments.common.tables import write_table
+from experiments.common.records.record import Record
+from experiments.common.records.report import provenance_of
+from experiments.common.records.tables import write_table
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
 from mvest.reporting.case.findings import UnknownRow
 from mvest.reporting.figures import save_figure_with

@@ -18,9 +18,9 @@ from experiments.common.cases.skill import (
     share_bounds,
     skill_words,
 )
-from experiments.common.record import Record
-from experiments.common.report import cautions, provenance_of
-from experiments.common.tables import write_table
+from experiments.common.records.record import Record
+from experiments.common.records.report import cautions, provenance_of
+from experiments.common.records.tables import write_table
 from experiments.studies.patient.tables import (
     distance_words,
     table3,

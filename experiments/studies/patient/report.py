@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.skill import skill_words
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.findings import CaseFindings, UnknownRow
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.virtual_patients import PatientSettings
 
 __all__ = ["Settings"]
 

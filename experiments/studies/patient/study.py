@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.building.gate import gate_of
+from experiments.common.building.patient_store import PatientPlace, make_patient
+from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.findings import Findings, Revealed
 from experiments.common.cases.own_case import FIELDS
 from experiments.common.cases.report import case_text, write_case_run
 from experiments.common.expectation import expect_own
-from experiments.common.gate import gate_of
-from experiments.common.patient_store import PatientPlace, make_patient
-from experiments.common.record import NOT_GATED, Outcome
+from experiments.common.records.record import NOT_GATED, Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job, Section, Study
-from experiments.common.virtual_patients import PatientSettings
 from experiments.studies.patient.calibration import calibration_answer
 from experiments.studies.patient.report import (
     arrays_of_patient,

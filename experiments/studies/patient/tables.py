@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import baselines, prior_alone, skill_words
-from experiments.common.record import Record
-from experiments.common.report import cautions, provenance_of
-from experiments.common.tables import write_table
+from experiments.common.records.record import Record
+from experiments.common.records.report import cautions, provenance_of
+from experiments.common.records.tables import write_table
 from mvest.errors import InputError
 from mvest.problem.verdict import NONE
 from mvest.reporting.case.drawing import ATRIUM, draw_valve, paint_leak, same_scale

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from experiments.common.findings import Rows, Vector, finite
+from experiments.common.records.findings import Rows, Vector, finite
 from mvest.scenarios.predict import PredictedScenario, Sample
 
 __all__ = ["Findings", "MeshStress", "Observed", "Patient", "Predicted", "Scenario"]

@@ -8,8 +8,8 @@ from typing import Literal
 
 import pandas as pd
 
-from experiments.common.record import Record
-from experiments.common.report import write_drawn
+from experiments.common.records.record import Record
+from experiments.common.records.report import write_drawn
 from experiments.studies.prediction.figure import prediction_figure
 from experiments.studies.prediction.findings import Findings, Predicted
 from mvest.reporting.markup import MISSING, markdown_rows, number

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import anatomy_of, build_mesh
-from experiments.common.build import Twin, build_twin
-from experiments.common.findings import Rows, rows, vector
-from experiments.common.forward import outcome_of
-from experiments.common.gate import gate_of
+from experiments.common.building.anatomy import anatomy_of, build_mesh
+from experiments.common.building.gate import gate_of
+from experiments.common.building.twin import Twin, build_twin
 from experiments.common.progress import TYPICAL_SOLVES, PartBar, SolveBar
-from experiments.common.record import Outcome
-from experiments.common.report import answer_of_main
+from experiments.common.records.findings import Rows, rows, vector
+from experiments.common.records.forward import outcome_of
+from experiments.common.records.record import Outcome
+from experiments.common.records.report import answer_of_main
 from experiments.common.study import Job, Section, Study
 from experiments.studies.prediction.findings import (
     Findings,

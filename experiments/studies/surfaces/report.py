@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import GENERIC, PRIOR, baselines, median_errors, prior_alone
-from experiments.common.record import Record
-from experiments.common.report import cautions, provenance_of
-from experiments.common.tables import write_table
+from experiments.common.records.record import Record
+from experiments.common.records.report import cautions, provenance_of
+from experiments.common.records.tables import write_table
 from experiments.studies.surfaces.findings import Findings
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Trust
 from mvest.reporting.case.findings import UnknownRow

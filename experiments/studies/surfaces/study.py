@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.building.patient_store import make_patient
 from experiments.common.cases import findings as of_cases
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.patient_store import make_patient
-from experiments.common.record import Outcome
+from experiments.common.records.record import Outcome
 from experiments.common.study import Job, Section, Study
 from experiments.studies.surfaces.doors import arrive
 from experiments.studies.surfaces.findings import Findings, SurfaceError, thickness_error

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from experiments.common.estimates import (
+from experiments.common.records.estimates import (
     Identified,
     Innovation,
     Paper,
     SeedRun,
     Spread,
 )
-from experiments.common.findings import Vector
+from experiments.common.records.findings import Vector
 from mvest.problem.estimate import Modulus
 from mvest.valve.measure.measurements import ClosureMeasurements
 

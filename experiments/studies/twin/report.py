@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.common.estimates import Paper
-from experiments.common.record import Record
-from experiments.common.report import heading
+from experiments.common.records.estimates import Paper
+from experiments.common.records.record import Record
+from experiments.common.records.report import heading
 from experiments.studies.twin.findings import Findings
 from mvest.files import write_atomically
 from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std

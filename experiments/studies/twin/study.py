@@ -12,19 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.build import Twin, build_filter, build_twin
-from experiments.common.estimate_record import (
+from experiments.common.building.extrapolated import Extrapolated
+from experiments.common.building.filters import build_filter
+from experiments.common.building.gate import gate_of
+from experiments.common.building.twin import Twin, build_twin
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.records.estimate_record import (
     identified_of,
     innovation_of,
     moduli_error,
     seed_run,
 )
-from experiments.common.estimates import Paper
-from experiments.common.extrapolated import Extrapolated
-from experiments.common.findings import Vector, vector
-from experiments.common.gate import gate_of
-from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.record import Mesh, Outcome
+from experiments.common.records.estimates import Paper
+from experiments.common.records.findings import Vector, vector
+from experiments.common.records.record import Mesh, Outcome
 from experiments.common.study import Check, Job, Section, Study
 from experiments.studies.twin.findings import Findings
 from experiments.studies.twin.report import (

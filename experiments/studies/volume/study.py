@@ -10,7 +10,7 @@ from experiments.common.cases.findings import Findings
 from experiments.common.cases.report import case_text, write_cases
 from experiments.common.cases.settings import ImagedSettings
 from experiments.common.cases.volume import detect_in_volume, run_volume, write_image_step
-from experiments.common.record import Outcome
+from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job, Study
 from experiments.studies.volume.settings import Settings

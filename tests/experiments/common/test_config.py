@@ -3,7 +3,9 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.common.build import build_filter, build_twin, truth_mesh
+from experiments.common.building.filters import build_filter
+from experiments.common.building.truth import truth_mesh
+from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, register
 from experiments.common.schema import build
 from experiments.runner.jobs.request import as_published

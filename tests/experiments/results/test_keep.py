@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.common.record import require_written
+from experiments.common.records.record import require_written
 from experiments.results.keep import publish, regenerate
 from experiments.studies.twin.study import STUDY
 from experiments.tables import main

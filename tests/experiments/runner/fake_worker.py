@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from types import ModuleType
 
-from experiments.common.record import Outcome
+from experiments.common.records.record import Outcome
 from experiments.common.study import Study
 from experiments.runner.execution import worker
 from experiments.studies.twin.settings import Settings

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import tables
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.twin.findings import Findings
 from mvest.closure.model import ClosureModel

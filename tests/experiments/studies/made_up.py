@@ -2,7 +2,7 @@
 
 from typing import Any, TypeVar
 
-from experiments.common.record import SCHEMA, GitState, Model, Provenance, Record
+from experiments.common.records.record import SCHEMA, GitState, Model, Provenance, Record
 
 F = TypeVar("F")
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 from experiments.common.cases.findings import Findings, Revealed
-from experiments.common.estimates import Data, SeedRun
-from experiments.common.record import Outcome, Record
+from experiments.common.records.estimates import Data, SeedRun
+from experiments.common.records.record import Outcome, Record
 from mvest.reporting.case.findings import (
     About,
     CaseFindings,

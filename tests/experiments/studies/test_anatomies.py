@@ -5,7 +5,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.anatomy import template_of
+from experiments.common.building.anatomy import template_of
 from experiments.common.config import plain, register
 from experiments.common.places import ANATOMIES
 from mvest.valve.anatomy.template import Template

@@ -12,7 +12,7 @@ from experiments.common.cases.own_case import read_configured, settings_of
 from experiments.common.cases.report import write_case_run
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.config import hash_of
-from experiments.common.record import NOT_GATED, read_record, stamp, write_record
+from experiments.common.records.record import NOT_GATED, read_record, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.run import main

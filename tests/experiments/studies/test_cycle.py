@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.common import whole_cycle
-from experiments.common.cycle_settings import CycleSettings
-from experiments.common.whole_cycle import shift_by_check_mesh
+from experiments.common.building import whole_cycle
+from experiments.common.building.cycle_settings import CycleSettings
+from experiments.common.building.whole_cycle import shift_by_check_mesh
 from experiments.run import main
 from experiments.studies.cycle import study as cycle
 from experiments.studies.cycle.study import frame_sets

@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from experiments.common.config import register
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.common.schema import build
 from experiments.run import main
 from experiments.studies.donor.findings import Findings

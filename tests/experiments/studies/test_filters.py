@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from experiments.common.build import build_filter
+from experiments.common.building.filters import build_filter
 from experiments.common.config import plain, register
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.filters.findings import Findings
 from experiments.studies.filters.problem import (

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.filters.findings import (
     Estimated,
     Findings,

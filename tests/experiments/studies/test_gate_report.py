@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.common.gate import anatomy_digest, gate_of
+from experiments.common.building.gate import anatomy_digest, gate_of
 from experiments.common.places import ANATOMIES, GATE_RECORDS
-from experiments.common.record import (
+from experiments.common.records.record import (
     NOT_GATED,
     Mesh,
     Outcome,
@@ -16,7 +16,7 @@ from experiments.common.record import (
     stamp,
     write_record,
 )
-from experiments.common.report import cautions, page
+from experiments.common.records.report import cautions, page
 from experiments.studies.gate.findings import Findings, Followed, Limits, Row
 from experiments.studies.gate.report import gate_answer, gate_table, gate_words, write_gate
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from experiments.common.build import closure_model
+from experiments.common.building.closure import closure_model
 from experiments.common.config import register
 from experiments.run import main
 from mvest.closure.model import ClosureModel

@@ -5,7 +5,7 @@ import sys
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.heart.findings import Findings, TwinRow
 from experiments.studies.heart.report import heart_answer, heart_table, heart_words

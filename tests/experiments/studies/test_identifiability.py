@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.identifiability.figures import designs_figure
 from experiments.studies.identifiability.findings import Findings

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.study import Job
-from experiments.common.virtual_patients import PatientSettings
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
 from experiments.studies.imaged_patient.budget import UNSEEN, with_unseen, write_budget

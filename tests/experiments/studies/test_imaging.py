@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from experiments import tables
 from experiments.common.config import register
-from experiments.common.record import Record, read_record
+from experiments.common.records.record import Record, read_record
 from experiments.common.schema import build
 from experiments.results.keep import publish
 from experiments.run import main

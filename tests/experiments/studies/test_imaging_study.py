@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from experiments.studies.imaging.findings import (
     Accuracy,
     Confidences,

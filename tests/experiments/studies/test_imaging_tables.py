@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import pandas as pd
 import pytest
 
-from experiments.common.record import record_from
+from experiments.common.records.record import record_from
 from experiments.studies.imaging.findings import (
     DetectedVolume,
     Evaluation,

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
 from experiments.studies.joint.findings import Findings, Fit, Frame, MeshError, OtherMesh, Pass
 from experiments.studies.joint.report import joint_words
 from experiments.studies.joint.study import STUDY

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.common.record import read_record, record_from, write_record
+from experiments.common.records.record import read_record, record_from, write_record
 from experiments.studies.law.findings import Findings
 from experiments.studies.law.report import curves_figure, law_text
 from experiments.studies.law.study import STUDY

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.law.findings import Findings
 

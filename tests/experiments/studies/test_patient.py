@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common import patient_store
+from experiments.common.building import patient_store
+from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import SECRET, read_estimate
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.record import NOT_GATED, stamp, write_record
+from experiments.common.records.record import NOT_GATED, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.common.virtual_patients import PatientSettings
 from experiments.studies.patient import study as patient
 from experiments.studies.patient.settings import Settings
 from experiments.studies.patient.study import STUDY, expect_patient, reveal, run_patient

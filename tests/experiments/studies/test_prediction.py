@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.common.record import read_record
+from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.prediction import study as prediction
 from experiments.studies.prediction.figure import PANELS, prediction_figure

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from experiments.common import patient_store
-from experiments.common.record import Outcome
+from experiments.common.building import patient_store
+from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job
 from experiments.studies.surfaces import study

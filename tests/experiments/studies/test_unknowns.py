@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.common.record import Record
-from experiments.common.whole_cycle import Bound
+from experiments.common.building.whole_cycle import Bound
+from experiments.common.records.record import Record
 from experiments.run import main
 from experiments.studies.chord.findings import Findings as ChordFindings
 from experiments.studies.chord.findings import Fit as ChordFit

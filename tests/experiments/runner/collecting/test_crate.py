@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import main
-from experiments.common.record import write_record
+from experiments.common.records.record import write_record
 from experiments.runner.collecting.crate import CRATE, write_crate
 from mvest.errors import InputError
 from mvest.files import sha256_of

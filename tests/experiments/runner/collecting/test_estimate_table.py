@@ -9,7 +9,7 @@ import pytest
 from pandas import read_csv, read_parquet
 
 from experiments.cli import main
-from experiments.common.record import write_record
+from experiments.common.records.record import write_record
 from experiments.runner.collecting.estimate_table import COLUMNS, estimate_table, write_estimates
 from mvest.errors import InputError
 from mvest.provenance import sealed, write_json

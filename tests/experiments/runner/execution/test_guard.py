@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import experiments.runner.execution.worker as worker_module
-from experiments.common.record import SCHEMA, Outcome, stamp, write_record
+from experiments.common.records.record import SCHEMA, Outcome, stamp, write_record
 from experiments.runner.execution.guard import WorkerProcess, run_apart
 from experiments.runner.execution.job import FailedRunError
 from experiments.runner.jobs.folder import finished_record, is_done, last_record, lock, mark_done

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from experiments import cli
-from experiments.common.estimates import SeedRun
+from experiments.common.records.estimates import SeedRun
 from experiments.run import main
 from experiments.runner.collecting import collect
 from experiments.runner.execution import guard

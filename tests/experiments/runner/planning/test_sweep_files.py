@@ -10,15 +10,16 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from experiments.common.build import build_filter, build_twin
+from experiments.common.building.filters import build_filter
+from experiments.common.building.twin import build_twin
+from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import SECRET
 from experiments.common.config import hash_of, register
-from experiments.common.estimates import SeedRun
 from experiments.common.ranges import require_in_range
-from experiments.common.record import Outcome
+from experiments.common.records.estimates import SeedRun
+from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.common.virtual_patients import PatientSettings
 from experiments.runner.jobs.limits import TIME_LIMIT_S
 from experiments.runner.planning.compose import expand, grids, make_plan
 from experiments.runner.plugins import register_plugins

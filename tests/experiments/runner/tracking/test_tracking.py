@@ -17,7 +17,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from pandas import read_parquet
 
-from experiments.common.record import SCHEMA, Record, here_and_now
+from experiments.common.records.record import SCHEMA, Record, here_and_now
 from experiments.runner.collecting import comparison
 from experiments.runner.jobs.compared import Compared, compared
 from experiments.runner.planning.plan import PLAN, Plan, PlannedJob

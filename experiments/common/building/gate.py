@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common.places import GATE_RECORDS
-from experiments.common.record import FAILED_GATE, NOT_GATED, PASSED_GATE
+from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import build
 from mvest.closure.anchors import content_digest
 from mvest.errors import InputError

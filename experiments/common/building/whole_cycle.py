@@ -8,11 +8,12 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from experiments.common.build import build_filter, closure_model
-from experiments.common.cycle_settings import CycleSettings
-from experiments.common.findings import finite, vector
+from experiments.common.building.closure import closure_model
+from experiments.common.building.cycle_settings import CycleSettings
+from experiments.common.building.filters import build_filter
+from experiments.common.building.store import Store, StoredModel
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
-from experiments.common.store import Store, StoredModel
+from experiments.common.records.findings import finite, vector
 from mvest.closure.cycle.model import CycleModel
 from mvest.closure.cycle.observation import CycleObservation
 from mvest.closure.cycle.protocol import CycleProtocol

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.common.findings import Rows, Vector
-from experiments.common.record import Status
+from experiments.common.records.findings import Rows, Vector
+from experiments.common.records.record import Status
 from mvest.reporting.findings import Identified, Innovation, Spread
 
 __all__ = ["Data", "Identified", "Innovation", "Paper", "SeedRun", "Spread"]

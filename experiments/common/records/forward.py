@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TypeVar
 
-from experiments.common.record import Mesh, Outcome
+from experiments.common.records.record import Mesh, Outcome
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = ["outcome_of"]

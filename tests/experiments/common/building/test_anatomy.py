@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from experiments.common.anatomy import anatomy_of, build_mesh, template_of, upright
-from experiments.common.build import build_twin, closure_model
+from experiments.common.building.anatomy import anatomy_of, build_mesh, template_of, upright
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import anatomy_digest
+from experiments.common.building.twin import build_twin
 from experiments.common.config import hash_of, plain
-from experiments.common.gate import anatomy_digest
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError

@@ -205,8 +205,8 @@ class Record(Generic[F]):
     findings : F
         None where the job died before it had any.
     gate : str or None
-        What the gate said of the anatomy (see `experiments.common.gate`); None where the study has
-        none of the configured anatomies.
+        What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
+        study has none of the configured anatomies.
     """
 
     schema: int

@@ -13,8 +13,8 @@ import experiments
 import mvest.closure.model
 import mvest.files
 import mvest.source
-from experiments.common.build import MADE_BY
-from experiments.common.store import Store, StoredModel, key_of
+from experiments.common.building.store import Store, StoredModel, key_of
+from experiments.common.building.truth import MADE_BY
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.estimation import Prediction
@@ -89,7 +89,7 @@ def test_what_was_written_half_is_never_read(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(experiments.common.store.np, "savez", interrupted)
+        patched.setattr(experiments.common.building.store.np, "savez", interrupted)
         with pytest.raises(KeyboardInterrupt):
             StoredModel(model, tmp_path, "key")(AT)
     assert not list(tmp_path.glob("*.npz"))
@@ -256,7 +256,7 @@ def test_a_truth_outlives_what_has_no_part_in_it(truth):
     code = truth.code
     edit(code / "mvest" / "estimation" / "filters" / "iterated.py", "max_iterations", "max_loops")
     edit(code / "mvest" / "reporting" / "style.py", "import", "X = 1\nimport")
-    edit(code / "experiments" / "common" / "build.py", '"paper", ', "")
+    edit(code / "experiments" / "common" / "building" / "truth.py", "fewer cells", "less")
     (code / "mvest" / "mechanics" / "another.py").write_text("VISCOSITY = 1.0\n")
     assert not truth()
     # That is, until it is used.

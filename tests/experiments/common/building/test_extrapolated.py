@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.common.build import build_twin
-from experiments.common.extrapolated import Extrapolated
-from experiments.common.store import StoredModel
+from experiments.common.building.extrapolated import Extrapolated
+from experiments.common.building.store import StoredModel
+from experiments.common.building.twin import build_twin
 from mvest.errors import ConfigurationError
 from mvest.estimation.prediction import Prediction
 from tests.experiments.common.test_config import composed, plain

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.common.store import StoredModel
+from experiments.common.building.store import StoredModel
 from mvest.estimation.prediction import Prediction
 from mvest.kept import Counts
 from mvest.typing import FloatArray

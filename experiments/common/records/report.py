@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from experiments.common.record import Record
+from experiments.common.records.record import Record
 from mvest.files import write_atomically
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.anatomy import template_of
-from experiments.common.build import mechanics_of
-from experiments.common.store import Store
-from experiments.common.virtual_patients import (
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.store import Store
+from experiments.common.building.virtual_patients import (
     PatientSettings,
     draw_patient_values,
     first_that_closes,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.common.estimates import (
+from experiments.common.records.estimates import (
     Identified,
     Innovation,
     SeedRun,
     Spread,
 )
-from experiments.common.findings import Vector, finite, rows, vector
+from experiments.common.records.findings import Vector, finite, rows, vector
 from mvest.estimation.estimate import Estimate
 from mvest.problem.estimate import StudyResult
 from mvest.reporting.expectation import alike
