@@ -248,6 +248,6 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
 
     monkeypatch.setattr("mvest.personalise.estimation.build_model", build)
     monkeypatch.setattr("mvest.personalise.expectation.build_model", build)
-    monkeypatch.setattr("mvest.personalise.considered_geometry._variations", lambda *_: [])
+    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_modes", lambda *_: ())
     monkeypatch.setattr("mvest.personalise.observation_errors.law_columns", lambda *_: ())
     return built

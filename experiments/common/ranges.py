@@ -181,7 +181,7 @@ RANGES = (
         "patients every modes points path_steps beats held_out held_out.* count vertices "
         "contact_vertices *_runs error_samples open_frame closed_frame curve hypotheses shared "
         "frames crossings volumes draft_volumes trees many_trees leaves min_leaf_samples "
-        "samples.* load_steps least_effective",
+        "samples.* load_steps least_effective renewals",
     ),
     # The simulated scanner, and the fit to what it sees.
     Range(-200, 200, "dB", "levels, per cm and MHz where they fall", "*_db *_db_per_cm*"),

@@ -7,7 +7,7 @@ they are, so that the same material points are observed, touch and are held.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -26,12 +26,15 @@ from mvest.mechanics.valve_system import (
 )
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.band import leaflet_normals, leaflet_normals_change
-from mvest.valve.anatomy.valve import lumped_areas_change
+from mvest.valve.anatomy.valve import Valve, lumped_areas_change
 from mvest.valve.geometry.proximity import ClosestPoints, closest_points
 from mvest.valve.geometry.triangles import unit_rows
 from mvest.valve.mesh.embedding import Embedding, embed
 
-__all__ = ["RestGeometry"]
+__all__ = ["PARTS", "RestGeometry"]
+
+PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "insertions")
+"""Of a geometry, by the methods of `RestGeometry` that say what each is a change of."""
 
 
 class RestGeometry:
@@ -173,6 +176,77 @@ class RestGeometry:
         ends = np.broadcast_to(moves[:, :, None], (len(moves), *slope.shape))
         patches = patch_change(weights, slope, ends)
         return RestVariation(self._still(len(moves)), patches=patches, members=members)
+
+    def variation(self, parts: Mapping[str, FloatArray]) -> RestVariation:
+        """Of several parts of the geometry at once, each ``(q, ...)`` as its method takes it.
+
+        Parameters
+        ----------
+        parts : mapping
+            Some of `PARTS` -> as many quantities of each.
+        """
+        return RestVariation.summed([getattr(self, name)(values) for name, values in parts.items()])
+
+    def displaced(self, parts: Mapping[str, FloatArray]) -> ClosureModel:
+        """The model of the valve with another geometry, its guide's too; it has closed nothing.
+
+        Everything embedded stays where it is in the material. A displacement of the open shape
+        carries the mesh along as its derivative says.
+
+        Parameters
+        ----------
+        parts : mapping
+            Some of `PARTS` -> what `variation` takes, of one quantity.
+
+        Raises
+        ------
+        GeometryError
+            If a leaflet would have no thickness, or a chord no length.
+        """
+        own = {name: np.asarray(values)[None] for name, values in parts.items()}
+        model, still = self.model, np.zeros_like(self.model.mesh.nodes)
+        shape = self.shape(own["shape"]).nodes[0] if "shape" in own else still
+        thicker = self.thickness(own["thickness"]).nodes[0] if "thickness" in own else still
+        nodes = shape + thicker
+        mesh = replace(model.mesh, nodes=model.mesh.nodes + nodes)
+        if "fibres" in own:
+            turned = self.fibres(own["fibres"]).fibre
+            assert turned is not None
+            fibre = mesh.fibre + turned[0]
+            mesh = replace(mesh, fibre=fibre / np.linalg.norm(fibre, axis=2, keepdims=True))
+        ends = self._ends(model.observed(nodes)) + parts.get("insertions", 0.0)
+        chordae = replace(
+            model.valve.chordae,
+            insertion=model.valve.chordae.insertion + ends,
+            rest_length=model.valve.chordae.rest_length * (1.0 + parts.get("rest_lengths", 0.0)),
+        )
+        thickness = parts.get("thickness", np.zeros(len(self.surface.vertices)))
+
+        def moved(
+            valve: Valve, by: FloatArray, thicker: FloatArray, to: FloatArray | float
+        ) -> Valve:
+            annulus, tips = np.array(valve.motion.annulus), np.array(valve.motion.papillary_tips)
+            annulus[0] += by[valve.annulus]
+            annulus[-1] += to
+            tips[-1] += parts.get("tips", 0.0)
+            surface = replace(
+                valve.surface,
+                vertices=valve.surface.vertices + by,
+                thickness=valve.surface.thickness * (1.0 + thicker),
+            )
+            motion = replace(valve.motion, annulus=annulus, papillary_tips=tips)
+            return replace(valve, surface=surface, chordae=chordae, motion=motion)
+
+        to = parts.get("annulus", 0.0)
+        contact = moved(
+            model.contact_valve, self._sampled(nodes), self._at(self._samples, thickness), to
+        )
+        same = model.contact_valve is model.valve
+        valve = contact if same else moved(model.valve, model.observed(nodes), thickness, 0.0)
+        guide = None if model.guide is None else RestGeometry(model.guide).displaced(parts)
+        return replace(
+            model, valve=valve, contact_valve=contact, mesh=mesh, guide=guide, anchors=None
+        )
 
     def change(
         self,

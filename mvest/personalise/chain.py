@@ -78,9 +78,13 @@ def personalise_case(
         stds = narrower(estimation, result)
     share = image_share(estimation, result)
     budget = error_budget(estimation, result)
+    unconsidered, geometry = estimation.errors.unconsidered, estimation.errors.geometry
     moduli_only = paper = confirmed = None
-    # With everything else known.
-    estimation.errors.considered = ()
+    if settings.confirm and frames.distances:
+        began = time.perf_counter()
+        confirmed = largest_difference_anew(estimation, result)
+        timed("confirm", began)
+    estimation.take_as_stated()
     if settings.moduli_only:
         moduli_only = estimation.estimate_moduli(
             IteratedFilter(settings.tolerance, max_iterations=settings.max_iterations),
@@ -91,10 +95,6 @@ def personalise_case(
     if settings.paper is not None:
         paper = estimation.estimate_as_paper(settings.paper)
         seconds["paper"] = paper.seconds
-    if settings.confirm and frames.distances:
-        began = time.perf_counter()
-        confirmed = largest_difference_anew(estimation, result)
-        timed("confirm", began)
     return Personalised(
         case,
         estimation.settings,
@@ -111,8 +111,9 @@ def personalise_case(
         stds,
         confirmed,
         seconds,
-        estimation.errors.geometry,
+        geometry,
         share,
-        estimation.errors.unconsidered,
+        unconsidered,
         budget,
+        estimation.moved,
     )

@@ -10,6 +10,7 @@ modes with the parameters, and to report the parameters alone.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,15 @@ from mvest.valve.anatomy.template import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 
-__all__ = ["ConsideredGeometry", "closure_at", "geometry_columns", "observed_change"]
+__all__ = [
+    "ConsideredGeometry",
+    "GeometryColumns",
+    "GeometryModes",
+    "closure_at",
+    "geometry_columns",
+    "geometry_modes",
+    "observed_change",
+]
 
 SEEN = 0.3
 """Standard deviations of the stated noise below which a combination of columns is left out."""
@@ -83,6 +92,10 @@ class ConsideredGeometry:
         are learned: one standard deviation of its logarithm, as a factor.
     share : float
         Of the variance of smooth modes that is represented; finer ones are left out.
+    renewals : int
+        How often all is estimated anew about the geometry that the last estimate expects: with it,
+        what is not known of the geometry is of first order about there, and not about what was
+        seen. Each costs about as much as the estimate.
     """
 
     shape_mm: float = 0.3
@@ -96,12 +109,15 @@ class ConsideredGeometry:
     fibre_degrees: float = 10.0
     factor: float = 2.0
     share: float = 0.9
+    renewals: int = 0
 
     def __post_init__(self) -> None:
         for name in _SCALES:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"considered geometry {name} = {value}, expected >= 0")
+        if self.renewals < 0:
+            raise InputError(f"considered geometry renewals = {self.renewals}, expected >= 0")
         for name in ("shape_length_mm", "annulus_length_mm"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
@@ -112,23 +128,90 @@ class ConsideredGeometry:
             raise InputError(f"considered geometry share = {self.share}, expected within 0 and 1")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometryModes:
+    """Independent errors of one kind of a geometry, one standard deviation each.
+
+    Attributes
+    ----------
+    name : str
+    parts : mapping
+        Of `mvest.closure.rest_geometry.PARTS` -> ``(q, ...)``, what each mode does to it.
+    factor : float
+        To which their size is known.
+    """
+
+    name: str
+    parts: Mapping[str, FloatArray]
+    factor: float = 1.0
+
+    def __len__(self) -> int:
+        return len(next(iter(self.parts.values())))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometryColumns:
+    """What modes of a geometry's error do to an observation, to first order.
+
+    Attributes
+    ----------
+    modes : tuple of GeometryModes
+    rows : tuple of (k, q)
+        Of each kind: the observation by its modes.
+    columns : tuple of ErrorColumns
+        The same of low rank, as far as it can be told from noise.
+    """
+
+    modes: tuple[GeometryModes, ...]
+    rows: tuple[FloatArray, ...]
+    columns: tuple[ErrorColumns, ...]
+
+    def expected(
+        self, noise: ObservationNoise, residual: FloatArray, scales: Mapping[str, float]
+    ) -> tuple[FloatArray, ...]:
+        """Each kind's modes ``(q,)``, most probable where the parameters are as estimated.
+
+        Parameters
+        ----------
+        noise : ObservationNoise
+            Of the observation, with what the geometry adds.
+        residual : (k,)
+            Of the estimate.
+        scales : mapping
+            Kind -> its size as it was learned, 1 where it was not.
+        """
+        white = noise.whiten(residual)
+        return tuple(
+            scales.get(own.name, 1.0) ** 2 * (noise.whiten(rows).T @ white)
+            for own, rows in zip(self.modes, self.rows, strict=True)
+        )
+
+    def offset(self, modes: Sequence[FloatArray]) -> FloatArray:
+        """What modes ``(q,)`` of each kind do to the observation ``(k,)``."""
+        return np.sum([rows @ z for rows, z in zip(self.rows, modes, strict=True)], axis=0)
+
+    def displacement(self, modes: Sequence[FloatArray]) -> dict[str, FloatArray]:
+        """What they do to the geometry, for `RestGeometry.displaced`."""
+        total: dict[str, FloatArray] = {}
+        for own, z in zip(self.modes, modes, strict=True):
+            for part, moves in own.parts.items():
+                total[part] = total.get(part, 0.0) + np.tensordot(z, moves, 1)
+        return total
+
+
 def geometry_columns(
-    case: ValveCase,
-    considered: ConsideredGeometry,
+    modes: Sequence[GeometryModes],
     registered: RegisteredModel,
     observation: Observed,
     noise: ObservationNoise,
     m: FloatArray,
     predicted: FloatArray,
-) -> tuple[ErrorColumns, ...] | str:
+) -> GeometryColumns | str:
     """Errors of an observation from those of the geometry, one kind after another, or why none.
-
-    Where samples tell how all frames may be in error, only what they do not tell is considered.
 
     Parameters
     ----------
-    case : ValveCase
-    considered : ConsideredGeometry
+    modes : sequence of GeometryModes
     registered : RegisteredModel
         Of the case; its last closed state is gone on from.
     observation : Observed
@@ -140,22 +223,22 @@ def geometry_columns(
     predicted : array
         All frames as predicted at ``m``, stacked.
     """
+    if not modes:
+        return GeometryColumns((), (), ())
     model, at, states = closure_at(registered, m)
     geometry = RestGeometry(model)
-    kinds = _variations(case, considered, geometry)
-    if not kinds:
-        return ()
-    joined = RestVariation.joined([own for _, own, _ in kinds])
+    joined = RestVariation.joined([geometry.variation(own.parts) for own in modes])
     change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):
         return change
     rows = observed_change(registered, observation, m, predicted, change)
-    columns, start = [], 0
-    for name, own, factor in kinds:
-        members = rows[:, start : start + len(own)]
-        columns.append(ErrorColumns(name, _of_low_rank(members, noise), factor))
-        start += len(own)
-    return tuple(columns)
+    ends = np.cumsum([len(own) for own in modes])[:-1]
+    split = tuple(np.split(rows, ends, axis=1))
+    columns = tuple(
+        ErrorColumns(own.name, _of_low_rank(members, noise), own.factor)
+        for own, members in zip(modes, split, strict=True)
+    )
+    return GeometryColumns(tuple(modes), split, columns)
 
 
 def closure_at(
@@ -186,42 +269,46 @@ def observed_change(
     return predict(linear, np.zeros(jacobian.shape[1]), derivatives=True).jacobian
 
 
-def _variations(
-    case: ValveCase, considered: ConsideredGeometry, geometry: RestGeometry
-) -> list[tuple[str, RestVariation, float]]:
-    """Name, modes of one standard deviation each, and factor of each kind."""
-    surface = case.surface
-    kinds: list[tuple[str, RestVariation, float]] = []
+def geometry_modes(
+    case: ValveCase, considered: ConsideredGeometry, model: ClosureModel
+) -> tuple[GeometryModes, ...]:
+    """What is not known of the geometry that the closure of a case is built from.
+
+    Where samples tell how all frames may be in error, only what they do not tell is considered.
+    """
+    surface, geometry = case.surface, RestGeometry(model)
+    kinds: list[GeometryModes] = []
     if case.error_samples is None:
         if considered.shape_mm:
             modes = smooth_modes(surface.vertices, considered.shape_length_mm, considered.share)
             moves = considered.shape_mm * _each_way(modes)
-            kinds.append(("open shape", geometry.shape(moves), considered.factor))
+            kinds.append(GeometryModes("open shape", {"shape": moves}, considered.factor))
         if considered.annulus_mm:
-            annulus = geometry.model.contact_valve.motion.annulus[-1]
+            annulus = model.contact_valve.motion.annulus[-1]
             modes = smooth_modes(annulus, considered.annulus_length_mm, considered.share)
             moves = considered.annulus_mm * _each_way(modes)
-            kinds.append(("annulus", geometry.annulus(moves), considered.factor))
+            kinds.append(GeometryModes("annulus", {"annulus": moves}, considered.factor))
         if considered.tips_mm:
             moves = considered.tips_mm * _each_way(np.eye(len(case.valve.papillary_tips)))
-            kinds.append(
-                ("papillary tips", geometry.tips(moves, rest_lengths_by_tips(case, moves)), 1.0)
-            )
+            lengths = rest_lengths_by_tips(case, moves)
+            follow = {} if lengths is None else {"rest_lengths": lengths}
+            kinds.append(GeometryModes("papillary tips", {"tips": moves} | follow))
     if considered.insertions_mm:
         ends = np.eye(len(case.valve.chordae))[:, None, :, None]
         moves = considered.insertions_mm * ends * geometry.along_ends()[:, :, None]
-        moves = moves.reshape(-1, *moves.shape[2:])
-        kinds.append(("insertions", geometry.insertions(moves), 1.0))
+        kinds.append(
+            GeometryModes("insertions", {"insertions": moves.reshape(-1, *moves.shape[2:])})
+        )
     if considered.rest_lengths and case.chordae_follow:
         changes = considered.rest_lengths * np.eye(len(case.valve.chordae))
-        kinds.append(("rest lengths", geometry.rest_lengths(changes), 1.0))
+        kinds.append(GeometryModes("rest lengths", {"rest_lengths": changes}))
     if considered.thickness:
         factors = considered.thickness * _leaflets(surface)
-        kinds.append(("thickness", geometry.thickness(factors), 1.0))
+        kinds.append(GeometryModes("thickness", {"thickness": factors}))
     if considered.fibre_degrees:
         angles = np.deg2rad(considered.fibre_degrees) * np.eye(len(surface.region_names))
-        kinds.append(("fibres", geometry.fibres(angles), 1.0))
-    return kinds
+        kinds.append(GeometryModes("fibres", {"fibres": angles}))
+    return tuple(kinds)
 
 
 def smooth_modes(points: FloatArray, length: float, share: float) -> FloatArray:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from mvest.cases.case import Role, ValveCase
-from mvest.closure.frames import is_frame_pressure
-from mvest.closure.model import ClosureModel
+from mvest.closure.frames import FramesModel, is_frame_pressure
+from mvest.closure.model import ClosedState, ClosureModel
+from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.considered import SchmidtFilter
@@ -28,6 +30,7 @@ from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treat
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Observed, Problem
 from mvest.problem.registration import REGISTRATION, RegisteredModel
+from mvest.typing import FloatArray
 
 __all__ = ["CaseEstimation", "OnStep"]
 
@@ -40,8 +43,38 @@ LEARNED = 4
 OnStep = Callable[[float, int], None]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _CaseClosure:
+    """The closure of a case's valve, in the forms in which the parts of an estimation take it."""
+
+    model: ClosureModel
+    frames: FramesModel | None
+    registered: RegisteredModel
+    shared: SharedStart[ClosedState]
+
+    @classmethod
+    def of(
+        cls,
+        case: ValveCase,
+        settings: PersonaliseSettings,
+        names: tuple[str, ...],
+        model: ClosureModel,
+        start: FloatArray,
+    ) -> _CaseClosure:
+        frames = frames_model(case, settings, model)
+        registered = RegisteredModel(frames or model, names)
+        return cls(model, frames, registered, SharedStart(registered, start))
+
+
 class CaseEstimation:
-    """The objects that the parts of one personalisation share."""
+    """The objects that the parts of one personalisation share.
+
+    Attributes
+    ----------
+    moved : float or None
+        Standard deviations by which the last renewed linearisation of the geometry moved a modulus
+        at most; None without one.
+    """
 
     def __init__(
         self,
@@ -63,8 +96,6 @@ class CaseEstimation:
         if model is None:
             model = build_model(case, settings, store)
             model.on_step = on_step
-        self.model = model
-        self.frames = frames_model(case, settings, self.model)
         self.on_iterate = on_iterate
         free = [u for u in settings.unknowns if u.treatment is not Treatment.FIXED]
         # Those of the closure first, in its order; then the displacement.
@@ -72,20 +103,21 @@ class CaseEstimation:
         rigid = [u for u in free if u.name in REGISTRATION]
         self.unknowns = (*own, *rigid)
         self.names = tuple(u.name for u in self.unknowns)
-        self.registered = RegisteredModel(self.frames or self.model, self.names)
         self.prior = Gaussian.from_variance(
             np.array([u.mean for u in self.unknowns]),
             np.array([u.std for u in self.unknowns]) ** 2,
         )
         self.transform = Log(tuple(u.is_positive for u in self.unknowns))
         start = self.transform.inverse(self.transform.forward(self.prior.mean))
-        self.shared = SharedStart(self.registered, start)
+        self._stated = _CaseClosure.of(case, settings, self.names, model, start)
+        self._use(self._stated)
         self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.estimated = np.array([name not in self._held for name in self.names])
         several = None if self.frames is None else self.frames.frames
         self.fitted = FittedFrames(case, settings, self.model.valve, several)
         self.errors = ObservationErrors(self.fitted, self.registered)
         self.filter = self._filter(settings.tolerance)
+        self.moved: float | None = None
 
     def _filter(self, tolerance: float, start: tuple[float, ...] | None = None) -> Filter:
         """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates."""
@@ -129,7 +161,79 @@ class CaseEstimation:
         result = self.estimate(
             self._filter(self.settings.tolerance, tuple(at.tolist())), self.errors.observation()
         )
-        return replace(result, seconds=rough.seconds + result.seconds)
+        result = replace(result, seconds=rough.seconds + result.seconds)
+        considered = self.settings.considered_geometry
+        # Samples of the frames' errors say what is likely of the geometry; nothing is expected.
+        renewals = (
+            0 if considered is None or self.errors.samples is not None else considered.renewals
+        )
+        for _ in range(renewals):
+            renewed = self._about_expected_geometry(result)
+            if renewed is None:
+                break
+            self.moved = _standard_deviations(result, renewed)
+            result = renewed
+        return result
+
+    def _about_expected_geometry(self, result: StudyResult) -> StudyResult | None:
+        """The estimate linearised at the geometry that the last one expects; None without one.
+
+        One further step of Gauss and Newton for moduli and geometry together: the closure is that
+        of a displaced valve, and the prior of the geometry's errors stays about what was seen.
+        """
+        filtered, observation, known = result.filtered, result.observation, self.errors.known
+        if known is None or observation is None or filtered is None or filtered.prediction is None:
+            return None
+        began, m = time.perf_counter(), filtered.mean
+        residual = observation.y - filtered.prediction.y
+        modes = self.errors.expected_modes(residual, filtered.learned)
+        displaced = RestGeometry(self._stated.model).displaced(known.displacement(modes))
+        before, errors = self._closure, self.errors
+        self._use(_CaseClosure.of(self.case, self.settings, self.names, displaced, m))
+        self.errors = errors.about(self.registered, modes)
+        prediction = self.shared(m)
+        if prediction.converged:
+            self.errors.consider(m, prediction.y)
+        if not prediction.converged or self.errors.unconsidered:
+            why = self.errors.unconsidered or (prediction.reason,)
+            self._use(before)
+            self.errors = errors
+            errors.unconsidered = tuple(
+                f"about the geometry that is expected: {one}" for one in why
+            )
+            return None
+        after = self.estimate(
+            self._filter(self.settings.tolerance, tuple(m.tolist())), self.errors.observation()
+        )
+        return replace(after, seconds=result.seconds + time.perf_counter() - began)
+
+    def take_as_stated(self) -> None:
+        """From now on with geometry and law as they are stated, known exactly."""
+        self._use(self._stated)
+        self.errors = self.errors.about(self.registered, ())
+
+    def _use(self, closure: _CaseClosure) -> None:
+        self._closure = closure
+
+    @property
+    def model(self) -> ClosureModel:
+        """The closure of the valve, displaced to the geometry that is expected if there is one."""
+        return self._closure.model
+
+    @property
+    def frames(self) -> FramesModel | None:
+        """All closed frames that are fitted, if they are several."""
+        return self._closure.frames
+
+    @property
+    def registered(self) -> RegisteredModel:
+        """The same, displaced as a whole before it is seen."""
+        return self._closure.registered
+
+    @property
+    def shared(self) -> SharedStart[ClosedState]:
+        """The same, for many estimations."""
+        return self._closure.shared
 
     def estimate(self, filter_: Filter, observation: Observed) -> StudyResult:
         """All unknowns."""
@@ -200,3 +304,12 @@ class CaseEstimation:
         covariance = np.array(posterior.covariance)
         covariance[np.ix_(estimated, estimated)] += learned.covariance
         return replace(posterior, covariance=covariance)
+
+
+def _standard_deviations(before: StudyResult, after: StudyResult) -> float | None:
+    """By how many standard deviations a modulus differs at most between two estimates."""
+    if before.filtered is None or after.filtered is None:
+        return None
+    one, other = before.filtered.transformed, after.filtered.transformed
+    moduli = [name.startswith("E_f.") for name in after.filtered.names]
+    return float(np.max(np.abs(other.mean - one.mean)[moduli] / other.std[moduli]))

@@ -180,10 +180,13 @@ class WeighedObservation:
     ----------
     plain : Observed
     R : NoiseCovariance
+    offset : (k,) or float
+        Added to what was seen: the mean of the noise, of other sign.
     """
 
     plain: Observed
     R: NoiseCovariance
+    offset: FloatArray | float = 0.0
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -193,7 +196,7 @@ class WeighedObservation:
     @property
     def y(self) -> FloatArray:
         """The observation ``(k,)``."""
-        return self.plain.y
+        return self.plain.y + self.offset
 
     def of(self, model: ObservationModel, /) -> ObservationModel:
         """What a model predicts of this observation."""

@@ -99,6 +99,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         observed_orifice_mm2=free_orifice(fit.case, closed),
         again=None if fit.confirmed_mm is None else fit.confirmed_mm <= SAME_MM,
         gate=gate,
+        moved=fit.moved,
         mistakes=mistakes,
         doubts=doubtful,
     )
@@ -117,7 +118,10 @@ def _mean(distances: list[FloatArray]) -> float | None:
 
 
 def _alike(observation: Observed, standardised: FloatArray) -> float | None:
-    """Largest of Moran's I of the standardised innovation, one for each coordinate; see `moran`."""
+    """Largest covariance of neighbours in the standardised innovation, over the coordinates.
+
+    Moran's I (`moran`), in units of the variance that was believed where it is smaller than that.
+    """
     plain = observation.plain if isinstance(observation, WeighedObservation) else observation
     if isinstance(plain, Observation):
         points = plain.positions[-1][plain.seen[-1]]
@@ -134,5 +138,8 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
     ones = np.ones(rows.size)
     one_way = coo_matrix((ones, (rows, near[:, 1:].ravel())), shape=(len(points),) * 2)
     neighbours = csr_array(one_way.maximum(one_way.T))
-    statistics = [moran(column, neighbours).statistic for column in values.T]
+    # What is smaller than believed contradicts nothing, whatever its pattern.
+    statistics = [
+        moran(column, neighbours).statistic * min(1.0, float(np.var(column))) for column in values.T
+    ]
     return float(max(statistics, key=abs))

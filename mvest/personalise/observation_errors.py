@@ -19,7 +19,13 @@ from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation
 from mvest.estimation.noise_family import ErrorColumns, NoiseFamily
 from mvest.estimation.sampled import SampledErrors
 from mvest.observation.learned import error_family
-from mvest.personalise.considered_geometry import geometry_columns
+from mvest.personalise.considered_geometry import (
+    GeometryColumns,
+    GeometryModes,
+    closure_at,
+    geometry_columns,
+    geometry_modes,
+)
 from mvest.personalise.considered_law import law_columns
 from mvest.personalise.fitted_frames import BLURRED_MM, SURFACE_MM, FittedFrames
 from mvest.personalise.geometry_errors import (
@@ -54,14 +60,28 @@ class ObservationErrors:
         What geometry and law, as far as not known, do to the observation.
     unconsidered : tuple of str
         Why it is not known what some of it does.
+    known : GeometryColumns or None
+        What modes of the geometry's error do to the observation.
+    geometry_modes : tuple of GeometryModes or None
+        What is not known of the geometry as it was seen, once it was asked for.
+    displaced_by : tuple of (q,)
+        Modes of each kind by which the geometry of the model is displaced; empty: it is as seen.
     """
 
-    def __init__(self, fitted: FittedFrames, registered: RegisteredModel) -> None:
+    def __init__(
+        self,
+        fitted: FittedFrames,
+        registered: RegisteredModel,
+        geometry_modes: tuple[GeometryModes, ...] | None = None,
+        displaced_by: tuple[FloatArray, ...] = (),
+    ) -> None:
         self.fitted, self.registered = fitted, registered
+        self.geometry_modes, self.displaced_by = geometry_modes, displaced_by
         self.geometry: GeometryErrors | None = None
         self.samples: SampledErrors | None = None
         self.considered: tuple[ErrorColumns, ...] = ()
         self.unconsidered: tuple[str, ...] = ()
+        self.known: GeometryColumns | None = None
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -96,18 +116,17 @@ class ObservationErrors:
             return
         found: list[tuple[ErrorColumns, ...] | str] = []
         if settings.considered_geometry is not None:
-            noise = self.noise(without=self.kinds)
-            found.append(
-                geometry_columns(
-                    self.fitted.case,
-                    settings.considered_geometry,
-                    self.registered,
-                    observation,
-                    noise,
-                    m,
-                    predicted,
+            if self.geometry_modes is None:
+                model, _, _ = closure_at(self.registered, m)
+                self.geometry_modes = geometry_modes(
+                    self.fitted.case, settings.considered_geometry, model
                 )
+            noise = self.noise(without=self.kinds)
+            geometry = geometry_columns(
+                self.geometry_modes, self.registered, observation, noise, m, predicted
             )
+            found.append(geometry if isinstance(geometry, str) else geometry.columns)
+            self.known = None if isinstance(geometry, str) else geometry
         if settings.considered_law:
             found.append(
                 law_columns(settings.considered_law, self.registered, observation, m, predicted)
@@ -184,7 +203,7 @@ class ObservationErrors:
             See `FittedFrames.observation`.
         """
         family = self.single_errors
-        scales: dict[str, float] = {}
+        scales = self._learned_sizes(learned)
         if family is None:
             observation = self.fitted.observation(stated=stated)
             base = observation_noise(observation.R, len(observation.y))
@@ -192,10 +211,6 @@ class ObservationErrors:
             log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
             first = len(family.names) - len(family.columns)
             base = family.without_columns().at(log[:first])
-            scales = {
-                own.name: float(np.exp(one))
-                for own, one in zip(family.columns, log[first:], strict=True)
-            }
         columns = [
             considered * scales.get(own.name, 1.0) * own.columns
             for own in self.considered
@@ -203,9 +218,50 @@ class ObservationErrors:
         ]
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
+    def about(
+        self, registered: RegisteredModel, displaced_by: tuple[FloatArray, ...]
+    ) -> ObservationErrors:
+        """The same errors, of which nothing is found out, about a valve with another geometry.
+
+        Parameters
+        ----------
+        registered : RegisteredModel
+            Of that valve.
+        displaced_by : tuple of (q,)
+            Modes of each kind by which it differs from the one that was seen.
+        """
+        return ObservationErrors(self.fitted, registered, self.geometry_modes, displaced_by)
+
+    def _learned_sizes(self, learned: LearnedNoise | None) -> dict[str, float]:
+        """Factor on each kind of what is considered whose size is learned."""
+        family = self.single_errors
+        if family is None or not family.columns:
+            return {}
+        log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
+        sizes = np.exp(log[-len(family.columns) :]).tolist()
+        return {own.name: size for own, size in zip(family.columns, sizes, strict=True)}
+
+    def expected_modes(
+        self, residual: FloatArray, learned: LearnedNoise | None
+    ) -> tuple[FloatArray, ...]:
+        """Most probable errors of the geometry ``(q,)``, kind after kind, at an estimate.
+
+        Parameters
+        ----------
+        residual : (k,)
+            Of the estimate, as `observation` has it.
+        learned : LearnedNoise or None
+            As it was learned with the estimate.
+        """
+        assert self.known is not None
+        return self.known.expected(self.noise(learned), residual, self._learned_sizes(learned))
+
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""
         plain, single = self.fitted.observation(), self.single_errors
+        if self.displaced_by and self.known is not None:
+            noise = self.noise() if single is None else single
+            return WeighedObservation(plain, noise, self.known.offset(self.displaced_by))
         if single is not None:
             if self.samples is not None:
                 columns = self.samples.samples / np.sqrt(self.samples.count)

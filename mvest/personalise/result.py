@@ -79,6 +79,9 @@ class Personalised:
         Why what is to be considered of geometry and law was not.
     budget : tuple of BudgetRow
         What each part of what is not known costs the moduli, where error samples are given.
+    moved : float or None
+        Standard deviations by which a modulus moved at most when geometry and moduli were
+        linearised anew for the last time; None where they were not.
     """
 
     case: ValveCase
@@ -100,6 +103,7 @@ class Personalised:
     image_share: FloatArray | None = None
     unconsidered: tuple[str, ...] = ()
     budget: tuple[BudgetRow, ...] = ()
+    moved: float | None = None
 
     def __str__(self) -> str:
         distances = [

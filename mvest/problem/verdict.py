@@ -135,6 +135,9 @@ class Indications:
         Whether the fitted closed state was also reached from the open valve.
     gate : bool or None
         Whether the valve has passed the gate (:mod:`mvest.closure.robustness`); None: not asked.
+    moved : float or None
+        Standard deviations by which a modulus moved at most when what is not known of the geometry
+        was linearised anew at what is expected of it.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
     unlike : str
@@ -158,6 +161,7 @@ class Indications:
     observed_orifice_mm2: float | None = None
     again: bool | None = None
     gate: bool | None = None
+    moved: float | None = None
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     unlike: str = ""
@@ -167,6 +171,9 @@ APPROXIMATION = 2.0
 """Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
 The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
 failed by less."""
+MOVED = 1.0
+"""Standard deviations by which the last renewed linearisation of the geometry may move a modulus:
+by as much again the estimate may still be off."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
@@ -246,6 +253,20 @@ def _approximated(e: Indications) -> Seen:
             DOUBTFUL,
             f"the interval is not that of the posterior: {e.approximation}",
             "sample the posterior",
+        )
+
+
+def _linear(e: Indications) -> Seen:
+    if e.moved is None:
+        yield None
+    elif e.moved > MOVED:
+        yield Ground(
+            "geometry",
+            DOUBTFUL,
+            f"a modulus moved by {e.moved:.1f} of its standard deviations when the geometry was "
+            f"linearised anew at what is expected of it, expected at most {MOVED:g}",
+            "linearise it once more (personal.considered_geometry.renewals), or see the open "
+            "shape, annulus and tips better",
         )
 
 
@@ -394,6 +415,7 @@ def _unique(e: Indications) -> Seen:
 CHECKS = {
     "iterations": _ended,
     "approximation": _approximated,
+    "geometry": _linear,
     "case": _plausible,
     "size of what is left over": _innovation,
     "pattern of what is left over": _structure,

@@ -1,35 +1,55 @@
 """What is not known of the geometry: modes, columns of an observation, and wider intervals."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import InputError
+from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.transform import Log, to_filter
 from mvest.observation.vertices import Observation
-from mvest.personalise import personalise_case
+from mvest.personalise import Treatment, personalise_case
 from mvest.personalise.considered_geometry import (
     ConsideredGeometry,
+    GeometryColumns,
+    GeometryModes,
     geometry_columns,
+    geometry_modes,
     rest_lengths_by_ends,
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.problem.registration import RegisteredModel
+from mvest.personalise.indications import indications_of
+from mvest.problem.registration import REGISTRATION, RegisteredModel
 from tests.cases.test_uncertainty import corresponding
 from tests.closure.test_model import AT, CLOSING, model_of
-from tests.made_up_closure import FIELDS, made_up_case, settings, use
+from tests.made_up_closure import (
+    FIELDS,
+    PRIORS,
+    TRUE,
+    MadeUpClosure,
+    made_up_case,
+    settings,
+    shape,
+    unknowns,
+    use,
+)
 
+MODE = GeometryModes("open shape", {"shape": np.ones((1, 1))})
 NONE = ConsideredGeometry(
     shape_mm=0, annulus_mm=0, tips_mm=0, insertions_mm=0, thickness=0, fibre_degrees=0
 )
 MODULI = ("E_f.anterior", "E_f.posterior")
+MODULUS_PRIORS = [PRIORS[name] for name in MODULI]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -62,9 +82,9 @@ def test_columns_are_derivatives_times_standard_deviations_turned_as_the_valve_i
     seen = Observation(("closed",), np.zeros((1, n, 3)), np.array(1.0))
 
     def columns_of(std=1e-3, case=case, **changes):
-        given = replace(NONE, **changes)
+        modes = geometry_modes(case, replace(NONE, **changes), model)
         noise = observation_noise(std**2, 3 * n)
-        return geometry_columns(case, given, registered, seen, noise, m, predicted.y)
+        return geometry_columns(modes, registered, seen, noise, m, predicted.y).columns
 
     assert columns_of() == ()
     (fibres,) = columns_of(fibre_degrees=10.0)
@@ -180,11 +200,11 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     where = []
 
-    def columns(case, considered, registered, observation, noise, m, predicted):
+    def columns(modes, registered, observation, noise, m, predicted):
         # As if the anterior belly were not known by 0.2 mm.
         where.append(m)
-        belly = FIELDS["E_f.anterior"].reshape(-1, 1)
-        return (ErrorColumns("open shape", 0.2 * belly),)
+        belly = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
+        return GeometryColumns((MODE,), (belly,), (ErrorColumns(MODE.name, belly),))
 
     monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
     for errors in (None, settings().errors):
@@ -206,9 +226,125 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
     np.testing.assert_allclose(where[1], known.result.estimate, rtol=0.05, atol=0.2)
 
 
+BENT, CURVED = FIELDS["loose"].ravel(), FIELDS["E_f.anterior"].ravel()
+"""What the one mode does to the closed valve (mm), and its square: as another modulus would."""
+
+
+def bent(x, bend):
+    """A closed valve ``(3 n,)`` that is displaced by the one mode."""
+    return x + BENT * bend + CURVED * bend**2
+
+
+@dataclass(eq=False)
+class BentClosure(MadeUpClosure):
+    """The formula for a valve that is displaced by one mode."""
+
+    bend: float = 0.0
+
+    def __call__(self, m):
+        plain = super().__call__(m)
+        if not plain.converged:
+            return plain
+        rest, closed = np.split(plain.y, 2)
+        return replace(plain, y=np.concatenate([rest, bent(closed, self.bend)]))
+
+
+class BentGeometry:
+    """Stands for a `RestGeometry`; ``bends`` is by what valves were displaced."""
+
+    bends: ClassVar[list] = []
+
+    def __init__(self, model):
+        self.model = model
+
+    def displaced(self, parts):
+        (bend,) = parts["shape"]
+        self.bends.append(bend)
+        return BentClosure(self.model.names, self.model.fixed, bend=bend)
+
+
+def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(monkeypatch):
+    use(monkeypatch)
+    std = 0.5
+    straight = made_up_case(std, displaced=False)
+    closed = straight.frame(Role.CLOSED)
+    seen = bent(closed.vertices.ravel(), 0.6)
+    frame = replace(closed, vertices=seen.reshape(-1, 3))
+    case = replace(straight, frames=tuple(frame if f is closed else f for f in straight.frames))
+    known = {name: value for name, value in TRUE.items() if not name.startswith("E_f.")}
+    known |= dict.fromkeys(REGISTRATION, 0.0)
+    free = unknowns(Treatment.FIXED, **known)
+
+    def columns(modes, registered, observation, noise, m, predicted):
+        slope = (BENT + 2.0 * getattr(registered.model, "bend", 0.0) * CURVED)[:, None]
+        return GeometryColumns((MODE,), (slope,), (ErrorColumns(MODE.name, slope),))
+
+    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalise.estimation.RestGeometry", BentGeometry)
+
+    def objective(z):
+        moduli = np.exp(z[:2])
+        x = shape(known | dict(zip(MODULI, moduli, strict=True))).ravel()
+        log = [to_filter(Log(), Gaussian.from_variance([m], s**2)) for m, s in MODULUS_PRIORS]
+        beforehand = [(z[k] - log[k].mean[0]) / log[k].std[0] for k in range(2)]
+        return np.concatenate([(bent(x, z[2]) - seen) / std, beforehand, z[2:]])
+
+    mode = least_squares(objective, [1.5, 1.0, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    errors = []
+    for renewals in (0, 1, 2, 8):
+        BentGeometry.bends.clear()
+        fit = personalise_case(
+            case,
+            settings(
+                *free,
+                considered_geometry=ConsideredGeometry(renewals=renewals),
+                tolerance=1e-9,
+                correspondence=True,
+            ),
+        )
+        assert len(BentGeometry.bends) == renewals
+        assert (fit.moved is None) == (renewals == 0)
+        errors.append(np.abs(np.log(fit.result.estimate) - mode[:2]).max())
+    assert errors[0] > 0.05
+    # The linearisation about the expected geometry leaves a square of what was off.
+    assert errors[1] < 0.2 * errors[0]
+    assert errors[3] < 1e-6
+    assert fit.moved < 1e-5
+    assert BentGeometry.bends[-1] == pytest.approx(mode[2], abs=1e-6)
+
+
+def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(monkeypatch):
+    use(monkeypatch)
+
+    class Torn(BentGeometry):
+        def displaced(self, parts):
+            return replace(super().displaced(parts), fails_above=0.0)
+
+    def columns(modes, registered, observation, noise, m, predicted):
+        return GeometryColumns((MODE,), (BENT[:, None],), (ErrorColumns(MODE.name, BENT[:, None]),))
+
+    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
+    monkeypatch.setattr("mvest.personalise.estimation.RestGeometry", Torn)
+    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
+    plain, torn = (
+        personalise_case(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))
+        for renewals in (0, 2)
+    )
+    np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
+    assert torn.moved is None
+    assert torn.unconsidered == ("about the geometry that is expected: no equilibrium",)
+    assert any("about the geometry" in doubt for doubt in indications_of(torn).doubts)
+
+
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("shape_mm", -0.1), ("shape_length_mm", 0.0), ("factor", 0.5), ("share", 1.0)],
+    [
+        ("shape_mm", -0.1),
+        ("shape_length_mm", 0.0),
+        ("factor", 0.5),
+        ("share", 1.0),
+        ("renewals", -1),
+    ],
 )
 def test_what_is_no_standard_deviation_is_refused(setting, value):
     with pytest.raises(InputError, match=f"considered geometry {setting} = "):

@@ -9,6 +9,7 @@ from mvest.problem.verdict import (
     DOUBTFUL,
     FARTHER,
     LEAK,
+    MOVED,
     NARROWING,
     NEEDED,
     NIS_FACTOR,
@@ -36,6 +37,7 @@ GOOD = Indications(
     observed_orifice_mm2=2.0,
     again=True,
     gate=True,
+    moved=0.4,
 )
 
 
@@ -43,15 +45,16 @@ def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
     assert verdict.grounds == ()
-    assert len(verdict.passed) == 12
+    assert len(verdict.passed) == 13
     assert verdict.missing == ()
-    assert str(verdict) == "trustworthy: 12 checks passed"
+    assert str(verdict) == "trustworthy: 13 checks passed"
 
 
 CASES = {
     "no estimate": ({"estimated": False, "ended": "it did not close"}, NONE, "it did not close"),
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
+    "not linear": ({"moved": 1.01 * MOVED}, DOUBTFUL, "moved by 1.0 of its standard deviations"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
     "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
@@ -86,6 +89,7 @@ def test_each_ground_counts_and_says_its_number(changes, trust, words):
     "changes",
     [
         {"nis": 0.3},
+        {"moved": MOVED},
         {"nis": 1.04},
         {"stretch": {"x": STRETCH[0]}},
         {"narrowing": {"x": NARROWING[0]}},
@@ -109,7 +113,7 @@ def test_the_worst_ground_decides_and_stands_first():
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(Indications(estimated=True))
-    assert len(verdict.missing) == 10
+    assert len(verdict.missing) == 11
     # Of these, four are needed.
     assert verdict.trust == DOUBTFUL
     assert [ground.check for ground in verdict.grounds] == list(NEEDED)

@@ -135,7 +135,7 @@ def surfaces_figure(records: Sequence[Record[Findings]]) -> Figure:
         axes.set_xlabel(f"{name.replace('E_f.', 'E_f ')}, estimate / truth")
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_yticks(range(len(doors)), labels=doors)
-    panels[0].set_ylim(len(doors) - 0.5, -0.5)
+    panels[0].invert_yaxis()
     for word, colour in COLOURS.items():
         panels[-1].plot([], [], "o-", color=colour, ms=4, lw=1.3, label=word)
     panels[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)

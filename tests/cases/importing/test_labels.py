@@ -20,7 +20,6 @@ from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
-from tests.cases.folders import closing
 from tests.cases.importing.voxelised import voxelised, write_slicer
 
 
@@ -139,57 +138,6 @@ def test_what_is_missing_is_asked_for_by_name(
         import_labels(slicer, options)
     assert "\n" not in str(caught.value)
     assert str(slicer) in str(caught.value)
-
-
-@pytest.fixture(scope="module")
-def swung(valve: Valve) -> FloatArray:
-    """The valve on its way: closer, and no leaflet touches the other yet."""
-    return closing(valve.surface.vertices, 0.3)
-
-
-@pytest.fixture(scope="module")
-def swung_image(valve: Valve, swung: FloatArray) -> SimpleITK.Image:
-    surface = valve.surface
-    return voxelised(swung, surface.triangles, surface.region, surface.thickness, voxel_mm=0.8)
-
-
-@pytest.mark.parametrize("in_one_file", [False, True])
-def test_a_second_map_or_frame_is_the_closed_one(
-    valve: Valve,
-    swung: FloatArray,
-    slicer: Path,
-    image: SimpleITK.Image,
-    swung_image: SimpleITK.Image,
-    tips: tuple[float, ...],
-    in_one_file: bool,
-    tmp_path: Path,
-) -> None:
-    later = tuple(x + 1.0 for x in tips)
-    options = LabelsOptions(
-        tips=tips, tips_closed=later, pressure_mmHg=90.0, closed="1", observer_mm=0.0
-    )
-    if in_one_file:
-        source = tmp_path / "both.nii.gz"
-        moved = SimpleITK.Resample(
-            swung_image, image, SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor
-        )
-        SimpleITK.WriteImage(SimpleITK.JoinSeries([image, moved], 0.0, 0.35), str(source))
-    else:
-        source, other = slicer, tmp_path / "closed.seg.nrrd"
-        write_slicer(SimpleITK.Image(swung_image), other)
-        options = replace(options, closed=str(other))
-    case = import_labels(source, options)
-    opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
-    for frame, true in ((opened, valve.surface.vertices), (closed, swung)):
-        away = closest_points(frame.vertices, true, valve.surface.triangles).distance
-        # The frames are millimetres apart. Resampled to the other's grid labels lose up to half a
-        # voxel, 0.4 mm.
-        assert np.sqrt(np.mean(away**2)) < (0.35 if in_one_file and frame is closed else 0.2)
-    assert (opened.pressure_mmHg, closed.pressure_mmHg) == (0.0, 90.0)
-    assert not closed.corresponds
-    assert closed.papillary_tips.ravel() == pytest.approx(later)
-    # It is laid out by both frames, not by an assumed closure.
-    assert any("rest lengths from the closed frame" in line for line in case.derived)
 
 
 def test_leaflets_that_do_not_meet_are_refused(

@@ -10,7 +10,6 @@ import meshio
 import numpy as np
 import pytest
 
-from mvest.cases.case import Role
 from mvest.cases.importing.reference_heart import DATA_VARIABLE
 from mvest.cases.importing.solid import SolidOptions, import_solid
 from mvest.errors import InputError
@@ -22,7 +21,6 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.io.leaflet_surfaces import read_surface
-from tests.cases.folders import closing
 
 HRA = Path(os.environ.get(DATA_VARIABLE, "../shared/data/hra_mitral"))
 """Folder with the mitral valve of the HRA reference heart, three PLY files in mm."""
@@ -56,24 +54,6 @@ def test_one_surface_for_all(valve: Valve, whole: Path, options: SolidOptions) -
     assert np.abs(case.surface.thickness - thickness).mean() < 0.02
     assert any("shortest on the side of each tip" in line for line in case.derived)
     assert any("1 mm by voxels, smoothing and observer_mm=1" in line for line in case.derived)
-
-
-def test_a_second_surface_is_the_closed_frame(
-    valve: Valve, whole: Path, options: SolidOptions, tmp_path: Path
-) -> None:
-    swung = closing(valve.surface.vertices, 0.3)
-    solid = thicken(replace(valve.surface, vertices=swung))
-    other = tmp_path / "closed.ply"
-    meshio.Mesh(solid.vertices, [("triangle", solid.triangles.astype(np.int32))]).write(other)
-    case = import_solid(whole, replace(options, closed=str(other), pressure_mmHg=90.0))
-    closed = case.frame(Role.CLOSED)
-    for frame, true in ((case.frame(Role.REFERENCE), valve.surface.vertices), (closed, swung)):
-        # The frames are millimetres apart.
-        away = closest_points(frame.vertices, true, valve.surface.triangles).distance
-        assert away.mean() < 0.06
-    assert closed.pressure_mmHg == 90.0
-    assert not closed.corresponds
-    assert any("tips of the closed frame: where they are in the open" in s for s in case.derived)
 
 
 def test_lengths_in_metres(whole: Path, options: SolidOptions, tmp_path: Path) -> None:
