@@ -1,4 +1,4 @@
-"""Readers of surfaces, leaflets and solid meshes."""
+"""Readers of surfaces."""
 
 import base64
 from pathlib import Path
@@ -12,18 +12,13 @@ from mvest.cases.importing.solid import SolidOptions, import_solid
 from mvest.cases.surface_files import read_regions
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
-from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.io.leaflet_surfaces import (
-    read_leaflets,
     read_surface,
-    write_leaflets,
     write_surface,
 )
-from mvest.valve.io.solid_meshes import read_solid, write_solid
 from tests.cases.folders import plain_folder
 from tests.fuzz.trial import Reader
-from tests.valve.io import test_io
 
 __all__ = ["READERS"]
 
@@ -197,19 +192,6 @@ def slicerheart(folder: Path, damaged: str) -> Path:
     return folder / damaged
 
 
-def leaflets(path: Path) -> Path:
-    names = ("anterior", "posterior")
-    fibre = np.tile([1.0, 0.0, 0.0], (5, 1))
-    labels = np.array([0, 1, 1])
-    return write_leaflets(
-        path, LeafletSurface(POINTS, TRIANGLES, labels, names, fibre, np.full(5, 1.0))
-    )
-
-
-def solid(name: str, folder: Path) -> Path:
-    return write_solid(folder / "a.vtu", test_io.one_element(name))
-
-
 def case(folder: Path) -> Path:
     """A case folder of which the reference surface is damaged."""
     document = plain_folder(folder)
@@ -267,15 +249,5 @@ READERS = (
             lambda folder, name=name: slicerheart(folder, name)
             for name in ("AnnulusContourPoints.csv", "ValveLandmarkPoints.csv")
         ),
-    ),
-    Reader(
-        "leaflets",
-        read_leaflets,
-        (lambda folder: leaflets(folder / "a.vtp"), lambda folder: leaflets(folder / "a.vtu")),
-    ),
-    Reader(
-        "solid",
-        read_solid,
-        (lambda folder: solid("tet4", folder), lambda folder: solid("hex18", folder)),
     ),
 )

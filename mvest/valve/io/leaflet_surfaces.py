@@ -1,4 +1,4 @@
-"""Reading and writing surfaces and solid meshes: VTK, STL, OBJ, PLY, time series for ParaView.
+"""Reading and writing surfaces: VTK, STL, OBJ, PLY, time series for ParaView.
 
 Coordinates are mm. A file appears under its name only once it is complete.
 """
@@ -19,19 +19,13 @@ from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
 from mvest.valve.io.vtk_legacy import read_vtk
 from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
 
 __all__ = [
     "SurfaceFile",
-    "cell_arrays",
-    "read_leaflets",
     "read_surface",
-    "write_cells",
-    "write_leaflets",
-    "write_series",
     "write_surface",
     "write_surface_series",
 ]
@@ -152,7 +146,7 @@ def write_surface(
     _check_suffix(target, WRITTEN_SUFFIXES)
     points = np.ascontiguousarray(vertices, dtype=np.float64)
     faces = np.ascontiguousarray(triangles, dtype=np.int64)
-    _check_cells(points, faces, 3, str(target))
+    _check_triangles(points, faces, str(target))
     at_points = _checked_data(point_data, len(points), "point")
     at_cells = _checked_data(cell_data, len(faces), "cell")
     suffix = target.suffix.lower()
@@ -166,39 +160,24 @@ def write_surface(
         content = SurfaceFile(points, faces, at_points, at_cells)
         write_atomically(target, lambda file: write_vtp(file, content))
     else:
-        write_cells(target, points, [("triangle", faces)], at_points, cell_arrays([at_cells]))
+        arrays: dict[str, list[Any]] = {name: [values] for name, values in at_cells.items()}
+        mesh = meshio.Mesh(points, [("triangle", faces)], point_data=at_points, cell_data=arrays)
+        write_atomically(
+            target, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
+        )
     return target
 
 
-def _check_cells(points: FloatArray, cells: IntArray, width: int, name: str) -> None:
+def _check_triangles(points: FloatArray, cells: IntArray, name: str) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{name}: points of shape {points.shape}, expected (n, 3)")
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise GeometryError(f"{name}: points {bad[:5].tolist()} are not finite numbers")
-    if cells.ndim != 2 or cells.shape[1] != width or len(cells) == 0:
-        raise InputError(f"{name}: cells of shape {cells.shape}, expected (m, {width}) with m > 0")
+    if cells.ndim != 2 or cells.shape[1] != 3 or len(cells) == 0:
+        raise InputError(f"{name}: cells of shape {cells.shape}, expected (m, 3) with m > 0")
     if cells.min() < 0 or cells.max() >= len(points):
         raise InputError(f"{name}: cells name points outside 0 to {len(points) - 1}")
-
-
-def cell_arrays(blocks: list[dict[str, NDArray[np.generic]]]) -> dict[str, list[Any]]:
-    """Cell data of several blocks, each with the same names, as meshio wants them."""
-    return {name: [block[name] for block in blocks] for name in blocks[0]}
-
-
-def write_cells(
-    path: Path,
-    points: FloatArray,
-    cells: list[tuple[str, IntArray]],
-    point_data: Data,
-    cell_data: Mapping[str, list[Any]],
-) -> None:
-    """Write blocks of cells (in VTK's node order) as compressed VTU."""
-    mesh = meshio.Mesh(points, cells, point_data=dict(point_data), cell_data=dict(cell_data))
-    write_atomically(
-        path, lambda file: meshio.vtu.write(str(file), mesh, binary=True, compression="zlib")
-    )
 
 
 def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
@@ -209,128 +188,13 @@ def region_arrays(region: IntArray, names: tuple[str, ...]) -> dict[str, NDArray
     return result
 
 
-def region_names(cell_data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Names of the regions, in order, from the indicators that `region_arrays` wrote."""
-    names = tuple(
-        name.removeprefix(REGION_PREFIX) for name in cell_data if name.startswith(REGION_PREFIX)
-    )
-    if not names:
-        raise InputError(
-            f"no cell data {REGION_PREFIX}NAME; expected one indicator for every region"
-        )
-    return names
-
-
-def write_leaflets(
-    path: Path | str, surface: LeafletSurface, point_data: Data | None = None
-) -> Path:
-    """Write a midsurface with regions, fibres and thickness as ``.vtu`` or ``.vtp``."""
-    _check_suffix(Path(path), (".vtu", ".vtp"))
-    return write_surface(
-        path,
-        surface.vertices,
-        surface.triangles,
-        {"fibre": surface.fibre, "thickness": surface.thickness, **(point_data or {})},
-        region_arrays(surface.region, surface.region_names),
-    )
-
-
-def read_leaflets(path: Path | str) -> LeafletSurface:
-    """Read what `write_leaflets` wrote, or any file with the same data.
-
-    Expected are the point data ``fibre`` (three components) and ``thickness`` (mm), and the cell
-    data ``region`` with an indicator ``region.NAME`` for every region, in the order of the labels.
-
-    Raises
-    ------
-    InputError, GeometryError
-        As `read_surface`, data that are missing, or an inadmissible midsurface.
-    """
-    source = _input_path(path, (".vtu", ".vtp"))
-    with refusing(source, "leaflet surface"):
-        file = read_surface(source)
-        for name, data in (
-            ("fibre", file.point_data),
-            ("thickness", file.point_data),
-            ("region", file.cell_data),
-        ):
-            if name not in data:
-                kind = "cell" if name == "region" else "point"
-                raise InputError(f"no {kind} data {name!r}; found {', '.join(data) or 'none'}")
-        return LeafletSurface(
-            vertices=file.vertices,
-            triangles=file.triangles,
-            region=file.cell_data["region"].astype(np.int64),
-            region_names=region_names(file.cell_data),
-            fibre=file.point_data["fibre"].astype(np.float64),
-            thickness=file.point_data["thickness"].astype(np.float64),
-        )
-
-
-def write_series(
-    path: Path | str,
-    times: FloatArray,
-    positions: FloatArray,
-    cells: list[tuple[str, IntArray]],
-    point_data: Data | None = None,
-    cell_data: Mapping[str, list[Any]] | None = None,
-) -> Path:
-    """Write deformed states for ParaView: one VTU per state, and an index of their times.
-
-    The states ``NAME_0000.vtu``, ``NAME_0001.vtu``, ... lie beside the index ``NAME.pvd``, which
-    is written last. Each carries its ``displacement`` (mm) from the first state.
-
-    Parameters
-    ----------
-    path
-        The index, ``.pvd``.
-    times
-        ``(f,)`` s, increasing.
-    positions
-        ``(f, n, 3)`` mm.
-    cells
-        Blocks of cells in VTK's node order, such as ``[("triangle", triangles)]``; for a solid
-        mesh those of `mvest.valve.io.solid_meshes.vtk_cells`.
-    point_data
-        Named arrays ``(f, n)`` or ``(f, n, c)``.
-    cell_data
-        As in `write_cells`, the same for all states.
-    """
-    index = Path(path)
-    _check_suffix(index, (".pvd",))
-    times = np.asarray(times, dtype=np.float64)
-    frames = np.asarray(positions, dtype=np.float64)
-    if frames.ndim != 3 or frames.shape[2] != 3 or times.shape != frames.shape[:1]:
-        raise InputError(
-            f"{index}: positions {frames.shape} and times {times.shape}, expected (f, n, 3) and "
-            f"(f,)"
-        )
-    if len(times) == 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise InputError(f"{index}: times must be finite, increasing, at least one")
-    for name, values in (point_data or {}).items():
-        if np.shape(values)[:2] != frames.shape[:2]:
-            raise InputError(
-                f"{index}: point data {name!r} has shape {np.shape(values)}, expected "
-                f"{frames.shape[:2]} first"
-            )
-    names = [f"{index.stem}_{number:04d}.vtu" for number in range(len(times))]
-    for number, name in enumerate(names):
-        state = index.with_name(name)
-        for _, block in cells:
-            _check_cells(frames[number], np.asarray(block), np.shape(block)[1], str(state))
-        data = {name: values[number] for name, values in (point_data or {}).items()}
-        data["displacement"] = frames[number] - frames[0]
-        checked = _checked_data(data, frames.shape[1], "point")
-        write_cells(state, frames[number], cells, checked, cell_data or {})
-    return _write_index(index, times, names)
-
-
 def write_surface_series(
     path: Path | str, times: Sequence[float], states: Sequence[SurfaceFile]
 ) -> Path:
     """Write surfaces over time for ParaView and 3D Slicer, each with triangles and data of its own.
 
-    As `write_series`, but ``NAME_0000.vtp``, ..., which name their axes (LPS) as Slicer does.
+    The states ``NAME_0000.vtp``, ``NAME_0001.vtp``, ... lie beside the index ``NAME.pvd``, which is
+    written last. They name their axes (LPS) as Slicer does.
 
     Raises
     ------
@@ -348,7 +212,7 @@ def write_surface_series(
     names = [f"{index.stem}_{number:04d}.vtp" for number in range(len(states))]
     for name, state in zip(names, states, strict=True):
         target = index.with_name(name)
-        _check_cells(state.vertices, state.triangles, 3, str(target))
+        _check_triangles(state.vertices, state.triangles, str(target))
         content = SurfaceFile(
             state.vertices,
             state.triangles,

@@ -1,21 +1,12 @@
-import xml.etree.ElementTree as ET
-
 import numpy as np
 import pytest
 
-from mvest.elements import ELEMENTS, FACES
 from mvest.errors import GeometryError, InputError
-from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.io.leaflet_surfaces import (
-    read_leaflets,
     read_surface,
-    write_leaflets,
-    write_series,
     write_surface,
 )
-from mvest.valve.io.solid_meshes import VTK_ORDER, read_solid, vtk_cells, write_solid
-from mvest.valve.mesh.solid_mesh import SolidMesh
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".vtp", ".stl", ".obj", ".ply"])
@@ -51,30 +42,6 @@ def test_data_come_back_exactly(shapes, tmp_path, suffix):
         assert back.point_data[name].dtype == values.dtype
     for name, values in cells.items():
         np.testing.assert_array_equal(back.cell_data[name], values)
-
-
-@pytest.fixture
-def leaflets(shapes):
-    vertices, triangles = shapes.cone(15.0, 6.0, 12.0, n=30, layers=4)
-    rng = np.random.default_rng(1)
-    region = (vertices[triangles].mean(axis=1)[:, 0] > 0).astype(int)
-    fibre = rng.normal(size=vertices.shape)
-    names = ("posterior", "anterior", "none here")
-    return LeafletSurface(
-        vertices, triangles, region, names, fibre, rng.uniform(0.5, 1.5, len(vertices))
-    )
-
-
-@pytest.mark.parametrize("suffix", [".vtu", ".vtp"])
-def test_leaflets_come_back_with_names_fibres_and_thickness(leaflets, tmp_path, suffix):
-    extra = {"distance": np.arange(len(leaflets.vertices), dtype=float)}
-    path = write_leaflets(tmp_path / f"valve{suffix}", leaflets, extra)
-    back = read_leaflets(path)
-    for name in ("vertices", "triangles", "region", "thickness"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(leaflets, name))
-    np.testing.assert_allclose(back.fibre, leaflets.fibre, rtol=1e-15)
-    assert back.region_names == leaflets.region_names
-    np.testing.assert_array_equal(read_surface(path).point_data["distance"], extra["distance"])
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "appended raw", "appended base64"])
@@ -156,87 +123,6 @@ def test_vtp_is_read_by_vtk(shapes, tmp_path):
     np.testing.assert_array_equal(mesh.point_data["x"], vertices[:, 0])
 
 
-def one_element(name):
-    """The reference element itself, two of them side by side, with its face of largest zeta."""
-    reference = ELEMENTS[name]
-    nodes = reference.node_coordinates
-    n = len(nodes)
-    face_nodes = FACES[reference.face].n_nodes
-    face = reference.top_face if len(reference.top_face) else np.arange(face_nodes)
-    return SolidMesh(
-        nodes=np.concatenate([nodes, nodes + np.array([3.0, 0, 0])]),
-        elements=np.arange(2 * n).reshape(2, n),
-        element_type=name,
-        region=np.array([1, 0]),
-        region_names=("posterior", "anterior"),
-        fibre=np.random.default_rng(0).normal(size=(2, n, 3)),
-        pressure_faces=face[None],
-    )
-
-
-@pytest.mark.parametrize("name", ELEMENTS)
-def test_a_solid_mesh_comes_back_with_the_same_hash(tmp_path, name):
-    mesh = one_element(name)
-    path = write_solid(tmp_path / "mesh.vtu", mesh, {"u": np.zeros((len(mesh.nodes), 3))})
-    back = read_solid(path)
-    assert back.element_type == name
-    assert back.region_names == mesh.region_names
-    assert back.sha256 == mesh.sha256
-
-
-CLASSES = {
-    "tet4": "vtkTetra",
-    "tet10": "vtkQuadraticTetra",
-    "wedge18": "vtkBiQuadraticQuadraticWedge",
-    "hex27": "vtkTriQuadraticHexahedron",
-    "tri6": "vtkQuadraticTriangle",
-    "quad9": "vtkBiQuadraticQuad",
-}
-
-
-@pytest.mark.parametrize("name", CLASSES)
-def test_node_orders_are_those_of_vtk(name):
-    vtk = pytest.importorskip("vtk")
-    cell = getattr(vtk, CLASSES[name])()
-    count = cell.GetNumberOfPoints()
-    theirs = np.reshape([cell.GetParametricCoords()[i] for i in range(3 * count)], (count, 3))
-    if name in ELEMENTS:
-        ours = ELEMENTS[name].node_coordinates.copy()
-        if name.startswith("hex"):
-            ours = 0.5 * (ours + 1)
-        if name.startswith("wedge"):
-            ours[:, 2] = 0.5 * (ours[:, 2] + 1)
-    elif name == "tri6":
-        ours = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]])
-    else:
-        ours = np.array([[x, y] for y in (0, 0.5, 1) for x in (0, 0.5, 1)])
-    np.testing.assert_allclose(theirs[:, : ours.shape[1]], ours[VTK_ORDER[name][1]])
-
-
-def test_series_has_an_index_and_one_file_per_state(tmp_path):
-    mesh = one_element("hex18")
-    times = np.array([0.0, 0.01, 0.03])
-    positions = mesh.nodes + np.array([0.0, 1.0, 2.5])[:, None, None] * [0, 0, 1]
-    path = write_series(
-        tmp_path / "closing.pvd",
-        times,
-        positions,
-        vtk_cells(mesh),
-        {"pressure": np.outer(times, np.ones(len(mesh.nodes)))},
-    )
-    entries = ET.parse(path).findall("Collection/DataSet")
-    assert [float(e.get("timestep")) for e in entries] == times.tolist()
-    names = [f"closing_{i:04d}.vtu" for i in range(3)]
-    assert [e.get("file") for e in entries] == names
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["closing.pvd", *names]
-    meshio = pytest.importorskip("meshio")
-    last = meshio.vtu.read(tmp_path / names[2])
-    np.testing.assert_array_equal(last.points, positions[2])
-    np.testing.assert_allclose(last.point_data["displacement"], np.full((36, 1), 2.5) * [0, 0, 1])
-    np.testing.assert_array_equal(last.point_data["pressure"], 0.03)
-    assert [(b.type, len(b.data)) for b in last.cells] == [("hexahedron", 8), ("quad9", 1)]
-
-
 PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\n"
     "property double z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -298,45 +184,4 @@ def box_with(shapes, **change):
 def test_bad_output_is_one_clear_error_and_leaves_nothing(shapes, tmp_path, name, change, message):
     with pytest.raises(InputError, match=message):
         write_surface(tmp_path / name, **box_with(shapes, **change))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_incomplete_leaflets_are_one_clear_error(shapes, tmp_path):
-    vertices, triangles = shapes.box()
-    fibre, thickness = np.tile([1.0, 0, 0], (8, 1)), np.ones(8)
-    points = {"fibre": fibre, "thickness": thickness}
-    region = {"region": np.zeros(12, int)}
-    path = tmp_path / "valve.vtu"
-    for point_data, cell_data, message in (
-        ({}, region, "no point data 'fibre'; found none"),
-        ({"fibre": fibre}, region, "no point data 'thickness'; found fibre"),
-        (points, {}, "no cell data 'region'"),
-        (points, region, "region.NAME"),
-        ({**points, "thickness": -thickness}, {**region, "region.a": np.ones(12)}, "thickness of"),
-    ):
-        write_surface(path, vertices, triangles, point_data, cell_data)
-        with pytest.raises(InputError, match=message):
-            read_leaflets(path)
-
-
-def test_a_surface_is_no_solid(shapes, tmp_path):
-    path = write_surface(tmp_path / "box.vtu", *shapes.box())
-    with pytest.raises(InputError, match="expected one kind of solid element"):
-        read_solid(path)
-    with pytest.raises(InputError, match="extension"):
-        write_solid(tmp_path / "a.vtp", one_element("tet4"))
-
-
-@pytest.mark.parametrize(
-    ("times", "shape", "message"),
-    [
-        ([0.0, 0.0], (2, 8, 3), "increasing"),
-        ([0.0], (2, 8, 3), "expected"),
-        ([0.0, 1.0], (2, 8), "expected"),
-        ([], (0, 8, 3), "at least one"),
-    ],
-)
-def test_bad_series_is_one_clear_error(tmp_path, times, shape, message):
-    with pytest.raises(InputError, match=message):
-        write_series(tmp_path / "a.pvd", np.array(times), np.zeros(shape), [])
     assert list(tmp_path.iterdir()) == []
