@@ -237,9 +237,7 @@ def _timed(function: Callable[[], Any]) -> tuple[Any, float]:
     return result, time.process_time() - start
 
 
-def valve_model(
-    pressure_mmHg: float, contact: ContactSettings | None = None, element: str = "hex18"
-) -> ClosureModel:
+def valve_model(pressure_mmHg: float, contact: ContactSettings | None = None) -> ClosureModel:
     """The default valve on a coarse mesh, with the generic ratios."""
     template = Template()
     tissue = {"anterior": TissueSettings(6.23 / 2.35), "posterior": TissueSettings(2.09 / 1.89)}
@@ -248,7 +246,7 @@ def valve_model(
         ClosureProtocol(pressure_mmHg=pressure_mmHg),
         contact=contact or ContactSettings(active=False),
     )
-    mesh = structured_mesh(template, element, *CELLS)
+    mesh = structured_mesh(template, "hex18", *CELLS)
     return ClosureModel(template.valve(72, 16), template.valve(144, 32), mesh, settings, NAMES)
 
 

@@ -6,7 +6,7 @@ or an array of any shape and returns the same.
 
 Sources: the conventional millimetre of mercury is 13.5951 g/cm³ × 9.80665 m/s² × 1 mm, which is
 133.322387415 Pa exactly (NIST SP 811, 2008, appendix B.8, gives 133.3224). Every other factor
-follows from the SI prefixes (BIPM, SI Brochure, 9th ed., table 7) and 1 l = 1 dm³ (table 8).
+follows from the SI prefixes (BIPM, SI Brochure, 9th ed., table 7).
 """
 
 from typing import Final, TypeVar
@@ -21,12 +21,6 @@ PA_PER_MPA: Final = 1e6
 
 KPA_PER_MPA: Final = 1e3
 """Kilopascal per megapascal."""
-
-MM3_PER_ML: Final = 1e3
-"""Cubic millimetres per millilitre (1 ml = 1 cm³)."""
-
-T_PER_MM3_PER_G_PER_ML: Final = 1e-9
-"""Tonne per cubic millimetre in one gram per millilitre: 1e-6 t / 1e3 mm³."""
 
 _Number = TypeVar("_Number", float, FloatArray)
 
@@ -44,28 +38,3 @@ def mpa_to_mmhg(pressure: _Number) -> _Number:
 def kpa_to_mpa(stress: _Number) -> _Number:
     """Stress in MPa from kPa."""
     return stress / KPA_PER_MPA
-
-
-def mpa_to_kpa(stress: _Number) -> _Number:
-    """Stress in kPa from MPa."""
-    return stress * KPA_PER_MPA
-
-
-def ml_to_mm3(volume: _Number) -> _Number:
-    """Volume in mm³ from ml."""
-    return volume * MM3_PER_ML
-
-
-def mm3_to_ml(volume: _Number) -> _Number:
-    """Volume in ml from mm³."""
-    return volume / MM3_PER_ML
-
-
-def g_per_ml_to_t_per_mm3(density: _Number) -> _Number:
-    """Density in t/mm³ from g/ml."""
-    return density * T_PER_MM3_PER_G_PER_ML
-
-
-def t_per_mm3_to_g_per_ml(density: _Number) -> _Number:
-    """Density in g/ml from t/mm³."""
-    return density / T_PER_MM3_PER_G_PER_ML

@@ -115,11 +115,6 @@ class Uncertainty:
             object.__setattr__(self, "std_mm", std)
 
     @property
-    def per_vertex(self) -> bool:
-        """Whether every vertex has a standard deviation of its own."""
-        return isinstance(self.std_mm, np.ndarray)
-
-    @property
     def typical_mm(self) -> float:
         """The standard deviation, or its root mean square over the vertices."""
         if isinstance(self.std_mm, np.ndarray):

@@ -76,17 +76,14 @@ def febio_program() -> Path:
     return Path(found)
 
 
-def run_febio(
-    document: FebDocument, path: Path, *, threads: int = 1, time_limit_s: float = 3600.0
-) -> FebRun:
-    """Write a document and run FEBio on it.
+def run_febio(document: FebDocument, path: Path, *, time_limit_s: float = 3600.0) -> FebRun:
+    """Write a document and run FEBio on it, with one thread.
 
     Parameters
     ----------
     document : FebDocument
     path : Path
         Of the input file; FEBio writes beside it.
-    threads : int
     time_limit_s : float
         After which it is stopped, which is a run that did not converge.
 
@@ -99,7 +96,7 @@ def run_febio(
     """
     program = febio_program()
     document.write(path)
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     command = [str(program), "-i", path.name, "-nosplash", "-silent"]
     before = os.times()
     reason = ""

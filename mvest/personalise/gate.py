@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mvest.cases.case import ValveCase
-from mvest.closure.robustness import GATE_CASES, GateCase, GateReport, run_gate, vary
+from mvest.closure.robustness import GATE_CASES, GateReport, run_gate, vary
 from mvest.personalise.model import build_model
 from mvest.personalise.settings import PersonaliseSettings
 
@@ -19,7 +18,6 @@ def gate_case(
     case: ValveCase,
     settings: PersonaliseSettings,
     store: Path | None = None,
-    variations: Sequence[GateCase] = GATE_CASES,
 ) -> GateReport:
     """Ask whether the closed state of a case is one, with the prior means of its unknowns.
 
@@ -32,7 +30,6 @@ def gate_case(
     settings : PersonaliseSettings
     store : Path, optional
         Where an unstructured mesh is kept.
-    variations : sequence of GateCase
 
     Raises
     ------
@@ -43,7 +40,7 @@ def gate_case(
     means = {unknown.name: unknown.mean for unknown in settings.unknowns}
     kept = [
         each
-        for each in variations
+        for each in GATE_CASES
         if not each.remeshed and (model.guide is not None or not each.guided)
     ]
     at = np.array([means[name] for name in model.names])

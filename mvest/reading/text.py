@@ -17,7 +17,6 @@ __all__ = [
     "one_line",
     "read_bytes",
     "read_text",
-    "writable_words",
 ]
 
 MAX_TEXT = 2**26
@@ -106,11 +105,6 @@ def check_words(text: str, max_length: int = MAX_WORDS) -> str:
         code = f"U+{ord(wrong.group()):04X}"
         raise InputError(f"the character {code} at {wrong.start()}, which is no text; remove it")
     return text
-
-
-def writable_words(text: str) -> str:
-    """The text with U+FFFD for what `check_words` refuses."""
-    return _UNWRITABLE.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def one_line(text: object, max_length: int = MAX_LINE) -> str:

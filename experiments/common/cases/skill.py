@@ -122,11 +122,10 @@ def log_width(row: UnknownRow) -> float | None:
     return None if row.low is None or row.high is None else float(np.log(row.high / row.low))
 
 
-def share_bounds(inside: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a share (Clopper and Pearson 1934, Biometrika 26:404)."""
-    tail = 0.5 * (1 - level)
-    low = 0.0 if inside == 0 else float(beta.ppf(tail, inside, n - inside + 1))
-    high = 1.0 if inside == n else float(beta.ppf(1 - tail, inside + 1, n - inside))
+def share_bounds(inside: int, n: int) -> tuple[float, float]:
+    """Exact 95 % interval of a share (Clopper and Pearson 1934, Biometrika 26:404)."""
+    low = 0.0 if inside == 0 else float(beta.ppf(0.025, inside, n - inside + 1))
+    high = 1.0 if inside == n else float(beta.ppf(0.975, inside + 1, n - inside))
     return low, high
 
 

@@ -62,8 +62,8 @@ def design_answer(records: Records) -> str:
     table = design_table(records)
     largest = max(row.frames for record in records.values() for row in record.findings.left)
 
-    def from_to(kind: str, geometry: str = "exact", known: str = "", mmhg: float = 0.0) -> str:
-        own = {"geometry": geometry, "errors": kind, "known": known, "error_mmHg": mmhg}
+    def from_to(kind: str, geometry: str = "exact", mmhg: float = 0.0) -> str:
+        own = {"geometry": geometry, "errors": kind, "known": "", "error_mmHg": mmhg}
         return " to ".join(f"{100 * _median(table, count, own):.0f}" for count in (1, largest))
 
     worst = ERRORS_MMHG[-1]

@@ -85,12 +85,11 @@ def write_for_slicer(
     valve: ValveSequence,
     thickness_mm: float,
     frames: Sequence[int],
-    name: str = "valve",
 ) -> list[Path]:
     """Write landmarks and a segmentation of chosen frames for 3D Slicer; returns the paths.
 
-    ``NAME_0007.mrk.json`` (see `write_landmarks`) and ``NAME_0007.seg.nrrd``, on the voxels of the
-    volume with a segment for each leaflet, hold frame 7.
+    ``valve_0007.mrk.json`` (see `write_landmarks`) and ``valve_0007.seg.nrrd``, on the voxels of
+    the volume with a segment for each leaflet, hold frame 7.
 
     Parameters
     ----------
@@ -102,7 +101,6 @@ def write_for_slicer(
         Of the leaflets.
     frames : sequence of int
         From 0 on.
-    name : str
 
     Raises
     ------
@@ -115,7 +113,7 @@ def write_for_slicer(
     names = {1 + k: segment_name(region) for k, region in enumerate(layout.region_names)}
     written = []
     for frame in frames:
-        base = folder / f"{name}_{frame:04d}"
+        base = folder / f"valve_{frame:04d}"
         written.append(write_landmarks(base.with_name(f"{base.name}.mrk.json"), valve, frame))
         labels = voxelise_leaflets(
             volume,

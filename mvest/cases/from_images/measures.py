@@ -80,9 +80,7 @@ def contact_distance(sequence: ValveSequence, thickness_mm: float) -> float:
     return float(thickness_mm + (np.sqrt(2.0) * np.median(known) if len(known) else 0.0))
 
 
-def measure_sequence(
-    sequence: ValveSequence, thickness_mm: float, *, passing_ball: bool = False
-) -> list[Row]:
+def measure_sequence(sequence: ValveSequence, thickness_mm: float) -> list[Row]:
     """Measure a valve in every frame.
 
     Parameters
@@ -90,8 +88,6 @@ def measure_sequence(
     sequence : ValveSequence
     thickness_mm : float
         Of the leaflets.
-    passing_ball : bool
-        Whether the largest ball that passes is looked for, which takes about a second per frame.
 
     Returns
     -------
@@ -107,7 +103,7 @@ def measure_sequence(
     """
     reach = contact_distance(sequence, thickness_mm)
     layout = sequence.layout
-    names = clinical_names(layout.region_names, TIPS, passing_ball)
+    names = clinical_names(layout.region_names, TIPS, passing_ball=False)
     rows = []
     for t, time in enumerate(sequence.times):
         row: Row = {
@@ -117,13 +113,13 @@ def measure_sequence(
             "vertex_confidence_mean": _finite(sequence.vertex_confidence[t].mean()),
             "contact_distance_mm": reach,
         }
-        measured = _measured(sequence, t, thickness_mm, reach, passing_ball)
+        measured = _measured(sequence, t, thickness_mm, reach)
         rows.append(row | {name: _finite(measured.get(name)) for name in names})
     return rows
 
 
 def _measured(
-    sequence: ValveSequence, t: int, thickness_mm: float, reach: float, passing_ball: bool
+    sequence: ValveSequence, t: int, thickness_mm: float, reach: float
 ) -> Mapping[str, float | None]:
     x, tips = sequence.vertices[t], sequence.tips[t]
     if not (np.isfinite(x).all() and np.isfinite(tips).all() and sequence.frame_confidence[t] > 0):
@@ -136,7 +132,7 @@ def _measured(
         tips,
         reach,
         tip_names=TIPS,
-        passing_ball=passing_ball,
+        passing_ball=False,
     )
     if is_open(measures):
         return {name: v for name, v in measures.items() if not name.startswith(CLOSED_ONLY)}
@@ -185,11 +181,11 @@ def measure_meaning(name: str) -> tuple[str, str]:
     return _OWN[name] if name in _OWN else clinical_meaning(name)
 
 
-def write_measures(folder: Path, rows: Sequence[Row], name: str = "measures") -> list[Path]:
+def write_measures(folder: Path, rows: Sequence[Row]) -> list[Path]:
     """Write the measures of every frame; returns the paths.
 
-    ``NAME.csv`` has one row per frame, the units in its columns, an empty cell for what could not
-    be measured; ``NAME.json`` the same (null), with unit and meaning of every name.
+    ``measures.csv`` has one row per frame, the units in its columns, an empty cell for what could
+    not be measured; ``measures.json`` the same (null), with unit and meaning of every name.
 
     Parameters
     ----------
@@ -197,7 +193,6 @@ def write_measures(folder: Path, rows: Sequence[Row], name: str = "measures") ->
         Exists.
     rows : sequence of dict
         From `measure_sequence`.
-    name : str
 
     Raises
     ------
@@ -205,8 +200,8 @@ def write_measures(folder: Path, rows: Sequence[Row], name: str = "measures") ->
         No rows, or a file that cannot be written.
     """
     if not rows:
-        raise InputError(f"{folder / name}: no frames to write, expected at least one")
-    table, document = folder / f"{name}.csv", folder / f"{name}.json"
+        raise InputError(f"{folder}: no frames to write, expected at least one")
+    table, document = folder / "measures.csv", folder / "measures.json"
 
     def write_csv(file: Path) -> None:
         with file.open("w", encoding="utf-8", newline="") as stream:

@@ -131,12 +131,12 @@ def pose_of(
     return Poses(centre[None], rotation[None], np.array([np.log(size / size_mm)]))
 
 
-def rotation_grid(count: int, seed: int = 0) -> FloatArray:
+def rotation_grid(count: int) -> FloatArray:
     """``(count, 3, 3)`` rotations over all orientations, spread more evenly than random ones.
 
     Drawn one after another, each the farthest of some candidates from those before it.
     """
-    candidates = Rotation.random(4 * count, rng=np.random.default_rng(seed)).as_quat()
+    candidates = Rotation.random(4 * count, rng=np.random.default_rng(0)).as_quat()
     nearness = np.abs(candidates @ candidates[0])
     chosen = [0]
     for _ in range(count - 1):

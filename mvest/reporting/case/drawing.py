@@ -267,9 +267,9 @@ def paint_leak(axes: Any, fields: CaseFields, points: FloatArray, frame: int) ->
         paint_gap(axes, fields, points, frame, fields.reach_mm)
 
 
-def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str], view: View = ATRIUM) -> None:
+def name_leaflets(axes: Any, fields: CaseFields, names: Sequence[str]) -> None:
     """Write the names of the leaflets outside the annulus, seen from the atrium."""
-    ring = fields.rest[fields.annulus] @ view.axes
+    ring = fields.rest[fields.annulus] @ ATRIUM.axes
     middle = ring.mean(axis=0)[:2]
     region = fields.vertex_region[fields.annulus]
     for k, name in enumerate(names):

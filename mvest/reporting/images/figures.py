@@ -159,7 +159,7 @@ def _leave_room(axes: Any, values: FloatArray) -> None:
     axes.set_ylim(middle - 0.6 * span, middle + 0.95 * span)
 
 
-def distance_figure(rows: Sequence[Row], *, title: str = "") -> Figure:
+def distance_figure(rows: Sequence[Row]) -> Figure:
     """Mean surface distance of every held-out volume, in distribution and shifted.
 
     Parameters
@@ -167,7 +167,6 @@ def distance_figure(rows: Sequence[Row], *, title: str = "") -> Figure:
     rows : sequence of mapping
         For each volume ``setting`` (see `SETTINGS`) and ``surface_mm``; None counts as a valve that
         was not found.
-    title : str
 
     Raises
     ------
@@ -218,7 +217,7 @@ def distance_figure(rows: Sequence[Row], *, title: str = "") -> Figure:
     axes.grid(visible=False, axis="y")
     headline(
         figure,
-        title or "Distance of the found leaflets from the true ones",
+        "Distance of the found leaflets from the true ones",
         "Simulated volumes that no training saw. Box: quartiles and median; whiskers: 5 to 95 %.",
     )
     return figure
@@ -228,14 +227,13 @@ def _lost(count: int) -> str:
     return f", {count} without a valve found" if count else ""
 
 
-def training_figure(table: pd.DataFrame, *, title: str = "") -> Figure:
+def training_figure(table: pd.DataFrame) -> Figure:
     """Error of every stage of the image step against the number of training volumes.
 
     Parameters
     ----------
     table : DataFrame
         Columns ``stage``, ``training_volumes``, ``setting``, ``median``, ``p90`` and ``unit``.
-    title : str
 
     Raises
     ------
@@ -282,13 +280,13 @@ def training_figure(table: pd.DataFrame, *, title: str = "") -> Figure:
         )
     headline(
         figure,
-        title or "Errors of the image step against the number of training volumes",
+        "Errors of the image step against the number of training volumes",
         "Simulated volumes that no training saw.",
     )
     return figure
 
 
-def std_figure(layout: ValveLayout, std_mm: FloatArray, *, title: str = "") -> Figure:
+def std_figure(layout: ValveLayout, std_mm: FloatArray) -> Figure:
     """Standard deviation of every point of the tissue over the valve's own plane (phi, s).
 
     Parameters
@@ -296,7 +294,6 @@ def std_figure(layout: ValveLayout, std_mm: FloatArray, *, title: str = "") -> F
     layout : ValveLayout
     std_mm : (n,) mm
         NaN where it was never measured.
-    title : str
 
     Raises
     ------
@@ -335,5 +332,5 @@ def std_figure(layout: ValveLayout, std_mm: FloatArray, *, title: str = "") -> F
         note += f"; median {np.median(known):.2f} mm, largest {known.max():.2f} mm"
     unknown = len(values) - len(known)
     note += f"; grey: never measured ({unknown} points)." if unknown else "."
-    headline(figure, title or "Where the image step is sure of the leaflets", note)
+    headline(figure, "Where the image step is sure of the leaflets", note)
     return figure

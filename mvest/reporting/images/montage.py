@@ -84,7 +84,6 @@ def montage_figure(
     *,
     title: str,
     closed: int | None = None,
-    most: int = 6,
     low_confidence: float = MIN_CONFIDENCE,
     accepted: bool = True,
 ) -> Figure:
@@ -101,8 +100,6 @@ def montage_figure(
         What is shown, such as the name of the sequence.
     closed : int, optional
         A frame that must be among those shown.
-    most : int
-        Rows.
     low_confidence : float
         Frames below this are marked in words.
     accepted : bool
@@ -120,7 +117,7 @@ def montage_figure(
             f"montage {title}: volume of {len(volume.times)} frames and valve of "
             f"{len(valve.times)}, expected the same frames at the same times"
         )
-    frames = chosen_frames(len(valve.times), closed, most)
+    frames = chosen_frames(len(valve.times), closed)
     usable = [frame for frame in frames if _finite(valve, frame)]
     planes = {frame: valve_planes(valve, frame) for frame in usable}
     extents = _extents(valve, planes)

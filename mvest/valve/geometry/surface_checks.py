@@ -27,10 +27,10 @@ MAX_OVERLAPS = 1e7
 """Of bounding boxes of edges and triangles (0.3 GB); 50 000 triangles in good order have 1e6."""
 
 
-def listed(numbers: IntArray, count: int = 8) -> str:
-    """The first numbers in words, for a message."""
-    shown = ", ".join(str(int(i)) for i in numbers[:count])
-    return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > count else "")
+def listed(numbers: IntArray) -> str:
+    """The first eight numbers in words, for a message."""
+    shown = ", ".join(str(int(i)) for i in numbers[:8])
+    return shown + (f", ... ({len(numbers)} in all)" if len(numbers) > 8 else "")
 
 
 def check_surface(

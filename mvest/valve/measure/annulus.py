@@ -38,14 +38,14 @@ class AnnulusPlane:
         return result
 
 
-def checked_loop(annulus: FloatArray, name: str = "annulus") -> FloatArray:
+def checked_loop(annulus: FloatArray) -> FloatArray:
     """Return a closed curve ``(k, 3)`` mm as an array, or say what is wrong with it."""
     loop = np.asarray(annulus, dtype=np.float64)
     if loop.ndim != 2 or loop.shape[1] != 3 or len(loop) < 3:
-        raise GeometryError(f"{name}: shape {loop.shape}, expected (k, 3) with k >= 3 points (mm)")
+        raise GeometryError(f"annulus: shape {loop.shape}, expected (k, 3) with k >= 3 points (mm)")
     bad = np.flatnonzero(~np.isfinite(loop).all(axis=1))
     if len(bad):
-        raise GeometryError(f"{name}: points {bad[:5].tolist()} are not finite numbers")
+        raise GeometryError(f"annulus: points {bad[:5].tolist()} are not finite numbers")
     return loop
 
 

@@ -61,7 +61,6 @@ def measure_closure(
     annulus: FloatArray,
     plane: AnnulusPlane,
     contact_distance: float,
-    opposing: tuple[int, int] = (0, 1),
 ) -> ClosureMeasurements:
     """Measure the closure of a valve from its midsurface in the current shape.
 
@@ -77,10 +76,8 @@ def measure_closure(
         Current annulus ``(k, 3)`` mm in loop order, and its plane.
     contact_distance
         mm between midsurfaces that count as touching: thickness plus the contact model's gap.
-    opposing
-        The two regions whose coaptation is measured.
     """
-    first, second = (triangles[np.asarray(region) == label] for label in opposing)
+    first, second = (triangles[np.asarray(region) == label] for label in (0, 1))
     return ClosureMeasurements(
         orifice_area=orifice_area(vertices, triangles, annulus, plane),
         passing_ball_diameter=largest_passing_ball(
@@ -201,28 +198,20 @@ def leaflet_length(
     vertices: FloatArray,
     triangles: IntArray,
     plane: AnnulusPlane,
-    origin: FloatArray | None = None,
-    direction: FloatArray | None = None,
 ) -> float:
-    """Length (mm) of a leaflet from annulus to free edge along a plane section.
+    """Length (mm) of a leaflet from annulus to free edge, in the middle of A2 or P2.
 
-    The section is the plane through `origin` spanned by the annulus normal and `direction`; its
-    length is the sum of the segments in which it cuts the leaflet's triangles.
+    The section is the plane through the annulus centre spanned by its normal and the anterior
+    direction; its length is the sum of the segments in which it cuts the leaflet's triangles.
 
     Parameters
     ----------
     vertices, triangles
         The triangles of one leaflet.
-    origin
-        ``(3,)`` mm, default the annulus centre.
-    direction
-        ``(3,)``, default the anterior direction: the middle of A2 or P2.
+    plane : AnnulusPlane
     """
-    start = plane.origin if origin is None else np.asarray(origin, dtype=np.float64)
-    along = plane.anterior if direction is None else np.asarray(direction, dtype=np.float64)
-    segments, _ = plane_section(
-        vertices, triangles, start, unit_vector(np.cross(plane.normal, along), "direction")
-    )
+    across = unit_vector(np.cross(plane.normal, plane.anterior), "anterior direction")
+    segments, _ = plane_section(vertices, triangles, plane.origin, across)
     return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())
 
 

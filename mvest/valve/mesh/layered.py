@@ -32,6 +32,9 @@ LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
 MIN_AREA_RATIO = 0.5
 """Smallest accepted ratio of least to greatest area factor in a six-node triangle. [choice]"""
 
+SMOOTHING = 3
+"""Rounds of averaging normals and thickness with their neighbours in the sheet."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayeredMesh:
@@ -73,7 +76,6 @@ def layered_wedges(
     element_type: str = "wedge12",
     layers: int = 1,
     onto: LeafletSurface | None = None,
-    smoothing: int = 3,
 ) -> LayeredMesh:
     """Thicken a midsurface into layers of six-node-triangle wedges.
 
@@ -88,8 +90,6 @@ def layered_wedges(
     onto : LeafletSurface, optional
         Finer surface that the edge middles are laid on (its boundary loops for boundary edges), and
         from which normals, fibre and thickness are taken; without it edges are straight.
-    smoothing : int
-        Rounds of averaging normals and thickness with their neighbours in the sheet.
 
     Raises
     ------
@@ -102,8 +102,8 @@ def layered_wedges(
         raise InputError(
             f"cannot thicken into {element_type!r}; known: {', '.join(LEVELS_PER_LAYER)}"
         )
-    if layers < 1 or smoothing < 0:
-        raise InputError(f"layers {layers} and smoothing {smoothing}, expected >= 1 and >= 0")
+    if layers < 1:
+        raise InputError(f"{layers} layers, expected at least 1")
     sheet, edges, on_boundary = _quadratic_sheet(surface.triangles)
     middles = surface.vertices[edges].mean(axis=1)
     thickness = np.concatenate([surface.thickness, surface.thickness[edges].mean(axis=1)])
@@ -122,7 +122,7 @@ def layered_wedges(
         normals = at.interpolate(onto.normals, onto.triangles)
 
     average = _neighbour_average(small, len(points))
-    for _ in range(smoothing):
+    for _ in range(SMOOTHING):
         normals = unit_rows(average @ normals)
         thickness = average @ thickness
     fibre = unit_rows(fibre - normals * np.einsum("ij,ij->i", fibre, normals)[:, None])
