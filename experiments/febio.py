@@ -27,7 +27,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import Log
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
 from mvest.febio.laws import LAWS as KINDS
-from mvest.febio.laws import OrthotropicElastic, febio_law
+from mvest.febio.laws import febio_law
 from mvest.febio.mesh import febio_mesh
 from mvest.febio.program import FebRun, run_febio
 from mvest.febio.valve import CONTACTS, FebSettings, differences, valve_document
@@ -36,6 +36,7 @@ from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.biot import TransverselyIsotropic
+from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.settings import (
     ClosureProtocol,
     ContactSettings,
@@ -165,7 +166,7 @@ def law_table(folder: Path) -> pd.DataFrame:
                 mesh = block("tet10", (1, 1, 1), (1.0, 1.0, 1.0), pressed)
                 body = Body(mesh, symmetric, -strain * modulus)
                 corner = np.flatnonzero(np.all(mesh.nodes == 1, axis=1))[0]
-                here, same = body.here(material), body.here(OrthotropicElastic([material]))
+                here, same = body.here(material), body.here(LinearLaw.of([material]))
                 row: dict[str, Any] = {
                     "reading": name, "pulled": pulled, "stress_mpa": strain * modulus,
                     "linear": strain,
@@ -205,7 +206,7 @@ def body_table(folder: Path) -> pd.DataFrame:
             for name in ("A", "C"):
                 material = MATERIALS[name]
                 here, own_s = _timed(partial(body.here, material))
-                law = body.here(OrthotropicElastic([material]))
+                law = body.here(LinearLaw.of([material]))
                 there = body.there(material, "orthotropic", folder)
                 rest = body.mesh.nodes
                 rows.append(
@@ -267,7 +268,7 @@ def closed(model: ClosureModel, law: bool = False) -> tuple[Simulation, float]:
             model.settings.tissue[name].material(value)
             for name, value in zip(model.mesh.region_names, GENERIC, strict=True)
         ]
-        system.solid.law = OrthotropicElastic(moduli)
+        system.solid.law = LinearLaw.of(moduli)
         system.solid.reset()
     loading = boundary_loading(system, model.valve, model.contact_valve, model.settings)
     return _timed(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.building.closure import mesh_store
 from experiments.common.building.filters import build_filter
 from experiments.common.building.twin import Twin, build_twin
 from experiments.common.building.whole_cycle import cycle_model, stored_cycle
@@ -20,7 +21,6 @@ from mvest.estimation.wrappers import SharedStart
 from mvest.personalise.design import design_text
 from mvest.personalise.expectation import foresee_case
 from mvest.problem.expectation import Expectation, expect, expect_of_model
-from mvest.problem.synthetic import simulate_observation
 from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text
 from mvest.typing import FloatArray
@@ -70,16 +70,7 @@ def _expected_at_start(twin: Twin, first: Prediction, start: FloatArray) -> Expe
 
     if not first.converged:
         return first.reason
-    data = simulate_observation(
-        model,
-        twin.problem.parameters,
-        start,
-        frames=twin.frames,
-        variance=twin.variance,
-        correlation=twin.correlation,
-        errors=twin.errors,
-        rng=np.random.default_rng(0),
-    )
+    data = twin.observe(model, start, np.random.default_rng(0))
     assert data.observation is not None
     return expect(replace(twin.problem, model=model), data.observation)
 
@@ -100,7 +91,7 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
     MvestError
         If the case is not in order.
     """
-    from experiments.common.cases.own_case import meshes_of, read_configured, settings_of
+    from experiments.common.cases.own_case import read_configured, settings_of
     from experiments.common.cases.settings import PersonalSettings
 
     case = read_configured(config["case"])
@@ -108,7 +99,7 @@ def expect_own(config: Values, _folder: Path | None = None) -> str:
         return f"{case.name}: an open frame alone, from which nothing can be estimated"
     settings = settings_of(config, build(PersonalSettings, config["personal"]))
     with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
-        store = meshes_of(config)
+        store = mesh_store(config)
         expected, designs = foresee_case(case, settings, store=store, on_step=bar.step)
     uncertainty = case.uncertainty
     length = uncertainty.correlation_length_mm

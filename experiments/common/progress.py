@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import cache
-from types import TracebackType
 
 from tqdm import tqdm
 
@@ -86,12 +85,7 @@ class SolveBar:
         announce_compilation(f"the {self._title}")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self._end_solve()
         self._bar.close()
@@ -180,12 +174,7 @@ class PartBar:
     def __enter__(self) -> PartBar:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._bar.close()
         if kind is None:
             say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")

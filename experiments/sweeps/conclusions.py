@@ -35,7 +35,7 @@ from experiments.sweeps.statistics import (
     spread_of,
     verdict,
 )
-from mvest.reporting.markup import number
+from mvest.reporting.markup import listed, number
 
 __all__ = ["conclusions", "question"]
 
@@ -91,10 +91,6 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}" + ("" if n == 1 else "s")
 
 
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
-
-
 def _worst(runs: Sequence[Run]) -> Run | None:
     known = [run for run in converged(runs) if np.isfinite(run.largest_error)]
     return max(known, key=lambda run: run.largest_error) if known else None
@@ -115,7 +111,7 @@ def _initial_guess(sweep: Sweep, runs: list[Run]) -> list[str]:
                 short_names(sweep.parameters), starts.min(0), starts.max(0), strict=True
             )
         ]
-        sentences.append(f"The starts range over {_listed(ranges)}.")
+        sentences.append(f"The starts range over {listed(ranges)}.")
     for mode, group in groups.items():
         outside = [run for run in group if not in_basin(run)]
         if outside:
@@ -168,7 +164,7 @@ def _covariance(sweep: Sweep, runs: list[Run]) -> list[str]:
     sentences = [f"The error depends most on {max(swings)[1]}."]
     if still := [where for where, all_small in quiet.items() if all_small]:
         sentences.append(
-            f"It stays within {BASIN_PERCENT:g} % at every value tried of {_listed(still)}."
+            f"It stays within {BASIN_PERCENT:g} % at every value tried of {listed(still)}."
         )
     growth, where = max(growths)
     sentences.append(
@@ -213,7 +209,7 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
             f"ratio is {number(largest[0])} ({largest[1]})."
         )
         if above:
-            sentences.append(f"It is above that for {_listed(list(above))}.")
+            sentences.append(f"It is above that for {listed(list(above))}.")
     if shares:
         low, high = COVERAGE_RANGE
         smallest = min(shares)
@@ -224,14 +220,14 @@ def _noise(sweep: Sweep, runs: list[Run]) -> list[str]:
             f"smallest coverage is {100 * smallest[0]:.0f} % ({smallest[1]})."
         )
         if outside:
-            sentences.append(f"It does not for {_listed(list(outside))}.")
+            sentences.append(f"It does not for {listed(list(outside))}.")
     strongest = {group.kind: group for group in groups if converged(group.runs)}
     for group in strongest.values():
         errors = [
             f"{number(accuracy(group.runs, k).rmse_percent, 2)} % ({name})"
             for k, name in enumerate(names)
         ]
-        sentences.append(f"Under “{group.label}” the root mean square error is {_listed(errors)}.")
+        sentences.append(f"Under “{group.label}” the root mean square error is {listed(errors)}.")
     return sentences
 
 
@@ -259,8 +255,8 @@ def _discrepancy(sweep: Sweep, runs: list[Run]) -> list[str]:
     ]
     following = [e for n, e in enumerate(real[1:]) if n < NEXT or e[0] >= NOTABLE_PERCENT]
     if following:
-        listed = _listed([f"“{e[3]}” ({e[1]:+.3g} %, {e[2]}{e[4]})" for e in following])
-        sentences.append(f"Next come {listed}.")
+        shown = listed([f"“{e[3]}” ({e[1]:+.3g} %, {e[2]}{e[4]})" for e in following])
+        sentences.append(f"Next come {shown}.")
     alone = [effect for effect in effects if effect[3] in own]
     if alone:
         sentences.append(f"Without any discrepancy the error is {number(alone[0][0])} %.")
@@ -317,7 +313,7 @@ def _anything(sweep: Sweep, runs: list[Run]) -> list[str]:
     kind, needed = sweep.kind, FACTORS.get(sweep.kind)
     missing = sorted(needed[0] - set(factor_names(sweep))) if needed else []
     why = (
-        f"This sweep of the kind “{kind}” lacks the factor {_listed(missing)} in a job and has"
+        f"This sweep of the kind “{kind}” lacks the factor {listed(missing)} in a job and has"
         if needed and missing
         else f"Sweeps of the kind “{kind}” have"
     )

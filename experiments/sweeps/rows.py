@@ -16,6 +16,7 @@ import pandas as pd
 
 from experiments.common.records.estimates import SeedRun, Spread
 from experiments.common.records.record import HASH_DIGITS
+from experiments.common.records.report import bracketed_unit
 from experiments.sweeps.collected import Cost, Sweep, SweepJob
 from mvest.typing import FloatArray
 
@@ -32,7 +33,6 @@ __all__ = [
     "short_names",
     "sweep_line",
     "tidy_rows",
-    "unit_of",
 ]
 
 CONVERGED = "converged"
@@ -189,11 +189,6 @@ def factor_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else "–" if value is None else str(value)
 
 
-def unit_of(parameter: str) -> str:
-    """`` [MPa]`` for a modulus, nothing for any other parameter."""
-    return " [MPa]" if parameter.startswith("E_f.") else ""
-
-
 def short_names(parameters: Sequence[str]) -> list[str]:
     """Names for figures: the regions where all are the same modulus, full names otherwise."""
     kinds = {name.partition(".")[0] for name in parameters}
@@ -235,7 +230,7 @@ def tidy_rows(sweep: Sweep) -> list[dict[str, Any]]:
             "noise [mm]": None if job.model is None else job.model.noise_mm,
         }
         for k, name in enumerate(sweep.parameters):
-            unit = unit_of(name)
+            unit = bracketed_unit(name)
             fixed[f"truth {name}{unit}"] = run.truth[k]
             fixed[f"start {name}{unit}"] = run.start[k]
             for key, variance in (("P0", job.P0), ("Q", job.Q)):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.records.report import bracketed_unit
 from experiments.sweeps.collected import Sweep
 from experiments.sweeps.families import SEED, noise_groups, setting_words, varied_names
 from experiments.sweeps.rows import (
@@ -21,7 +22,6 @@ from experiments.sweeps.rows import (
     factor_text,
     kind_of,
     runs_of,
-    unit_of,
 )
 from experiments.sweeps.statistics import (
     BASIN_PERCENT,
@@ -102,13 +102,14 @@ def _paper_rows(sweep: Sweep, like: Reading) -> tuple[list[Row], list[Reading]]:
             {
                 "setting": label,
                 "parameter": name,
-                f"estimate mean{unit_of(name)}": estimate[k],
+                f"estimate mean{bracketed_unit(name)}": estimate[k],
                 "largest error [%]": error[k],
             }
             for k, name in enumerate(names)
         ]
         words = [
-            {"setting": label, "parameter": name, f"estimate{unit_of(name)}": number(estimate[k]),
+            {"setting": label, "parameter": name,
+             f"estimate{bracketed_unit(name)}": number(estimate[k]),
              "largest error [%]": number(error[k])}
             for k, name in enumerate(names)
         ]  # fmt: skip
@@ -116,9 +117,9 @@ def _paper_rows(sweep: Sweep, like: Reading) -> tuple[list[Row], list[Reading]]:
         plain = [{"setting": label}]
         words = [{"setting": label}]
         for k, name in enumerate(names):
-            plain[0][f"estimate {name}{unit_of(name)}"] = estimate[k]
+            plain[0][f"estimate {name}{bracketed_unit(name)}"] = estimate[k]
             plain[0][f"largest error {name} [%]"] = error[k]
-            words[0][f"{name}{unit_of(name)}"] = number(estimate[k])
+            words[0][f"{name}{bracketed_unit(name)}"] = number(estimate[k])
             for column in (f"error {name} [%]", f"largest error {name} [%]"):
                 words[0][column] = number(error[k])
     return plain, [{name: row.get(name, MISSING) for name in like} for row in words]
@@ -155,10 +156,10 @@ def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
         }
         for k, name in enumerate(sweep.parameters):
             found = accuracy(group, k)
-            row[f"estimate {name}{unit_of(name)}"] = found.mean
-            row[f"SD over starts {name}{unit_of(name)}"] = found.spread
+            row[f"estimate {name}{bracketed_unit(name)}"] = found.mean
+            row[f"SD over starts {name}{bracketed_unit(name)}"] = found.spread
             row[f"largest error {name} [%]"] = found.worst_percent
-            text[f"{name}{unit_of(name)}"] = with_std(found.mean, found.spread)
+            text[f"{name}{bracketed_unit(name)}"] = with_std(found.mean, found.spread)
             text[f"largest error {name} [%]"] = number(found.worst_percent)
         solves = spread_of([run.forward_solves for run in good])
         row["forward solves, median"], row["forward solves, max"] = solves["median"], solves["max"]
@@ -173,7 +174,7 @@ def _starts(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
 def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
     """One row per setting and parameter."""
     names = [name for name in factor_names(sweep) if name != SEED]
-    units = {unit_of(name) for name in sweep.parameters}
+    units = {bracketed_unit(name) for name in sweep.parameters}
     mixed = len(units) > 1
     common = "" if mixed else units.pop()
     rows, reading = [], []
@@ -206,13 +207,13 @@ def _noise(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
                     "95 % interval covers [%]": _share(levels[-1]),
                     f"{100 * COVERAGE_RANGE[0]:.0f}–{100 * COVERAGE_RANGE[1]:.0f} %": judged[1],
                 }
-                | _noise_reading(unit_of(name) if mixed else "", common, found)
+                | _noise_reading(bracketed_unit(name) if mixed else "", common, found)
             )
     return rows, reading
 
 
 def _accuracy_row(found: EstimateAccuracy, name: str) -> Row:
-    unit = unit_of(name)
+    unit = bracketed_unit(name)
     return {
         "runs": found.n,
         "failed": found.failed,
@@ -280,13 +281,13 @@ def _settings(sweep: Sweep, runs: list[Run]) -> tuple[list[Row], list[Reading]]:
             text["n"] = str(len(good))
         for k, name in enumerate(sweep.parameters):
             found, covered = accuracy(group, k), coverage(group, k)
-            row[f"estimate {name}{unit_of(name)}"] = found.mean
-            row[f"SD over seeds {name}{unit_of(name)}"] = found.spread
-            row[f"std {name}{unit_of(name)}"] = found.reported
+            row[f"estimate {name}{bracketed_unit(name)}"] = found.mean
+            row[f"SD over seeds {name}{bracketed_unit(name)}"] = found.spread
+            row[f"std {name}{bracketed_unit(name)}"] = found.reported
             row[f"error {name} [%]"] = found.bias_percent
             row[f"RMSE {name} [%]"] = found.rmse_percent
             row[f"largest error {name} [%]"] = found.worst_percent
-            text[f"{name}{unit_of(name)}"] = with_std(found.mean, found.reported)
+            text[f"{name}{bracketed_unit(name)}"] = with_std(found.mean, found.reported)
             error = found.rmse_percent if repeated else found.bias_percent
             text[f"{'RMSE' if repeated else 'error'} {name} [%]"] = number(error)
             if repeated:

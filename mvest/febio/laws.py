@@ -5,7 +5,8 @@ The linear law of this project is :math:`\tfrac12 \epsilon : C : \epsilon` of th
 Both have the same stiffness at rest.
 
 ``orthotropic``
-    ``orthotropic elastic``: the same C, of the Green-Lagrange strain.
+    ``orthotropic elastic``: the same C, of the Green-Lagrange strain
+    (:class:`mvest.mechanics.law.linear.LinearLaw`).
 ``neo-hookean``
     ``neo-Hookean transiso``: the same moduli in a neo-Hookean form.
 
@@ -18,18 +19,14 @@ hyperelastic`` with the same exponential; the stretch of its fibres is then the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-
-import numpy as np
 
 from mvest.errors import InputError
 from mvest.mechanics.law.moduli import TransverselyIsotropic
-from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ExponentialTissue
-from mvest.typing import FloatArray, IntArray
 
-__all__ = ["LAWS", "FebLaw", "OrthotropicElastic", "febio_law"]
+__all__ = ["LAWS", "FebLaw", "febio_law"]
 
 LAWS = ("orthotropic", "neo-hookean")
 
@@ -90,56 +87,3 @@ def febio_law(
         "v12": tissue.nu_fp, "v23": tissue.nu_pp, "v31": tissue.nu_fp * tissue.E_p / tissue.E_f,
     }  # fmt: skip
     return FebLaw("orthotropic elastic", names, "mat_axis")
-
-
-class OrthotropicElastic:
-    """FEBio's ``orthotropic elastic`` as a law of this project: ``S = C : E``.
-
-    With it the two differ in element and contact alone. It knows no parameters.
-
-    Parameters
-    ----------
-    materials : sequence of TransverselyIsotropic
-        One per region.
-    """
-
-    kinds: tuple[str, ...] = ()
-
-    def __init__(self, materials: Sequence[TransverselyIsotropic]) -> None:
-        self._stiffness = np.array([m.stiffness for m in materials])
-
-    def strain(self, green: FloatArray) -> FloatArray:
-        """The Green-Lagrange strain itself."""
-        return green
-
-    def response(
-        self, green: FloatArray, region: IntArray, previous: FloatArray, rate: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Stress ``(e, q, 6)`` and tangent ``(e, q, 6, 6)`` MPa."""
-        c = self._stiffness[region]
-        tangent = np.repeat((1 + rate) * c[:, None], green.shape[1], axis=1)
-        return np.einsum("eij,eqj->eqi", c, (1 + rate) * green - rate * previous), tangent
-
-    def partial_stress(
-        self,
-        parameter: Parameter,
-        green: FloatArray,
-        region: IntArray,
-        previous: FloatArray,
-        rate: float,
-        *,
-        which: int,
-        stress: FloatArray,
-    ) -> FloatArray:
-        """InputError: there is no parameter."""
-        raise InputError(f"parameter {parameter.name!r}: this law has none")
-
-    def history_stress(
-        self, green: FloatArray, region: IntArray, d_previous: FloatArray, rate: float
-    ) -> FloatArray:
-        """Change of the stress for a change of the previous strain."""
-        return -rate * np.einsum("eij,eqj->eqi", self._stiffness[region], d_previous)
-
-    def strain_change(self, green: FloatArray, d_green: FloatArray) -> FloatArray:
-        """The change of the strain itself."""
-        return d_green

@@ -38,7 +38,8 @@ from mvest.mechanics.element import (
     strain_derivative,
     strains,
 )
-from mvest.mechanics.law.corotational import CorotationalLaw, EdgeRotations
+from mvest.mechanics.law.corotational import EdgeRotations
+from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
@@ -162,7 +163,7 @@ class Solid:
         self.n_modes = self.polynomials.shape[1]
         self.sampling = _sampling(mesh, reference)
         self.rotations = None
-        if isinstance(law, CorotationalLaw):
+        if isinstance(law, LinearLaw) and law.corotational:
             at_rest = strains(mesh.nodes, mesh.elements, self.gradients)[1]
             self.rotations = EdgeRotations(mesh, at_rest)
         self.lumped_mass = density * _lumped_volume(mesh, reference, self.volumes)

@@ -18,9 +18,9 @@ from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.law.biot import BiotLaw
-from mvest.mechanics.law.corotational import CorotationalLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
+from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
 from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
@@ -211,7 +211,7 @@ def material_law(
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
     law: Law
     if corotational == {True}:
-        law = CorotationalLaw.of_moduli(linear)
+        law = LinearLaw.of_moduli(linear, corotational=True)
     elif not exponential:
         law = BiotLaw.of_moduli(linear)
     elif not linear:

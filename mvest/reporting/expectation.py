@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import ndtri
@@ -11,7 +11,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability
 from mvest.estimation.transform import Transform
 from mvest.reporting.findings import Alike
-from mvest.reporting.markup import MISSING, number
+from mvest.reporting.markup import MISSING, listed, number
 from mvest.typing import FloatArray
 
 __all__ = ["alike", "alike_words", "confounded_words", "expectation_text", "measurement_words"]
@@ -168,9 +168,9 @@ def alike_words(group: Alike, labels: Mapping[str, str] | None = None) -> str:
         )
     ]
     return (
-        f"The data hardly tell apart {_listed(labelled)} (correlations of at least "
+        f"The data hardly tell apart {listed(labelled)} (correlations of at least "
         f"{np.floor(1000 * group.correlation) / 1000:.3g}): {moved[0]} with "
-        f"{_listed(moved[1:])} looks almost the same."
+        f"{listed(moved[1:])} looks almost the same."
     )
 
 
@@ -178,10 +178,6 @@ def _change(name: str, change: float, relative: float) -> str:
     if _unit(name) in ("mm", "degrees"):
         return f"{change:+.2g} {_unit(name)}".replace("-", "−")
     return f"{100 * relative:+.2g} %".replace("-", "−")
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _unit(name: str) -> str:

@@ -16,6 +16,7 @@ __all__ = [
     "ended",
     "latex_rows",
     "latex_text",
+    "listed",
     "markdown_rows",
     "markdown_text",
     "number",
@@ -139,3 +140,8 @@ def number(value: Any, digits: int = 3) -> str:
 def with_std(value: Any, std: Any) -> str:
     """``value ± std``, or the value alone where there is no standard deviation."""
     return number(value) if number(std) == MISSING else f"{number(value)} ± {number(std, 2)}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """One or more words as a sentence lists them: with commas, and "and" before the last."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -7,11 +7,12 @@ import pytest
 
 from mvest.errors import ConfigurationError, InputError
 from mvest.febio.document import Control, FebDocument, Prescribed, Pressure
-from mvest.febio.laws import OrthotropicElastic, febio_law
+from mvest.febio.laws import febio_law
 from mvest.febio.mesh import febio_mesh
 from mvest.febio.program import febio_program, read_positions, run_febio
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law.biot import PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings
 from tests.febio.test_febio_mesh import mesh_of
@@ -69,7 +70,7 @@ def theirs(mesh, fibre, rim, kind, folder):
 @pytest.mark.parametrize(("kind", "difference"), [("tet4", 1e-10), ("tet10", 2e-8)])
 def test_a_sheet_is_the_same_where_element_and_law_are(kind, difference, program, tmp_path):
     mesh, fibre, rim = sheet(kind)
-    law = OrthotropicElastic([MATERIAL])
+    law = LinearLaw.of([MATERIAL])
     assert isinstance(law, Law)
     here = ours(mesh, fibre, rim, law)
     there = theirs(mesh, fibre, rim, "orthotropic", tmp_path)

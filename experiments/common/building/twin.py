@@ -20,6 +20,7 @@ from mvest.closure.anchors import Anchors
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.noise import observation_noise
+from mvest.estimation.prediction import ObservationModel
 from mvest.mechanics.parameters import kind_of
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import linear_solver
@@ -30,6 +31,7 @@ from mvest.observation.errors import (
 )
 from mvest.observation.vertices import require_frames
 from mvest.problem.problem import Problem
+from mvest.problem.synthetic import TwinData, simulate_observation
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 
@@ -71,6 +73,21 @@ class Twin:
     correlation: SpatialCorrelation | None
     frames: tuple[str, ...]
     errors: tuple[ObservationError, ...]
+
+    def observe(
+        self, model: ObservationModel, values: FloatArray, rng: np.random.Generator
+    ) -> TwinData:
+        """An observation made from what a model predicts at parameters ``(p,)``."""
+        return simulate_observation(
+            model,
+            self.problem.parameters,
+            values,
+            frames=self.frames,
+            variance=self.variance,
+            correlation=self.correlation,
+            errors=self.errors,
+            rng=rng,
+        )
 
 
 def build_twin(config: Values) -> Twin:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common.building.closure import mechanics_of
+from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.progress import SolveBar
@@ -24,7 +24,7 @@ from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import ImageStep
 
-__all__ = ["FIELDS", "meshes_of", "read_configured", "run_case", "settings_of"]
+__all__ = ["FIELDS", "read_configured", "run_case", "settings_of"]
 
 Values = Mapping[str, Any]
 
@@ -80,11 +80,6 @@ def read_configured(place: str | None) -> ValveCase:
     return read_case(Path(place))
 
 
-def meshes_of(values: Values) -> Path:
-    """Where meshes are kept."""
-    return Path(values["paths"]["outputs"]) / "meshes"
-
-
 def run_case(
     values: Values,
     personal: PersonalSettings,
@@ -108,7 +103,7 @@ def run_case(
     names = sorted(free, key=lambda name: name in REGISTRATION)
     with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
         fit = personalise_case(
-            case, settings, store=meshes_of(values), on_step=bar.step, on_iterate=bar.iterate
+            case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
         )
     if fit.distances:
         np.savez_compressed(fields, **fields_of(fit))

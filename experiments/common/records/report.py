@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "answer_of_main",
     "axis_label",
+    "bracketed_unit",
     "cautions",
     "heading",
     "page",
@@ -47,6 +48,11 @@ def axis_label(name: str) -> str:
     """A parameter in a figure: ``E_f (anterior)``."""
     kind, _, part = name.partition(".")
     return AXES.get(kind, kind) + (f" ({part})" if part else "")
+
+
+def bracketed_unit(parameter: str) -> str:
+    """`` [MPa]`` for a modulus, nothing for any other parameter."""
+    return " [MPa]" if parameter.startswith("E_f.") else ""
 
 
 def parameter_label(name: str) -> str:

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.common.building.closure import mesh_store
 from experiments.common.cases.findings import Findings
-from experiments.common.cases.own_case import meshes_of, read_configured, run_case, settings_of
+from experiments.common.cases.own_case import read_configured, run_case, settings_of
 from experiments.common.cases.report import case_text, write_cases
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.expectation import expect_own
@@ -46,7 +47,7 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
 
     case = _read(values)
     settings = settings_of(values, build(PersonalSettings, values["personal"]))
-    model = build_model(case, settings, meshes_of(values))
+    model = build_model(case, settings, mesh_store(values))
     surface = case.surface
     figure = _drawn(case, contact_reach(model))
     files = save_figure_with(folder / "case", figure, f"case {case.sha256[:12]}")
@@ -61,7 +62,7 @@ def check_case(values: Mapping[str, Any], folder: Path) -> str:
         f"  unknowns: {', '.join(u.name for u in settings.unknowns)}",
     ]
     if values["gate"]:
-        lines += gate_lines(gate_case(case, settings, meshes_of(values)))
+        lines += gate_lines(gate_case(case, settings, mesh_store(values)))
     strange = doubts(case)
     lines += [f"  {'MISTAKE?' if one.mistake else 'doubtful'}: {one}" for one in strange]
     drawn = f"drawn in {files[0]}"

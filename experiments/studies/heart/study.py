@@ -47,7 +47,6 @@ from mvest.estimation.wrappers import SharedStart
 from mvest.files import sha256_of, write_atomically
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.problem.estimate import estimate
-from mvest.problem.synthetic import simulate_observation
 from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.valve.geometry.surface_checks import enclosed_volume
@@ -287,16 +286,7 @@ def _twin(values: Values, name: str, changes: Values) -> TwinRow:
     ) as bar:
         twin.truth_model.on_step = bar.step
         seen = twin.source(twin.truth_values)
-    data = simulate_observation(
-        lambda m: seen,
-        twin.problem.parameters,
-        twin.truth_values,
-        frames=twin.frames,
-        variance=twin.variance,
-        correlation=twin.correlation,
-        errors=twin.errors,
-        rng=np.random.default_rng(values["seed"]),
-    )
+    data = twin.observe(lambda m: seen, twin.truth_values, np.random.default_rng(values["seed"]))
     if data.observation is None:
         return TwinRow(name, true, None, None, None, None, data.reason)
     problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))

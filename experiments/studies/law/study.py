@@ -48,7 +48,7 @@ from mvest.mechanics.solid import Law
 from mvest.mechanics.valve_system import material_law
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.synthetic import Truth, TwinData, simulate_observation
+from mvest.problem.synthetic import Truth, TwinData
 from mvest.typing import FloatArray
 
 __all__ = ["STUDY", "run_law_study"]
@@ -135,15 +135,7 @@ def _linear(values: Values, settings: LawSettings) -> dict[str, Any]:
 
 def _observed(twin: Twin, closed: Prediction, seed: int) -> TwinData:
     """An observation of the true valve."""
-    return simulate_observation(
-        lambda m: closed,
-        twin.problem.parameters,
-        twin.truth_values,
-        frames=twin.frames,
-        variance=twin.variance,
-        errors=twin.errors,
-        rng=np.random.default_rng(seed),
-    )
+    return twin.observe(lambda m: closed, twin.truth_values, np.random.default_rng(seed))
 
 
 def _stretches(model: ClosureModel, values: FloatArray) -> dict[str, Stretches]:

@@ -40,7 +40,6 @@ from experiments.studies.prediction.settings import PredictionSettings, Settings
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.synthetic import simulate_observation
 from mvest.reading.npz import read_npz
 from mvest.scenarios import scenario as conditions
 from mvest.scenarios.measures import contact_reach, meaning_of
@@ -183,16 +182,7 @@ def _predicted(
             f"{', '.join(twin.problem.parameters)}"
         )
     truth = twin.truth_values * np.exp(spread * rng.standard_normal(len(spread)))
-    data = simulate_observation(
-        twin.source,
-        twin.problem.parameters,
-        truth,
-        frames=twin.frames,
-        variance=twin.variance,
-        correlation=twin.correlation,
-        errors=twin.errors,
-        rng=rng,
-    )
+    data = twin.observe(twin.source, truth, rng)
     step()
     if data.observation is None:
         return _Patient(seed, truth, StudyResult.failed(twin.problem, data.reason, 0.0), {}, {})

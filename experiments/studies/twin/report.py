@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.common.records.estimates import Paper
 from experiments.common.records.record import Record
-from experiments.common.records.report import heading
+from experiments.common.records.report import bracketed_unit, heading
 from experiments.studies.twin.findings import Findings
 from mvest.files import write_atomically
 from mvest.reporting.markup import MISSING, latex_text, markdown_rows, number, with_std
@@ -57,8 +57,8 @@ def frame(records: Sequence[Twin]) -> pd.DataFrame:
 def _paper_row(record: Twin, paper: Paper) -> dict[str, Any]:
     row: dict[str, Any] = {"run": f"paper, {paper.table}", "source": "paper"}
     for k, name in enumerate(record.parameters):
-        row[f"truth {name}{_unit(name)}"] = record.findings.truth[k]
-        row[f"estimate {name}{_unit(name)}"] = _at(paper.estimate, k)
+        row[f"truth {name}{bracketed_unit(name)}"] = record.findings.truth[k]
+        row[f"estimate {name}{bracketed_unit(name)}"] = _at(paper.estimate, k)
         row[f"error {name} [%]"] = _at(paper.error_percent, k)
     row["moduli error mean [%]"] = _at(paper.moduli_error_percent, 0)
     row["moduli error SD [%]"] = _at(paper.moduli_error_percent, 1)
@@ -74,10 +74,10 @@ def _row(record: Twin) -> dict[str, Any]:
     assert mesh is not None
     row: dict[str, Any] = {"run": record.row, "source": "mvest"}
     for k, name in enumerate(record.parameters):
-        row[f"truth {name}{_unit(name)}"] = findings.truth[k]
-        row[f"start {name}{_unit(name)}"] = findings.initial[k]
-        row[f"estimate {name}{_unit(name)}"] = _at(first.estimate, k)
-        row[f"std {name}{_unit(name)}"] = _at(first.std, k)
+        row[f"truth {name}{bracketed_unit(name)}"] = findings.truth[k]
+        row[f"start {name}{bracketed_unit(name)}"] = findings.initial[k]
+        row[f"estimate {name}{bracketed_unit(name)}"] = _at(first.estimate, k)
+        row[f"std {name}{bracketed_unit(name)}"] = _at(first.std, k)
         error = _at(first.relative_error, k)
         row[f"error {name} [%]"] = None if error is None else 100.0 * abs(error)
         row[f"truth of {name} known to [%]"] = _at(findings.truth_band_percent, k)
@@ -115,7 +115,7 @@ def readable(records: Sequence[Twin]) -> pd.DataFrame:
     for _, row in table.iterrows():
         text: dict[str, str] = {"run": str(row["run"])}
         for name in records[0].parameters:
-            unit = _unit(name)
+            unit = bracketed_unit(name)
             text[f"{name}{unit}"] = with_std(
                 row[f"estimate {name}{unit}"], row.get(f"std {name}{unit}")
             )
@@ -196,10 +196,6 @@ def _latex(table: pd.DataFrame) -> str:
             "",
         ]
     )
-
-
-def _unit(parameter: str) -> str:
-    return " [MPa]" if parameter.startswith("E_f.") else ""
 
 
 def _at(values: Sequence[float] | None, k: int) -> float | None:

@@ -43,7 +43,6 @@ from mvest.estimation.wrappers import SharedStart
 from mvest.files import write_atomically
 from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
-from mvest.problem.synthetic import simulate_observation
 from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
@@ -110,16 +109,7 @@ def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
     with SolveBar("estimation", steps, solves, problem.parameters) as bar:
         twin.model.on_step = bar.step
         for seed in seeds:
-            data = simulate_observation(
-                lambda m: truth,
-                twin.problem.parameters,
-                twin.truth_values,
-                frames=twin.frames,
-                variance=twin.variance,
-                correlation=twin.correlation,
-                errors=twin.errors,
-                rng=np.random.default_rng(seed),
-            )
+            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
             if data.observation is None:
                 return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
             result = estimate(problem, data.observation, on_iterate=bar.iterate)
