@@ -92,11 +92,12 @@ def volume_words(table: pd.DataFrame) -> list[str]:
         out.append(f"For {lost} of {len(table)} moduli there is no estimate.")
     if denied.any():
         held = table.loc[denied & table["inside"].notna(), "inside"].astype(bool)
-        out.append(
-            f"For {int(denied.sum())} of {len(table)} the verdict is that there is no estimate; "
-            f"they are not counted. (Of the {len(held)} intervals that they ended with "
-            f"{int(held.sum())} contain the truth.)"
-        )
+        words = f"For {int(denied.sum())} of {len(table)} the verdict is that there is no "
+        words += "estimate; they are not counted."
+        if len(held):
+            words += f" (Of the {len(held)} intervals that they ended with {int(held.sum())} "
+            words += "contain the truth.)"
+        out.append(words)
     counted = table.assign(**{column: table[column].where(~denied) for column in OF_VOLUMES})
     medians = _medians(counted)
     if medians:
