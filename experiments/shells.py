@@ -112,6 +112,7 @@ class ShellProblem:
         cells: tuple[int, int],
         *,
         steps: int | None = None,
+        solver: str = "auto",
     ) -> tuple[Shell, Simulation]:
         """The equilibria under equal steps of the load."""
         shell = self.build(element_type, cells)
@@ -124,6 +125,7 @@ class ShellProblem:
             forces=lambda t: t * shell.forces,
             times=np.arange(1, (steps or self.steps) + 1) / (steps or self.steps),
             static=True,
+            solver=solver,
         )
         return shell, result
 

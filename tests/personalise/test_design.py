@@ -8,7 +8,7 @@ import pytest
 from mvest.cases.case import Role
 from mvest.closure.frames import SCALE
 from mvest.personalise import PressureErrors, design_case, expect_case
-from mvest.personalise.considered_geometry import ConsideredGeometry
+from mvest.personalise.considered_geometry import ConsideredGeometry, GeometryModes
 from mvest.personalise.design import ERRORS_MMHG, HALF, KINDS, StatedErrors, design_text
 from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
 
@@ -85,10 +85,8 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
     use(monkeypatch)
     moved = np.zeros((6, *CASE.surface.vertices.shape, 2))
     moved[1:, ..., 0] = 1.0
-    monkeypatch.setattr(
-        "mvest.personalise.considered_geometry._variations",
-        lambda *_: [("one", _Modes(2), 1.0)],
-    )
+    two = GeometryModes("one", {"fibres": np.eye(2)})
+    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_modes", lambda *_: (two,))
     monkeypatch.setattr(
         "mvest.personalise.considered_geometry.RestVariation.joined", lambda modes: modes[0]
     )
@@ -96,6 +94,9 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
     class Rest:
         def __init__(self, model):
             pass
+
+        def variation(self, parts):
+            return parts
 
         def change(self, m, variation, states, tolerance):
             assert len(states) == 4
@@ -113,14 +114,6 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
     # What moves all frames alike is known from all of them.
     assert doubted.at(5).names[-1] == doubted.at(1).names[-1] == "geometry.0"
     assert doubted.at(5).std[-1] < doubted.at(1).std[-1]
-
-
-class _Modes:
-    def __init__(self, count):
-        self.count = count
-
-    def __len__(self):
-        return self.count
 
 
 def test_the_text_says_what_it_takes(designs):
