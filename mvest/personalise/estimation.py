@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosedState, ClosureModel
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
@@ -187,25 +187,33 @@ class CaseEstimation:
         began, m = time.perf_counter(), filtered.mean
         residual = observation.y - filtered.prediction.y
         modes = self.errors.expected_modes(residual, filtered.learned)
-        displaced = RestGeometry(self._stated.model).displaced(known.displacement(modes))
         before, errors = self._closure, self.errors
-        self._use(_CaseClosure.of(self.case, self.settings, self.names, displaced, m))
-        self.errors = errors.about(self.registered, modes)
-        prediction = self.shared(m)
-        if prediction.converged:
-            self.errors.consider(m, prediction.y)
-        if not prediction.converged or self.errors.unconsidered:
-            why = self.errors.unconsidered or (prediction.reason,)
+        why = self._linearised_at(known.displacement(modes), modes, m)
+        if why:
             self._use(before)
             self.errors = errors
-            errors.unconsidered = tuple(
-                f"about the geometry that is expected: {one}" for one in why
-            )
+            errors.unconsidered = tuple(f"about the geometry that is expected: {w}" for w in why)
             return None
         after = self.estimate(
             self._filter(self.settings.tolerance, tuple(m.tolist())), self.errors.observation()
         )
         return replace(after, seconds=result.seconds + time.perf_counter() - began)
+
+    def _linearised_at(
+        self, parts: Mapping[str, FloatArray], modes: tuple[FloatArray, ...], m: FloatArray
+    ) -> tuple[str, ...]:
+        """Take closure and errors from a valve with another geometry; why that cannot be done."""
+        try:
+            displaced = RestGeometry(self._stated.model).displaced(parts)
+            self._use(_CaseClosure.of(self.case, self.settings, self.names, displaced, m))
+            self.errors = self.errors.about(self.registered, modes)
+            prediction = self.shared(m)
+            if not prediction.converged:
+                return (prediction.reason,)
+            self.errors.consider(m, prediction.y)
+        except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
+            return (str(error),)
+        return self.errors.unconsidered
 
     def take_as_stated(self) -> None:
         """From now on with geometry and law as they are stated, known exactly."""

@@ -163,7 +163,6 @@ def test_a_valve_with_another_geometry_closes_as_its_derivative_says(closed, par
         assert simulation.converged
         ends.append(closed.observed(simulation.frames[-1]))
     difference = (ends[0] - ends[1]) / 4e-3
-    print(part, np.linalg.norm(difference - exact) / np.linalg.norm(exact))
     assert np.linalg.norm(difference - exact) < 0.01 * np.linalg.norm(exact)
 
 

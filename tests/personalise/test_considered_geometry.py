@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from mvest.cases.case import Role
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
 from mvest.closure.rest_geometry import RestGeometry
-from mvest.errors import InputError
+from mvest.errors import GeometryError, InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.noise_family import ErrorColumns
@@ -313,11 +313,14 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
     assert BentGeometry.bends[-1] == pytest.approx(mode[2], abs=1e-6)
 
 
-def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(monkeypatch):
+@pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0"])
+def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(monkeypatch, why):
     use(monkeypatch)
 
     class Torn(BentGeometry):
         def displaced(self, parts):
+            if why != "no equilibrium":
+                raise GeometryError(why)
             return replace(super().displaced(parts), fails_above=0.0)
 
     def columns(modes, registered, observation, noise, m, predicted):
@@ -332,7 +335,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     )
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
     assert torn.moved is None
-    assert torn.unconsidered == ("about the geometry that is expected: no equilibrium",)
+    assert torn.unconsidered == (f"about the geometry that is expected: {why}",)
     assert any("about the geometry" in doubt for doubt in indications_of(torn).doubts)
 
 
