@@ -93,9 +93,9 @@ class ConsideredGeometry:
     share : float
         Of the variance of smooth modes that is represented; finer ones are left out.
     renewals : int
-        How often all is estimated anew about the geometry that the last estimate expects: with it,
-        what is not known of the geometry is of first order about there, and not about what was
-        seen. Each costs about as much as the estimate.
+        How often, at most, all is estimated anew about the geometry that the last estimate expects:
+        with it, what is not known of the geometry is of first order about there, and not about what
+        was seen. Each costs somewhat more than the estimate.
     """
 
     shape_mm: float = 0.3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +19,13 @@ from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.wrappers import SharedStart, of_some
 from mvest.personalise.fitted_frames import FittedFrames
 from mvest.personalise.geometry_errors import WeighedObservation
+from mvest.personalise.joint import JointPosterior
 from mvest.personalise.model import build_model, frames_model, with_pressures
 from mvest.personalise.observation_errors import ObservationErrors
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
@@ -39,6 +41,16 @@ ROUGH = 0.05
 
 LEARNED = 4
 """Iterates at which errors are learned beside what is considered, from an estimate without it."""
+
+TRIALS = 4
+"""Of how far a step towards the geometry that is expected is gone."""
+
+AS_PROMISED = 0.75
+"""Part of the gain that a first order promises with which a step is good enough."""
+
+SETTLED = 0.25
+"""Standard deviations of a modulus; a step towards that geometry that moves none by as much is the
+last."""
 
 OnStep = Callable[[float, int], None]
 
@@ -64,6 +76,16 @@ class _CaseClosure:
         frames = frames_model(case, settings, model)
         registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Moduli and geometry at which a valve was closed, and about which errors are linearised."""
+
+    closure: _CaseClosure
+    errors: ObservationErrors
+    m: FloatArray
+    prediction: Prediction
 
 
 class CaseEstimation:
@@ -110,7 +132,7 @@ class CaseEstimation:
         self.transform = Log(tuple(u.is_positive for u in self.unknowns))
         start = self.transform.inverse(self.transform.forward(self.prior.mean))
         self._stated = _CaseClosure.of(case, settings, self.names, model, start)
-        self._use(self._stated)
+        self._closure = self._stated
         self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.estimated = np.array([name not in self._held for name in self.names])
         several = None if self.frames is None else self.frames.frames
@@ -162,66 +184,132 @@ class CaseEstimation:
             self._filter(self.settings.tolerance, tuple(at.tolist())), self.errors.observation()
         )
         result = replace(result, seconds=rough.seconds + result.seconds)
-        considered = self.settings.considered_geometry
+        considered, known = self.settings.considered_geometry, self.errors.known
         # Samples of the frames' errors say what is likely of the geometry; nothing is expected.
-        renewals = (
-            0 if considered is None or self.errors.samples is not None else considered.renewals
+        sampled = self.errors.samples is not None
+        if considered is None or known is None or not known.modes or sampled:
+            return result
+        return self._about_expected_geometry(
+            result, _Place(self._closure, self.errors, at, prediction), considered.renewals
         )
-        for _ in range(renewals):
-            renewed = self._about_expected_geometry(result)
-            if renewed is None:
-                break
-            self.moved = _standard_deviations(result, renewed)
-            result = renewed
-        return result
 
-    def _about_expected_geometry(self, result: StudyResult) -> StudyResult | None:
-        """The estimate linearised at the geometry that the last one expects; None without one.
+    def _about_expected_geometry(
+        self, result: StudyResult, place: _Place, renewals: int
+    ) -> StudyResult:
+        """The estimate with closure and errors linearised where its own geometry is expected.
 
-        One further step of Gauss and Newton for moduli and geometry together: the closure is that
-        of a displaced valve, and the prior of the geometry's errors stays about what was seen.
+        Steps of Gauss and Newton for moduli and geometry together: the closure is that of a
+        displaced valve, and the prior of the geometry's errors stays about what was seen.
+
+        Parameters
+        ----------
+        result : StudyResult
+            Linearised at ``place``.
+        place : _Place
+        renewals : int
+            Largest number of steps.
         """
-        filtered, observation, known = result.filtered, result.observation, self.errors.known
-        if known is None or observation is None or filtered is None or filtered.prediction is None:
-            return None
-        began, m = time.perf_counter(), filtered.mean
-        residual = observation.y - filtered.prediction.y
-        modes = self.errors.expected_modes(residual, filtered.learned)
-        before, errors = self._closure, self.errors
-        why = self._linearised_at(known.displacement(modes), modes, m)
-        if why:
-            self._use(before)
-            self.errors = errors
-            errors.unconsidered = tuple(f"about the geometry that is expected: {w}" for w in why)
-            return None
-        after = self.estimate(
-            self._filter(self.settings.tolerance, tuple(m.tolist())), self.errors.observation()
-        )
-        return replace(after, seconds=result.seconds + time.perf_counter() - began)
+        began, first = time.perf_counter(), result.seconds
+        for _ in range(renewals):
+            found = self._nearer(result, place)
+            if not isinstance(found, str):
+                self._use(found)
+                self.errors.consider(found.m, found.prediction.y)
+                found = "; ".join(self.errors.unconsidered) or found
+            if isinstance(found, str):
+                self._use(place)
+                self.errors.unconsidered = (f"about the geometry that is expected: {found}",)
+                break
+            place, before = found, result
+            result = self.estimate(
+                self._filter(self.settings.tolerance, tuple(place.m.tolist())),
+                self.errors.observation(),
+            )
+            self.moved = _standard_deviations(before, result)
+            if self.moved is None or self.moved < SETTLED:
+                break
+        return replace(result, seconds=first + time.perf_counter() - began)
 
-    def _linearised_at(
-        self, parts: Mapping[str, FloatArray], modes: tuple[FloatArray, ...], m: FloatArray
-    ) -> tuple[str, ...]:
-        """Take closure and errors from a valve with another geometry; why that cannot be done."""
+    def _nearer(self, result: StudyResult, place: _Place) -> _Place | str:
+        """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
+
+        On the way from ``place`` to them: all of it where the first order on which they rest
+        reaches as far, otherwise as far as a parabola through what is found has it, so that steps
+        across a curved valley do not go to and fro.
+        """
+        filtered, observation, known = result.filtered, result.observation, place.errors.known
+        if filtered is None or filtered.prediction is None or observation is None or known is None:
+            return result.reason
+        posterior = JointPosterior(
+            to_filter(self.transform, self.prior),
+            self.transform,
+            self.fitted.observation(),
+            place.errors,
+            filtered.learned,
+        )
+
+        def improbability(there: _Place) -> float:
+            modes = there.errors.displaced_by
+            return posterior.improbability_of(there.m, there.prediction, modes)
+
+        residual = observation.y - filtered.prediction.y
+        modes = place.errors.expected_modes(residual, filtered.learned)
+        begin, end = self.transform.forward(place.m), filtered.transformed.mean
+        was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
+        here = improbability(place)
+        promised = here - posterior.improbability(end, residual - known.offset(modes), modes)
+        best, lowest, share = None, here, 1.0
+        why = "no step to it makes what was seen more probable"
+        for _ in range(TRIALS):
+            there = self._displaced(
+                tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
+                self.transform.inverse(begin + share * (end - begin)),
+                posterior,
+            )
+            if isinstance(there, str):
+                why, share = there, 0.5 * share
+                continue
+            value = improbability(there)
+            if value < lowest:
+                best, lowest = there, value
+            if here - value > AS_PROMISED * share * (2.0 - share) * promised:
+                break
+            curvature = (value - here + 2.0 * share * promised) / share**2
+            share = float(np.clip(promised / curvature, 0.2 * share, 0.8 * share))
+        return why if best is None else best
+
+    def _displaced(
+        self, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
+    ) -> _Place | str:
+        """The valve with a geometry displaced by modes, or why it does not close.
+
+        It is closed at ``m (p,)``, and from there with what fits best to this geometry.
+        """
+        assert posterior.errors.known is not None
         try:
+            parts = posterior.errors.known.displacement(modes)
             displaced = RestGeometry(self._stated.model).displaced(parts)
-            self._use(_CaseClosure.of(self.case, self.settings, self.names, displaced, m))
-            self.errors = self.errors.about(self.registered, modes)
-            prediction = self.shared(m)
-            if not prediction.converged:
-                return (prediction.reason,)
-            self.errors.consider(m, prediction.y)
         except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
-            return (str(error),)
-        return self.errors.unconsidered
+            return str(error)
+        closure = _CaseClosure.of(self.case, self.settings, self.names, displaced, m)
+        first = closure.shared(m)
+        if not first.converged:
+            return first.reason
+        errors = self.errors.about(closure.registered, modes)
+        better = posterior.refitted(m, first)
+        again = predict(closure.shared, better)
+        found = [_Place(closure, errors, m, first)]
+        if again.converged:
+            found.append(_Place(closure, errors, better, again))
+        return min(found, key=lambda one: posterior.improbability_of(one.m, one.prediction, modes))
 
     def take_as_stated(self) -> None:
         """From now on with geometry and law as they are stated, known exactly."""
-        self._use(self._stated)
-        self.errors = self.errors.about(self.registered, ())
+        self._closure = self._stated
+        self.errors = self.errors.about(self.registered)
 
-    def _use(self, closure: _CaseClosure) -> None:
-        self._closure = closure
+    def _use(self, place: _Place) -> None:
+        self._closure, self.errors = place.closure, place.errors
 
     @property
     def model(self) -> ClosureModel:

@@ -219,7 +219,7 @@ class ObservationErrors:
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
     def about(
-        self, registered: RegisteredModel, displaced_by: tuple[FloatArray, ...]
+        self, registered: RegisteredModel, displaced_by: tuple[FloatArray, ...] = ()
     ) -> ObservationErrors:
         """The same errors, of which nothing is found out, about a valve with another geometry.
 
@@ -255,6 +255,12 @@ class ObservationErrors:
         """
         assert self.known is not None
         return self.known.expected(self.noise(learned), residual, self._learned_sizes(learned))
+
+    def sizes(self, learned: LearnedNoise | None) -> tuple[float, ...]:
+        """Factor on each kind of the geometry's modes, where it is learned."""
+        assert self.known is not None
+        found = self._learned_sizes(learned)
+        return tuple(found.get(own.name, 1.0) for own in self.known.modes)
 
     def observation(self) -> Observed:
         """The closed frame, with its uncertainty and what errors of the geometry add to it."""

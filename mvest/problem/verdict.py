@@ -171,9 +171,9 @@ APPROXIMATION = 2.0
 """Times the limit of a check of the filter (`mvest.estimation.check`) beyond which it is doubtful.
 The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
 failed by less."""
-MOVED = 1.0
+MOVED = 0.5
 """Standard deviations by which the last renewed linearisation of the geometry may move a modulus:
-by as much again the estimate may still be off."""
+twice what is taken for the end of such steps; by as much again the estimate may still be off."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
@@ -263,9 +263,9 @@ def _linear(e: Indications) -> Seen:
         yield Ground(
             "geometry",
             DOUBTFUL,
-            f"a modulus moved by {e.moved:.1f} of its standard deviations when the geometry was "
+            f"a modulus moved by {e.moved:.2f} of its standard deviations when the geometry was "
             f"linearised anew at what is expected of it, expected at most {MOVED:g}",
-            "linearise it once more (personal.considered_geometry.renewals), or see the open "
+            "allow more such steps (personal.considered_geometry.renewals), or see the open "
             "shape, annulus and tips better",
         )
 

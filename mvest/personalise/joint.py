@@ -1,0 +1,95 @@
+"""The posterior of a case's parameters and of the errors of its geometry together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mvest.estimation.evidence import LearnedNoise
+from mvest.estimation.gaussian import Gaussian
+from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.prediction import Prediction, predict
+from mvest.estimation.transform import Transform
+from mvest.personalise.observation_errors import ObservationErrors
+from mvest.problem.problem import Observed
+from mvest.typing import FloatArray
+
+__all__ = ["JointPosterior"]
+
+
+@dataclass(frozen=True)
+class JointPosterior:
+    """Of parameters m and modes of the geometry's errors, with all other errors as learned.
+
+    Attributes
+    ----------
+    prior : Gaussian
+        Of the parameters in filter coordinates.
+    transform : Transform
+    observation : Observed
+        As it was seen.
+    errors : ObservationErrors
+        With what the geometry does.
+    learned : LearnedNoise or None
+        By which they are known; None: as they are stated.
+    """
+
+    prior: Gaussian
+    transform: Transform
+    observation: Observed
+    errors: ObservationErrors
+    learned: LearnedNoise | None
+
+    @cached_property
+    def noise(self) -> ObservationNoise:
+        """Of the observation of a valve with a known geometry."""
+        assert self.errors.known is not None
+        kinds = [own.name for own in self.errors.known.modes]
+        return self.errors.noise(self.learned, without=kinds)
+
+    def improbability(
+        self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]
+    ) -> float:
+        """Twice the negative logarithm of the density, up to a constant.
+
+        Parameters
+        ----------
+        z : (p,)
+            Parameters in filter coordinates.
+        residual : (k,)
+            Of the observation.
+        modes : tuple of (q,)
+            Of each kind; empty: the geometry is as it was seen.
+        """
+        moved, white = z - self.prior.mean, self.noise.whiten(residual)
+        own = moved @ np.linalg.solve(self.prior.covariance, moved)
+        sizes = self.errors.sizes(self.learned) if modes else ()
+        beside = sum(np.sum((q / s) ** 2) for q, s in zip(modes, sizes, strict=True))
+        return float(own + white @ white + beside)
+
+    def improbability_of(
+        self, m: FloatArray, prediction: Prediction, modes: tuple[FloatArray, ...]
+    ) -> float:
+        """The same of a valve that was closed with parameters ``m (p,)`` and such a geometry."""
+        seen = predict(self.observation.of(lambda _: prediction), m)
+        return self.improbability(self.transform.forward(m), self.observation.y - seen.y, modes)
+
+    def refitted(self, m: FloatArray, prediction: Prediction) -> FloatArray:
+        """Parameters ``(p,)`` with which a valve of this geometry fits best, to first order.
+
+        Parameters
+        ----------
+        m : (p,)
+            With which it was closed.
+        prediction : Prediction
+            What was predicted there, with derivatives.
+        """
+        z = self.transform.forward(m)
+        seen = predict(self.observation.of(lambda _: prediction), m, derivatives=True)
+        H = self.noise.whiten(seen.jacobian * self.transform.derivative(z))
+        precision = np.linalg.inv(self.prior.covariance)
+        slope = H.T @ self.noise.whiten(self.observation.y - seen.y)
+        slope -= precision @ (z - self.prior.mean)
+        return self.transform.inverse(z + np.linalg.solve(H.T @ H + precision, slope))
