@@ -25,7 +25,7 @@ from experiments.runner.jobs.folder import FailedRunError, nothing_empty
 from experiments.runner.jobs.interruption import interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
-from experiments.runner.tracking.upload import track_job
+from experiments.runner.tracking.beside import Uploader
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -98,12 +98,13 @@ def run_alone(config: DictConfig) -> None:
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
             return
-        try:
-            run_job(request)
-        except FailedRunError:
-            track_job(request.folder, request.values)
-            raise
-        track_job(request.folder, request.values)
+        with Uploader(request.values) as uploader:
+            try:
+                run_job(request)
+            except FailedRunError:
+                uploader.track(request.folder)
+                raise
+            uploader.track(request.folder)
 
 
 def explain(error: BaseException) -> str:

@@ -22,7 +22,15 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
     from mlflow.tracking import MlflowClient
 
-__all__ = ["Store", "TrackingError", "first_line", "open_store", "require_no_password", "telling"]
+__all__ = [
+    "Store",
+    "TrackingError",
+    "first_line",
+    "load_client",
+    "open_store",
+    "require_no_password",
+    "telling",
+]
 
 MANNERS = {
     # A server that is away is given up after seconds, not MLflow's minutes: nothing is lost.
@@ -116,6 +124,16 @@ def require_no_password(uri: str | None) -> None:
         )
 
 
+def load_client() -> None:
+    """Import MLflow, which takes seconds, with our manners."""
+    for name, value in MANNERS.items():
+        os.environ.setdefault(name, value)
+    import mlflow.store.tracking.sqlalchemy_store
+    import mlflow.tracking  # noqa: F401
+
+    _quieten()
+
+
 def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
     """Open the tracking store and the experiment, both created if need be.
 
@@ -131,11 +149,9 @@ def open_store(uri: str | None, outputs: Path, experiment: str) -> Store:
         If the address holds a password, which would be written down with every result.
     """
     require_no_password(uri)
-    for name, value in MANNERS.items():
-        os.environ.setdefault(name, value)
+    load_client()
     from mlflow.tracking import MlflowClient
 
-    _quieten()
     outputs = outputs.resolve()
     place = uri or f"sqlite:///{outputs / 'mlflow.db'}"
     artifacts = (outputs / "mlartifacts").as_uri() if _is_database(place) else None

@@ -29,6 +29,7 @@ __all__ = [
     "RECEIPT",
     "REMEDY",
     "is_complete",
+    "is_due",
     "is_tracked",
     "track_job",
     "upload",
@@ -57,14 +58,25 @@ def track_job(folder: Path, config: Mapping[str, Any]) -> None:
 
     A store that fails costs a line of warning: the result is on disk, to be logged later.
     """
-    if not config["tracking"]["enabled"] or not (folder / "result.json").is_file():
-        return
     try:
-        if is_complete(folder) and not is_tracked(folder):
+        if is_due(folder, config):
             outputs = Path(config["paths"]["outputs"])
             upload(open_store(config["tracking"]["uri"], outputs, str(config["name"])), folder)
     except MvestError as error:
         print(f"warning: {error}; {REMEDY}", file=sys.stderr)
+
+
+def is_due(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Whether a run is to be logged, has a result, and has not been logged yet.
+
+    Raises
+    ------
+    InputError
+        If a file of the run cannot be read.
+    """
+    if not config["tracking"]["enabled"] or not (folder / "result.json").is_file():
+        return False
+    return is_complete(folder) and not is_tracked(folder)
 
 
 def is_complete(job: Path) -> bool:

@@ -288,6 +288,17 @@ def test_a_locked_database_costs_one_line_and_sync_makes_up_for_it(
     assert "debug: 0 uploaded, 2 already there" in capsys.readouterr().out
 
 
+def test_a_store_that_takes_no_tags_costs_one_line(tmp_path, capsys, monkeypatch) -> None:
+    def fails(*_, **__):
+        raise UnicodeEncodeError("utf-8", "a\ud800", 1, 2, "surrogates not allowed")
+
+    monkeypatch.setattr("mlflow.tracking.MlflowClient.create_run", fails)
+    job = make_job(tmp_path, "a")
+    uploading.track_job(job, make_config(tmp_path))
+    assert capsys.readouterr().err.startswith("warning: tracking store")
+    assert not (job / RECEIPT).exists()
+
+
 def test_a_lost_database_is_rebuilt(tmp_path, capsys, empty_database) -> None:
     jobs = [make_job(tmp_path, name) for name in "abc"]
     store = open_store(None, tmp_path, "debug")
