@@ -306,6 +306,31 @@ def test_a_continuation_that_fails_is_repeated_from_the_open_valve(monkeypatch):
     assert failed.reason is StepReason.NO_CONVERGENCE
 
 
+def test_a_guided_valve_that_is_not_soon_continued_is_closed_by_its_guide(monkeypatch):
+    alone = replace(model_of(GENTLE, cells=(12, 2), samples=(32, 8)), continuation=True)
+    guided = replace(alone, guide=model_of(GENTLE, **SMALL))
+    most, true_simulate = alone.settings.newton.max_iterations, mvest.closure.model.simulate
+    for model, patience in ((alone, most), (guided, mvest.closure.model.CONTINUED)):
+        model.close(AT)
+        allowed, starts = [], []
+
+        def simulate(*arguments, allowed=allowed, starts=starts, **options):
+            allowed.append(options["newton"].max_iterations)
+            starts.append(options["initial_positions"])
+            result = true_simulate(*arguments, **options)
+            if len(starts) < 3:
+                result = replace(result, reason=StepReason.NO_CONVERGENCE)
+            return result
+
+        monkeypatch.setattr(mvest.closure.model, "simulate", simulate)
+        assert model.close(1.1 * AT, sensitivities=False).simulation.converged
+        monkeypatch.undo()
+        # Where it was expected, where it was, and then anew, as long as that takes.
+        assert allowed[:2] == [patience] * 2
+        assert allowed[2:] == [most] * len(allowed[2:])
+        assert len(allowed) > 2
+
+
 def test_a_restarted_model_forgets_to_the_last_bit(closed):
     # Contact met on another way is in the pattern and in the order of elimination, which may round
     # differently; after a restart both begin anew.
