@@ -141,15 +141,20 @@ class CaseEstimation:
         self.filter = self._filter(settings.tolerance)
         self.moved: float | None = None
 
-    def _filter(self, tolerance: float, start: tuple[float, ...] | None = None) -> Filter:
-        """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates."""
+    def _filter(
+        self, tolerance: float, start: tuple[float, ...] | None = None, *, final: bool = True
+    ) -> Filter:
+        """The filter of all unknowns, to a relative tolerance; where it starts, if it iterates.
+
+        ``final``: something is read from its covariance, which is to be that of the posterior.
+        """
         inner = IteratedFilter(tolerance, max_iterations=self.settings.max_iterations)
         if self._held:
             return SchmidtFilter(inner, self._held)
         if start is None:
             return inner
         # Of error samples the covariance is found otherwise.
-        second_order = self.errors.samples is None
+        second_order = final and self.errors.samples is None
         return replace(inner, start=start, max_learned=LEARNED, second_order=second_order)
 
     def knowledge(self) -> dict[str, float]:
@@ -169,6 +174,7 @@ class CaseEstimation:
         """
         if not self.errors.considers:
             return self.estimate(self.filter, self.errors.observation())
+        began = time.perf_counter()
         rough = self.estimate(
             self._filter(max(ROUGH, self.settings.tolerance)), self.errors.rough_observation()
         )
@@ -178,40 +184,31 @@ class CaseEstimation:
             self.errors.unconsidered = (prediction.reason,)
             return rough
         self.errors.consider(at, prediction.y)
+        place = _Place(self._closure, self.errors, at, prediction)
         if self.errors.samples is not None:
+            # They say what is likely of the geometry; nothing is expected of it.
             self.errors.sample_geometry(at, prediction.y)
-        result = self.estimate(
-            self._filter(self.settings.tolerance, tuple(at.tolist())), self.errors.observation()
-        )
-        result = replace(result, seconds=rough.seconds + result.seconds)
-        considered, known = self.settings.considered_geometry, self.errors.known
-        # Samples of the frames' errors say what is likely of the geometry; nothing is expected.
-        sampled = self.errors.samples is not None
-        if considered is None or known is None or not known.modes or sampled:
-            return result
-        return self._about_expected_geometry(
-            result, _Place(self._closure, self.errors, at, prediction), considered.renewals
-        )
+        elif self.errors.known is not None and self.errors.known.modes:
+            place = self._expected(place)
+        return replace(self._estimate_about(place), seconds=time.perf_counter() - began)
 
-    def _about_expected_geometry(
-        self, result: StudyResult, place: _Place, renewals: int
-    ) -> StudyResult:
-        """The estimate with closure and errors linearised where its own geometry is expected.
+    def _estimate_about(self, place: _Place, *, final: bool = True) -> StudyResult:
+        """All unknowns from ``place`` on, where closure and errors are linearised."""
+        tolerance = self.settings.tolerance if final else max(ROUGH, self.settings.tolerance)
+        filter_ = self._filter(tolerance, tuple(place.m.tolist()), final=final)
+        return self.estimate(filter_, self.errors.observation())
 
-        Steps of Gauss and Newton for moduli and geometry together: the closure is that of a
+    def _expected(self, place: _Place) -> _Place:
+        """Where estimate and geometry are expected: from now on all is linearised there.
+
+        Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
         displaced valve, and the prior of the geometry's errors stays about what was seen.
-
-        Parameters
-        ----------
-        result : StudyResult
-            Linearised at ``place``.
-        place : _Place
-        renewals : int
-            Largest number of steps.
         """
-        began, first = time.perf_counter(), result.seconds
-        for _ in range(renewals):
-            found = self._nearer(result, place)
+        assert self.settings.considered_geometry is not None
+        result = None
+        for _ in range(self.settings.considered_geometry.renewals):
+            before = result or self._estimate_about(place, final=False)
+            found = self._nearer(before, place)
             if not isinstance(found, str):
                 self._use(found)
                 self.errors.consider(found.m, found.prediction.y)
@@ -220,15 +217,12 @@ class CaseEstimation:
                 self._use(place)
                 self.errors.unconsidered = (f"about the geometry that is expected: {found}",)
                 break
-            place, before = found, result
-            result = self.estimate(
-                self._filter(self.settings.tolerance, tuple(place.m.tolist())),
-                self.errors.observation(),
-            )
+            place = found
+            result = self._estimate_about(place, final=False)
             self.moved = _standard_deviations(before, result)
             if self.moved is None or self.moved < SETTLED:
                 break
-        return replace(result, seconds=first + time.perf_counter() - began)
+        return place
 
     def _nearer(self, result: StudyResult, place: _Place) -> _Place | str:
         """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
