@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Frame, Role
 from mvest.observation.surfaces import surface_distance
 from mvest.personalise.estimation import CaseEstimation
-from mvest.personalise.model import frames_model, held_state
+from mvest.personalise.model import held_state
 from mvest.personalise.result import FrameDistance
 from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import RegisteredModel
@@ -116,7 +116,7 @@ def largest_difference_anew(estimation: CaseEstimation, result: StudyResult) -> 
     assert result.estimate is not None
     assert result.fitted is not None
     anew = replace(estimation.model, continuation=False, guide=None, repeat=True)
-    frames = frames_model(estimation.case, estimation.settings, anew)
+    frames = estimation.frames and replace(estimation.frames, model=anew)
     prediction = RegisteredModel(frames or anew, estimation.names)(result.estimate)
     if not prediction.converged:
         return None

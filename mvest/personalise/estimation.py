@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -67,15 +67,31 @@ class _CaseClosure:
     @classmethod
     def of(
         cls,
-        case: ValveCase,
-        settings: PersonaliseSettings,
-        names: tuple[str, ...],
         model: ClosureModel,
+        frames: FramesModel | None,
+        names: tuple[str, ...],
         start: FloatArray,
     ) -> _CaseClosure:
-        frames = frames_model(case, settings, model)
         registered = RegisteredModel(frames or model, names)
         return cls(model, frames, registered, SharedStart(registered, start))
+
+    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> _CaseClosure:
+        """Of the valve with another geometry, see `RestGeometry.displaced`.
+
+        All closed frames have the same errors of annulus and tips, as their derivatives say.
+        """
+        model, frames = RestGeometry(self.model).displaced(parts), self.frames
+        if frames is not None:
+            states = {
+                name: replace(
+                    state,
+                    annulus=state.annulus + parts.get("annulus", 0.0),
+                    papillary_tips=state.papillary_tips + parts.get("tips", 0.0),
+                )
+                for name, state in frames.states.items()
+            }
+            frames = replace(frames, model=model, states=states)
+        return self.of(model, frames, self.registered.names, start)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,12 +147,13 @@ class CaseEstimation:
         )
         self.transform = Log(tuple(u.is_positive for u in self.unknowns))
         start = self.transform.inverse(self.transform.forward(self.prior.mean))
-        self._stated = _CaseClosure.of(case, settings, self.names, model, start)
+        several = frames_model(case, settings, model)
+        self._stated = _CaseClosure.of(model, several, self.names, start)
         self._closure = self._stated
         self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.estimated = np.array([name not in self._held for name in self.names])
-        several = None if self.frames is None else self.frames.frames
-        self.fitted = FittedFrames(case, settings, self.model.valve, several)
+        names = None if several is None else several.frames
+        self.fitted = FittedFrames(case, settings, model.valve, names)
         self.errors = ObservationErrors(self.fitted, self.registered)
         self.filter = self._filter(settings.tolerance)
         self.moved: float | None = None
@@ -209,37 +226,50 @@ class CaseEstimation:
         for _ in range(self.settings.considered_geometry.renewals):
             before = result or self._estimate_about(place, final=False)
             found = self._nearer(before, place)
-            if not isinstance(found, str):
-                self._use(found)
-                self.errors.consider(found.m, found.prediction.y)
-                found = "; ".join(self.errors.unconsidered) or found
-            if isinstance(found, str):
-                self._use(place)
-                self.errors.unconsidered = (f"about the geometry that is expected: {found}",)
+            if found is place:
+                self.moved = _standard_deviations(self.transform.forward(place.m), before)
                 break
-            place = found
-            result = self._estimate_about(place, final=False)
-            self.moved = _standard_deviations(before, result)
-            if self.moved is None or self.moved < SETTLED:
+            renewed = found if isinstance(found, str) else self._renewed(found)
+            if isinstance(found, str) or isinstance(renewed, str):
+                self._use(place)
+                self.errors.unconsidered += (f"about the geometry that is expected: {renewed}",)
+                break
+            assert before.filtered is not None
+            self.moved = _standard_deviations(before.filtered.transformed.mean, renewed)
+            place, result = found, renewed
+            if self.moved < SETTLED:
                 break
         return place
+
+    def _renewed(self, place: _Place) -> StudyResult | str:
+        """A rough estimate about a place, with its closure and errors, or why there is none."""
+        self._use(place)
+        self.errors.consider(place.m, place.prediction.y)
+        if self.errors.unconsidered:
+            return "; ".join(self.errors.unconsidered)
+        result = self._estimate_about(place, final=False)
+        return f"{result.reason} ({result.detail})" if result.estimate is None else result
 
     def _nearer(self, result: StudyResult, place: _Place) -> _Place | str:
         """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
 
         On the way from ``place`` to them: all of it where the first order on which they rest
         reaches as far, otherwise as far as a parabola through what is found has it, so that steps
-        across a curved valley do not go to and fro.
+        across a curved valley do not go to and fro. ``place`` itself, if it is as good as they are.
         """
         filtered, observation, known = result.filtered, result.observation, place.errors.known
         if filtered is None or filtered.prediction is None or observation is None or known is None:
             return result.reason
+        held = ~self.estimated
+        considered = filtered.prediction.jacobian[:, held] * self.prior.std[held]
         posterior = JointPosterior(
             to_filter(self.transform, self.prior),
             self.transform,
             self.fitted.observation(),
             place.errors,
             filtered.learned,
+            self.estimated,
+            considered,
         )
 
         def improbability(there: _Place) -> float:
@@ -247,13 +277,12 @@ class CaseEstimation:
             return posterior.improbability_of(there.m, there.prediction, modes)
 
         residual = observation.y - filtered.prediction.y
-        modes = place.errors.expected_modes(residual, filtered.learned)
+        modes = place.errors.expected_modes(residual, filtered.learned, considered)
         begin, end = self.transform.forward(place.m), filtered.transformed.mean
         was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
         here = improbability(place)
         promised = here - posterior.improbability(end, residual - known.offset(modes), modes)
-        best, lowest, share = None, here, 1.0
-        why = "no step to it makes what was seen more probable"
+        best, lowest, share, why = None, here, 1.0, ""
         for _ in range(TRIALS):
             there = self._displaced(
                 tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
@@ -266,11 +295,15 @@ class CaseEstimation:
             value = improbability(there)
             if value < lowest:
                 best, lowest = there, value
-            if here - value > AS_PROMISED * share * (2.0 - share) * promised:
+            if promised <= 0.0 or here - value > AS_PROMISED * share * (2.0 - share) * promised:
                 break
+            # Positive: the gain is at most three quarters of what is promised.
             curvature = (value - here + 2.0 * share * promised) / share**2
             share = float(np.clip(promised / curvature, 0.2 * share, 0.8 * share))
-        return why if best is None else best
+        if best is None and not why and promised < SETTLED**2:
+            # To first order a gain is the square of a distance in standard deviations.
+            return place
+        return best or why or "no step to it makes what was seen more probable"
 
     def _displaced(
         self, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
@@ -281,11 +314,9 @@ class CaseEstimation:
         """
         assert posterior.errors.known is not None
         try:
-            parts = posterior.errors.known.displacement(modes)
-            displaced = RestGeometry(self._stated.model).displaced(parts)
+            closure = self._stated.displaced(posterior.errors.known.displacement(modes), m)
         except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
             return str(error)
-        closure = _CaseClosure.of(self.case, self.settings, self.names, displaced, m)
         first = closure.shared(m)
         if not first.converged:
             return first.reason
@@ -396,10 +427,17 @@ class CaseEstimation:
         return replace(posterior, covariance=covariance)
 
 
-def _standard_deviations(before: StudyResult, after: StudyResult) -> float | None:
-    """By how many standard deviations a modulus differs at most between two estimates."""
-    if before.filtered is None or after.filtered is None:
-        return None
-    one, other = before.filtered.transformed, after.filtered.transformed
+def _standard_deviations(z: FloatArray, after: StudyResult) -> float:
+    """By how many of its standard deviations an estimate's modulus differs at most from ``z``.
+
+    Parameters
+    ----------
+    z : (p,)
+        Filter coordinates.
+    after : StudyResult
+        With an estimate.
+    """
+    assert after.filtered is not None
+    found = after.filtered.transformed
     moduli = [name.startswith("E_f.") for name in after.filtered.names]
-    return float(np.max(np.abs(other.mean - one.mean)[moduli] / other.std[moduli]))
+    return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))

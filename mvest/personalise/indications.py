@@ -128,7 +128,8 @@ def _alike(observation: Observed, standardised: FloatArray) -> float | None:
         values = standardised[-points.size :].reshape(len(points), 3)
     elif isinstance(plain, SurfaceObservation):
         points = plain.seen[-1].points
-        values = standardised[: len(points), None]
+        first = sum(plain.sizes[:-1])
+        values = standardised[first : first + len(points), None]
     else:
         return None
     if len(points) <= NEIGHBOURS:

@@ -14,7 +14,7 @@ from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.transform import Transform
 from mvest.personalise.observation_errors import ObservationErrors
 from mvest.problem.problem import Observed
-from mvest.typing import FloatArray
+from mvest.typing import BoolArray, FloatArray
 
 __all__ = ["JointPosterior"]
 
@@ -34,6 +34,10 @@ class JointPosterior:
         With what the geometry does.
     learned : LearnedNoise or None
         By which they are known; None: as they are stated.
+    estimated : (p,)
+        Which parameters are; the others stay at their prior's mean, independent of these.
+    considered : (k, r)
+        What those others do to the observation, one standard deviation of each.
     """
 
     prior: Gaussian
@@ -41,13 +45,15 @@ class JointPosterior:
     observation: Observed
     errors: ObservationErrors
     learned: LearnedNoise | None
+    estimated: BoolArray
+    considered: FloatArray
 
     @cached_property
     def noise(self) -> ObservationNoise:
         """Of the observation of a valve with a known geometry."""
         assert self.errors.known is not None
         kinds = [own.name for own in self.errors.known.modes]
-        return self.errors.noise(self.learned, without=kinds)
+        return self.errors.noise(self.learned, without=kinds, beside=self.considered)
 
     def improbability(
         self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]
@@ -86,10 +92,11 @@ class JointPosterior:
         prediction : Prediction
             What was predicted there, with derivatives.
         """
-        z = self.transform.forward(m)
+        z, free = np.array(self.transform.forward(m)), self.estimated
         seen = predict(self.observation.of(lambda _: prediction), m, derivatives=True)
-        H = self.noise.whiten(seen.jacobian * self.transform.derivative(z))
-        precision = np.linalg.inv(self.prior.covariance)
+        H = self.noise.whiten((seen.jacobian * self.transform.derivative(z))[:, free])
+        precision = np.linalg.inv(self.prior.covariance[np.ix_(free, free)])
         slope = H.T @ self.noise.whiten(self.observation.y - seen.y)
-        slope -= precision @ (z - self.prior.mean)
-        return self.transform.inverse(z + np.linalg.solve(H.T @ H + precision, slope))
+        slope -= precision @ (z - self.prior.mean)[free]
+        z[free] += np.linalg.solve(H.T @ H + precision, slope)
+        return self.transform.inverse(z)

@@ -187,6 +187,7 @@ class ObservationErrors:
         *,
         considered: float = 1.0,
         without: Collection[str] = (),
+        beside: FloatArray | None = None,
         stated: bool = False,
     ) -> ObservationNoise:
         """Noise of the observation without that of error samples.
@@ -199,6 +200,8 @@ class ObservationErrors:
             Factor on what is added by all that is considered.
         without : collection of str
             Kinds of it that are left out.
+        beside : (k, q), optional
+            Further columns.
         stated : bool
             See `FittedFrames.observation`.
         """
@@ -216,6 +219,8 @@ class ObservationErrors:
             for own in self.considered
             if own.name not in without
         ]
+        if beside is not None and beside.shape[1]:
+            columns.append(beside)
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
     def about(
@@ -242,7 +247,7 @@ class ObservationErrors:
         return {own.name: size for own, size in zip(family.columns, sizes, strict=True)}
 
     def expected_modes(
-        self, residual: FloatArray, learned: LearnedNoise | None
+        self, residual: FloatArray, learned: LearnedNoise | None, beside: FloatArray
     ) -> tuple[FloatArray, ...]:
         """Most probable errors of the geometry ``(q,)``, kind after kind, at an estimate.
 
@@ -252,9 +257,12 @@ class ObservationErrors:
             Of the estimate, as `observation` has it.
         learned : LearnedNoise or None
             As it was learned with the estimate.
+        beside : (k, q)
+            Columns of parameters that are considered.
         """
         assert self.known is not None
-        return self.known.expected(self.noise(learned), residual, self._learned_sizes(learned))
+        noise = self.noise(learned, beside=beside)
+        return self.known.expected(noise, residual, self._learned_sizes(learned))
 
     def sizes(self, learned: LearnedNoise | None) -> tuple[float, ...]:
         """Factor on each kind of the geometry's modes, where it is learned."""

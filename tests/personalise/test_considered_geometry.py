@@ -10,12 +10,16 @@ from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
 from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import observation_noise
 from mvest.estimation.noise_family import ErrorColumns
+from mvest.estimation.prediction import Prediction
 from mvest.estimation.transform import Log, to_filter
+from mvest.mechanics.settings import ExponentialTissue
+from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
 from mvest.personalise import Treatment, personalise_case
 from mvest.personalise.considered_geometry import (
@@ -28,11 +32,11 @@ from mvest.personalise.considered_geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalise.estimation import SETTLED, CaseEstimation
+from mvest.personalise.estimation import SETTLED, CaseEstimation, _CaseClosure
 from mvest.personalise.indications import indications_of
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from tests.cases.test_uncertainty import corresponding
-from tests.closure.test_model import AT, CLOSING, model_of
+from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, model_of
 from tests.made_up_closure import (
     FIELDS,
     PRIORS,
@@ -265,19 +269,10 @@ class BentClosure(MadeUpClosure):
         return replace(plain, y=np.concatenate([rest, bent(closed, self.bend)]))
 
 
-@pytest.mark.parametrize("curve", [1.0, 6.0, 100.0])
-def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(monkeypatch, curve):
+def bent_case(monkeypatch, curve, std):
+    """A case whose valve is displaced by 0.6 of the one mode, and its nuisances, all known."""
     use(monkeypatch)
     monkeypatch.setattr(BentGeometry, "curve", curve)
-    std = 0.5
-    straight = made_up_case(std, displaced=False)
-    closed = straight.frame(Role.CLOSED)
-    seen = bent(closed.vertices.ravel(), 0.6)
-    frame = replace(closed, vertices=seen.reshape(-1, 3))
-    case = replace(straight, frames=tuple(frame if f is closed else f for f in straight.frames))
-    known = {name: value for name, value in TRUE.items() if not name.startswith("E_f.")}
-    known |= dict.fromkeys(REGISTRATION, 0.0)
-    free = unknowns(Treatment.FIXED, **known)
 
     def columns(modes, registered, observation, noise, m, predicted):
         bend = getattr(registered.model, "bend", 0.0)
@@ -286,6 +281,22 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
 
     monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
     monkeypatch.setattr("mvest.personalise.estimation.RestGeometry", BentGeometry)
+    straight = made_up_case(std, displaced=False)
+    closed = straight.frame(Role.CLOSED)
+    frame = replace(closed, vertices=bent(closed.vertices.ravel(), 0.6).reshape(-1, 3))
+    known = {name: value for name, value in TRUE.items() if not name.startswith("E_f.")}
+    known |= dict.fromkeys(REGISTRATION, 0.0)
+    return replace(
+        straight, frames=tuple(frame if f is closed else f for f in straight.frames)
+    ), known
+
+
+@pytest.mark.parametrize("curve", [1.0, 6.0, 100.0])
+def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(monkeypatch, curve):
+    std = 0.5
+    case, known = bent_case(monkeypatch, curve, std)
+    free = unknowns(Treatment.FIXED, **known)
+    seen = case.frame(Role.CLOSED).vertices.ravel()
 
     def objective(z):
         moduli = np.exp(z[:2])
@@ -331,6 +342,82 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
     assert errors[3] < 0.1 * fit.result.filtered.transformed.std.max()
 
 
+def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
+    case, known = bent_case(monkeypatch, curve=0.0, std=0.5)
+    monkeypatch.setattr("mvest.personalise.estimation.ROUGH", 0.0)
+    places, nearer = [], CaseEstimation._nearer
+
+    def followed(self, result, place):
+        found = nearer(self, result, place)
+        places.append((self, result, place, found))
+        return found
+
+    monkeypatch.setattr(CaseEstimation, "_nearer", followed)
+    fit = personalise_case(
+        case,
+        settings(
+            *unknowns(Treatment.FIXED, **known),
+            considered_geometry=ConsideredGeometry(renewals=6),
+            tolerance=1e-9,
+        ),
+    )
+    # Of a straight valley the first step is the last.
+    ((estimation, before, first, last),) = places
+    assert fit.moved < 1e-4
+    # As if no other place were better than the last: then it is as good as promised, the first not.
+    monkeypatch.setattr(CaseEstimation, "_displaced", lambda *_: last)
+    assert nearer(estimation, fit.result, last) is last
+    monkeypatch.setattr(CaseEstimation, "_displaced", lambda *_: first)
+    assert nearer(estimation, before, first) == "no step to it makes what was seen more probable"
+    assert fit.unconsidered == ()
+
+
+def test_a_parameter_that_is_considered_stays_what_it_is_on_the_way(monkeypatch):
+    case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
+    monkeypatch.setattr("mvest.personalise.estimation.ROUGH", 0.0)
+    pressure = replace(unknowns()[2], std=0.3)
+    found = {}
+    for treatment in (Treatment.ESTIMATED, Treatment.CONSIDERED):
+        others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != pressure.name]
+        found[treatment] = personalise_case(
+            case,
+            settings(
+                replace(pressure, treatment=treatment),
+                *others,
+                considered_geometry=ConsideredGeometry(renewals=6),
+                tolerance=1e-9,
+            ),
+        ).result.filtered
+    estimated, considered = found.values()
+    # Of one observation the estimate and its covariance are those of all parameters.
+    moduli = [estimated.names.index(name) for name in MODULI]
+    away = (considered.transformed.mean - estimated.transformed.mean) / estimated.transformed.std
+    assert np.abs(away[moduli]).max() < 0.15
+    np.testing.assert_allclose(
+        considered.transformed.std[moduli], estimated.transformed.std[moduli], rtol=0.1
+    )
+
+
+def test_all_closed_frames_are_displaced_as_their_derivatives_say():
+    model = model_of(GENTLE, **SMALL)
+    motion = model.contact_valve.motion
+    state = HeldState(0.3, motion.annulus[-1], motion.papillary_tips[-1])
+    frames = FramesModel(model, "closed", {"early": state}, 1.0)
+    closure = _CaseClosure.of(model, frames, model.names, AT)
+    rng = np.random.default_rng(2)
+    parts = {
+        "annulus": np.broadcast_to(rng.normal(0.0, 0.02, 3), motion.annulus[-1].shape),
+        "tips": rng.normal(0.0, 0.02, motion.papillary_tips[-1].shape),
+    }
+    displaced, still = closure.displaced(parts, AT).shared(AT), closure.shared(AT)
+    geometry = RestGeometry(model)
+    variation = geometry.variation({name: move[None] for name, move in parts.items()})
+    change = geometry.change(AT, variation, [state])[..., 0]
+    moved = (displaced.y - still.y).reshape(change.shape)
+    assert np.abs(change[1]).max() > 0.01
+    np.testing.assert_allclose(moved, change, atol=0.02 * np.abs(change).max())
+
+
 @pytest.mark.parametrize("why", ["no equilibrium", "thickness is -0.1 mm, expected > 0"])
 def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(monkeypatch, why):
     use(monkeypatch)
@@ -355,6 +442,49 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     assert torn.moved is None
     assert torn.unconsidered == (f"about the geometry that is expected: {why}",)
     assert any("about the geometry" in doubt for doubt in indications_of(torn).doubts)
+
+
+def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
+    monkeypatch,
+):
+    case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
+
+    class OnceClosed(BentClosure):
+        def __call__(self, m):
+            return Prediction.failed("stuck") if len(self.calls) > 1 else super().__call__(m)
+
+    def displaced(self, parts):
+        return OnceClosed(self.model.names, self.model.fixed, bend=parts["shape"][0])
+
+    monkeypatch.setattr(BentGeometry, "displaced", displaced)
+    plain, stuck = (
+        personalise_case(
+            case,
+            settings(
+                *unknowns(Treatment.FIXED, **known),
+                considered_geometry=ConsideredGeometry(renewals=renewals),
+            ),
+        )
+        for renewals in (0, 2)
+    )
+    np.testing.assert_array_equal(stuck.result.estimate, plain.result.estimate)
+    (doubt,) = stuck.unconsidered
+    assert doubt.startswith("about the geometry that is expected: ")
+    assert "stuck" in doubt
+
+
+def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
+    case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
+    monkeypatch.setattr("mvest.personalise.observation_errors.law_columns", lambda *_: "no law")
+    fit = personalise_case(
+        case,
+        settings(
+            *unknowns(Treatment.FIXED, **known),
+            considered_geometry=ConsideredGeometry(renewals=2),
+            considered_law={"anterior": ExponentialTissue(0.06, 4.325, 1446.5)},
+        ),
+    )
+    assert fit.unconsidered == ("no law", "about the geometry that is expected: no law")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from mvest.cases.case import Role, Uncertainty
 from mvest.observation.errors import SpatialCorrelation
 from mvest.personalise import personalise_case
-from mvest.personalise.indications import indications_of
+from mvest.personalise.estimation import CaseEstimation
+from mvest.personalise.indications import _alike, indications_of
 from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
 from tests.made_up_closure import PRIORS, made_up_case, settings, use
 
@@ -75,6 +76,23 @@ def test_a_fit_by_distances_is_looked_at_as_well(fit):
     seen = indications_of(fit(correspondence=False))
     assert seen.nis is not None
     assert abs(seen.alike) < 0.15
+
+
+@pytest.mark.parametrize("smooth", [0, 1])
+def test_of_several_surfaces_the_last_is_looked_at(monkeypatch, smooth):
+    use(monkeypatch)
+    case = made_up_case(0.3)
+    closed = case.frame(Role.CLOSED)
+    early = replace(closed, name="early", role=Role.FITTED, time=closed.time - 0.1)
+    frames = sorted((*case.frames, early), key=lambda frame: frame.time)
+    seen = CaseEstimation(
+        replace(case, frames=tuple(frames)), settings(correspondence=False), None, None
+    ).fitted.observation()
+    values = np.random.default_rng(7).standard_normal(len(seen.y))
+    first = smooth * seen.sizes[0]
+    points = seen.seen[smooth].points
+    values[first : first + len(points)] = np.sin(points[:, 0] / 5.0)
+    assert (_alike(seen, values) > 0.3) == (smooth == 1)
 
 
 def test_without_an_estimate_there_is_its_reason(monkeypatch):
