@@ -276,9 +276,11 @@ class CaseEstimation:
             modes = there.errors.displaced_by
             return posterior.improbability_of(there.m, there.prediction, modes)
 
-        residual = observation.y - filtered.prediction.y
+        z = filtered.transformed.mean
+        H = filtered.prediction.jacobian * self.transform.derivative(z)
+        end, residual = posterior.next(z, observation.y - filtered.prediction.y, H)
         modes = place.errors.expected_modes(residual, filtered.learned, considered)
-        begin, end = self.transform.forward(place.m), filtered.transformed.mean
+        begin = self.transform.forward(place.m)
         was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
         here = improbability(place)
         promised = here - posterior.improbability(end, residual - known.offset(modes), modes)

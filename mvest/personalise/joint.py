@@ -12,6 +12,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import ObservationNoise
 from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.transform import Transform
+from mvest.estimation.update import kalman_update
 from mvest.personalise.observation_errors import ObservationErrors
 from mvest.problem.problem import Observed
 from mvest.typing import BoolArray, FloatArray
@@ -81,6 +82,31 @@ class JointPosterior:
         """The same of a valve that was closed with parameters ``m (p,)`` and such a geometry."""
         seen = predict(self.observation.of(lambda _: prediction), m)
         return self.improbability(self.transform.forward(m), self.observation.y - seen.y, modes)
+
+    def next(
+        self, z: FloatArray, residual: FloatArray, H: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Parameters ``(p,)`` after one more step to their mode, and the residual ``(k,)`` there.
+
+        To first order, whatever the modes are: a filter that ends as soon as its next step is
+        small has not gone it.
+
+        Parameters
+        ----------
+        z : (p,)
+            An estimate in filter coordinates.
+        residual : (k,)
+            Of the observation that it was made from.
+        H : (k, p)
+            Derivatives of what is predicted there.
+        """
+        free, away = self.estimated, z - self.prior.mean
+        prior = Gaussian(self.prior.mean[free], self.prior.covariance[np.ix_(free, free)])
+        noise = self.errors.noise(self.learned, beside=self.considered)
+        innovation = residual + H[:, free] @ away[free]
+        end = np.array(z)
+        end[free] = kalman_update(prior, innovation, H[:, free], noise).posterior.mean
+        return end, residual - H @ (end - z)
 
     def refitted(self, m: FloatArray, prediction: Prediction) -> FloatArray:
         """Parameters ``(p,)`` with which a valve of this geometry fits best, to first order.

@@ -372,6 +372,22 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
     assert fit.unconsidered == ()
 
 
+def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
+    case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
+    others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != "pressure_scale"]
+    given = settings(
+        replace(unknowns()[2], std=0.3),
+        *others,
+        considered_geometry=ConsideredGeometry(renewals=6),
+        tolerance=1e-9,
+    )
+    rough = personalise_case(case, given).result.filtered.transformed
+    monkeypatch.setattr("mvest.personalise.estimation.ROUGH", 0.0)
+    exact = personalise_case(case, given).result.filtered.transformed
+    np.testing.assert_allclose(rough.mean, exact.mean, atol=0.02 * exact.std.min())
+    np.testing.assert_allclose(rough.std, exact.std, rtol=0.02)
+
+
 def test_a_parameter_that_is_considered_stays_what_it_is_on_the_way(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
     monkeypatch.setattr("mvest.personalise.estimation.ROUGH", 0.0)
