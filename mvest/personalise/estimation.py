@@ -333,7 +333,7 @@ class CaseEstimation:
     def take_as_stated(self) -> None:
         """From now on with geometry and law as they are stated, known exactly."""
         self._closure = self._stated
-        self.errors = self.errors.about(self.registered)
+        self.errors = self.errors.as_stated(self.registered)
 
     def _use(self, place: _Place) -> None:
         self._closure, self.errors = place.closure, place.errors

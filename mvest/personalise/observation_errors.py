@@ -237,6 +237,20 @@ class ObservationErrors:
         """
         return ObservationErrors(self.fitted, registered, self.geometry_modes, displaced_by)
 
+    def as_stated(self, registered: RegisteredModel) -> ObservationErrors:
+        """The same where geometry and law are known: error samples of the frames remain.
+
+        Parameters
+        ----------
+        registered : RegisteredModel
+            Of the valve as it was seen.
+        """
+        errors = self.about(registered)
+        if self.samples is not None:
+            errors.geometry = self.geometry
+            errors.samples = replace(self.samples, base=errors.noise())
+        return errors
+
     def _learned_sizes(self, learned: LearnedNoise | None) -> dict[str, float]:
         """Factor on each kind of what is considered whose size is learned."""
         family = self.single_errors

@@ -31,6 +31,7 @@ from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.valve.anatomy.valve import LeafletSurface
 from tests.made_up_closure import (
     CLOSED_ANNULUS,
+    FIELDS,
     HELD_ANNULUS,
     MECHANICS,
     PRIORS,
@@ -600,6 +601,14 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
     assert np.all((ratio > 0.5) & (ratio < 2.0))
     assert np.all(exact < 0.7 * told.narrower["now"])
     np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)
+
+
+def test_without_nuisances_moduli_alone_have_the_errors_of_the_frames_too(monkeypatch):
+    use_geometry(monkeypatch)
+    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    found = personalise_case(case, settings(*right_nuisances(), moduli_only=True))
+    np.testing.assert_allclose(found.moduli_only.estimate, found.result.estimate, rtol=1e-6)
+    np.testing.assert_allclose(found.moduli_only.std, found.result.std, rtol=1e-6)
 
 
 def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
