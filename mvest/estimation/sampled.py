@@ -7,7 +7,7 @@ shown, and is as sure as if there were no other: with twelve samples its interva
 truth in 70 % (simulated). So the noise is what the filter weighs with, and no more. The covariance
 of its estimate is taken from the samples themselves, through a gain K that has not seen them::
 
-    P⁺ = (I − K H) P (I − K H)ᵀ + c / K Σ (K₋ₖ dₖ)(K₋ₖ dₖ)ᵀ
+    P⁺ = (I − K H) P (I − K H)ᵀ + c / K Σ (K₋ₖ dₖ)(K₋ₖ dₖ)ᵀ + (K C)(K C)ᵀ
 
 the form of Joseph, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes
 with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th and what was
@@ -57,11 +57,14 @@ class SampledErrors:
         Samples with the same number are not independent of each other: of one of them a gain that
         has not seen it has seen none of these. Student's distribution has a degree of freedom for
         each source. None: all are independent.
+    beside : (n, q) or None
+        C of the base: errors that no sample has, one standard deviation of each.
     """
 
     base: ObservationNoise
     samples: FloatArray
     source: IntArray | None = None
+    beside: FloatArray | None = None
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
@@ -134,4 +137,8 @@ class SampledErrors:
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
         ) ** 2
         part = widened / self.count * moved @ moved.T
-        return SampledPosterior(rest @ P @ rest.T + part, part)
+        covariance = rest @ P @ rest.T + part
+        if self.beside is not None:
+            moved = K @ noise.whiten(self.base.whiten(self.beside))
+            covariance = covariance + moved @ moved.T
+        return SampledPosterior(covariance, part)

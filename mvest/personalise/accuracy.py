@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -78,7 +77,6 @@ def narrower(estimation: CaseEstimation, result: StudyResult) -> Mapping[str, Fl
     errors, learned = estimation.errors.samples, filtered.learned
     doubt = np.zeros_like(prior.covariance)
     if learned is not None:
-        errors = errors and replace(errors, base=estimation.errors.noise(learned))
         doubt[np.ix_(estimation.estimated, estimation.estimated)] = learned.covariance
     groups = _measurable(estimation)
 
@@ -96,7 +94,8 @@ def narrower(estimation: CaseEstimation, result: StudyResult) -> Mapping[str, Fl
     def std(P: FloatArray, scale: float = 1.0) -> FloatArray:
         if errors is None:
             return linear(P, scale)
-        return widened(errors.posterior(H * scale, P).covariance, scale)
+        own = estimation.errors.weighing(errors, learned, considered=scale)
+        return widened(own.posterior(H * scale, P).covariance, scale)
 
     stds = {"now": std(prior.covariance)}
     for words, members in groups.items():

@@ -422,7 +422,7 @@ class CaseEstimation:
         learned = filtered.learned
         if learned is None:
             return samples.posterior(H, prior.covariance, estimated)
-        errors = replace(samples, base=self.errors.noise(learned))
+        errors = self.errors.weighing(samples, learned)
         posterior = errors.posterior(H, prior.covariance, estimated)
         covariance = np.array(posterior.covariance)
         covariance[np.ix_(estimated, estimated)] += learned.covariance

@@ -137,7 +137,7 @@ class ObservationErrors:
             return  # what was found out elsewhere serves
         self.considered = tuple(own for columns in known for own in columns)
         if self.samples is not None:
-            self.samples = replace(self.samples, base=self.noise())
+            self.samples = self.weighing(self.samples)
 
     def sample_geometry(self, m: FloatArray, predicted: FloatArray) -> None:
         """Find out what errors of the case's frames do to the observation at ``m``.
@@ -154,7 +154,8 @@ class ObservationErrors:
             raise GeometryError(f"case {case.name}: what its error samples do: {sampled}")
         self.geometry, errors = sampled
         assert case.error_samples is not None
-        self.samples = SampledErrors(self.noise(), errors, case.error_samples.source)
+        plain = SampledErrors(self.noise(), errors, case.error_samples.source)
+        self.samples = self.weighing(plain)
 
     def sampled(
         self,
@@ -223,6 +224,22 @@ class ObservationErrors:
             columns.append(beside)
         return low_rank_noise(base, np.concatenate(columns, axis=1)) if columns else base
 
+    def weighing(
+        self,
+        samples: SampledErrors,
+        learned: LearnedNoise | None = None,
+        *,
+        considered: float = 1.0,
+    ) -> SampledErrors:
+        """Samples with the noise of all other errors, see `noise`."""
+        scales = self._learned_sizes(learned)
+        columns = [considered * scales.get(c.name, 1.0) * c.columns for c in self.considered]
+        return replace(
+            samples,
+            base=self.noise(learned, considered=considered),
+            beside=np.concatenate(columns, axis=1) if columns else None,
+        )
+
     def about(
         self, registered: RegisteredModel, displaced_by: tuple[FloatArray, ...] = ()
     ) -> ObservationErrors:
@@ -248,7 +265,7 @@ class ObservationErrors:
         errors = self.about(registered)
         if self.samples is not None:
             errors.geometry = self.geometry
-            errors.samples = replace(self.samples, base=errors.noise())
+            errors.samples = errors.weighing(self.samples)
         return errors
 
     def _learned_sizes(self, learned: LearnedNoise | None) -> dict[str, float]:

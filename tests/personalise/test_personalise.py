@@ -8,8 +8,9 @@ import pytest
 from mvest.cases.case import ErrorSamples, Role, Uncertainty
 from mvest.errors import GeometryError, InputError
 from mvest.estimation import Prediction, observation_noise
+from mvest.estimation.noise_family import ErrorColumns
 from mvest.estimation.transform import to_filter
-from mvest.mechanics.settings import ClosureProtocol
+from mvest.mechanics.settings import ClosureProtocol, ExponentialTissue
 from mvest.observation.errors import SpatialCorrelation
 from mvest.observation.learned import ErrorBeliefs
 from mvest.observation.surfaces import UNKNOWN
@@ -609,6 +610,25 @@ def test_without_nuisances_moduli_alone_have_the_errors_of_the_frames_too(monkey
     found = personalise_case(case, settings(*right_nuisances(), moduli_only=True))
     np.testing.assert_allclose(found.moduli_only.estimate, found.result.estimate, rtol=1e-6)
     np.testing.assert_allclose(found.moduli_only.std, found.result.std, rtol=1e-6)
+
+
+def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monkeypatch):
+    use_geometry(monkeypatch)
+    column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
+    monkeypatch.setattr(
+        "mvest.personalise.observation_errors.law_columns",
+        lambda *_: (ErrorColumns("law", column),),
+    )
+    case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
+    law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
+    given = settings(*right_nuisances(), considered_law=law)
+    told = personalise_case(case, given)
+    alone = personalise_case(replace(case, error_samples=None), given)
+    known = personalise_case(case, settings(*right_nuisances()))
+    assert told.result.std[0] > 1.05 * known.result.std[0]
+    # Of the linear model at another estimate.
+    averaged = [one.narrower["any number of beats averaged"][0] for one in (told, alone)]
+    assert averaged[0] == pytest.approx(averaged[1], rel=0.3)
 
 
 def test_a_sample_is_what_moves_the_prediction_against_the_frame(monkeypatch):
