@@ -65,6 +65,9 @@ NEGLIGIBLE = 1e-9
 BANDS = 14
 """Bands of a smooth part: half decades of w / k from 1 down; what is finer is in the last."""
 
+LARGEST = 300.0
+"""Logarithm of a standard deviation beyond which it is that: a search may try any."""
+
 SPECTRUM_POINTS = 400
 """Points on which the bands of a stated correlation are computed."""
 
@@ -468,6 +471,7 @@ class VarianceRows:
 
     def variances(self, log: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The variances ``(r,)``, and the shares in each of the smooth and of the rough part."""
+        log = np.clip(log, -LARGEST, LARGEST)
         smooth = np.where(self.weight > 0.0, np.exp(2.0 * log[self.band]) * self.weight, 0.0)
         rough = np.exp(2.0 * log[self.rough])
         within = smooth + rough + self.resolution

@@ -111,6 +111,17 @@ def some(family: NoiseFamily, seed: int, p: int = 5) -> tuple[FloatArray, FloatA
     return rng.standard_normal(family.size), rng.standard_normal((family.size, p)), log
 
 
+def test_errors_far_beyond_what_is_believed_are_learned_all_the_same() -> None:
+    # A thousand times as large as believed: on its way a search tries what no number holds.
+    rng = np.random.default_rng(3)
+    errors = 1e3 * rng.standard_normal(3 * len(POINTS))
+    evidence = Evidence.of(FAMILY, errors, np.zeros((errors.size, 1)))
+    u = np.full(evidence.prior.size, 1e3)
+    assert np.isfinite(evidence.objective(u)[0])
+    rough = np.exp(evidence.log(evidence.posterior().mean))[list(FAMILY.names).index("rough")]
+    assert rough > 10.0
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_evidence_is_that_of_the_dense_normal_distribution(seed: int) -> None:
     family = mixed_family()
