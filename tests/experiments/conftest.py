@@ -1,7 +1,13 @@
 """What every test of the application needs."""
 
-import pytest
+import json
+import sys
+from types import SimpleNamespace
 
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from experiments.common.records.record import read_record
 from tests.experiments.composed_once import composed_once
 
 
@@ -12,6 +18,43 @@ def compiled(monkeypatch):
     That it is given is tested in processes of their own (``test_first_use.py``).
     """
     monkeypatch.setattr("experiments.common.progress.kernels_are_compiled", lambda: True)
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left_over():
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the application in an empty folder: exit status, standard output and error."""
+    from experiments.run import main
+
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
+        status = main()
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def run_here(run, tmp_path):
+    """Run it into ``here``: exit status, record if any, folder and what it said."""
+
+    def call(*arguments: str, findings=None):
+        status, out, err = run(*arguments, "hydra.run.dir=here")
+        folder = tmp_path / "here"
+        file, record = folder / "result.json", None
+        if file.is_file():
+            record = read_record(file, findings) if findings else json.loads(file.read_text())
+        return status, record, folder, SimpleNamespace(out=out, err=err)
+
+    return call
 
 
 @pytest.fixture(autouse=True, scope="session")

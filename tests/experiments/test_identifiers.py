@@ -19,8 +19,8 @@ from experiments.studies.case.study import run_own_case
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
-from tests.experiments.common.test_config import composed, plain
 from tests.experiments.common.test_inputs import own_case, own_program, own_volume, typed
+from tests.experiments.configured import composed, plain
 from tests.imaging.reading import test_nifti, test_philips
 from tests.imaging.reading import volumes as v
 from tests.made_up_closure import use

@@ -1,16 +1,14 @@
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.building.filters import build_filter
 from experiments.common.building.truth import truth_mesh
 from experiments.common.building.twin import build_twin
-from experiments.common.config import hash_of, register
+from experiments.common.config import hash_of
 from experiments.common.schema import build
 from experiments.runner.jobs.request import as_published
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.observation.errors import WhiteNoise
+from tests.experiments.configured import composed, plain
 from tests.places import CONF
 
 HAVING = {
@@ -23,22 +21,6 @@ HAVING = {
 """Group that only some studies have -> an experiment of one that has it."""
 
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
-
-
-def composed(*overrides: str) -> DictConfig:
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
-
-
-def plain(config: DictConfig) -> dict:
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

@@ -7,17 +7,16 @@ import typing
 from collections.abc import Iterator, Mapping
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from experiments.common.config import Config, plain, register
+from experiments.common.config import Config, plain
 from experiments.common.ranges import ANY, RANGES, range_of, require_in_range
 from experiments.common.study import load_settings, study_names
 from experiments.runner.jobs.request import Request
 from mvest.errors import ConfigurationError
 from mvest.mechanics.parameters import KINDS
 from mvest.problem.registration import REGISTRATION
+from tests.experiments.configured import composed
 from tests.places import CONF, ROOT
 
 FREE = ("external.settings", "factors", "sweep", "imaging.targets")
@@ -41,12 +40,6 @@ HAVING = {
 }
 
 EXAMPLE = {"REGION": "anterior", "FAMILY or tipN": "tip1", "REGION.K": "anterior.3", "": ""}
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 def numbers(hint: object, key: str) -> Iterator[str]:
@@ -141,9 +134,7 @@ CHOICES = [[f"experiment={path.stem}"] for path in sorted((CONF / "experiment").
 
 @pytest.mark.parametrize("overrides", CHOICES, ids=lambda choice: choice[-1])
 def test_all_that_is_configured_is_inside(overrides: list[str]) -> None:
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        require_in_range(plain(compose("config", overrides)))
+    require_in_range(plain(composed(*overrides)))
 
 
 def test_so_are_the_launchers_settings() -> None:

@@ -11,27 +11,12 @@ import pytest
 
 from experiments import tables
 from experiments.common.records.record import read_record
-from experiments.run import main
 from experiments.studies.twin.findings import Findings
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.estimation import Prediction
 from mvest.files import PREFIX
 from tests.places import ROOT
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 def test_debug_runs_end_to_end(tmp_path) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run import main
 from experiments.runner import sweep
 from experiments.runner.execution import guard
 from experiments.runner.jobs import limits
@@ -31,22 +30,15 @@ QUICK = ("hydra/launcher=basic", "tracking.enabled=false")
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
+def run(run, monkeypatch):
     """Run a sweep in an empty folder: exit status, standard output and error."""
-    monkeypatch.chdir(tmp_path)
     fake = Path(__file__).with_name("fake_worker.py")
     monkeypatch.setattr(guard, "WORKER", (sys.executable, str(fake)))
     for name in guard.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
     guard.own_worker.cache_clear()
 
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments, *QUICK])
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    yield call
+    yield lambda *arguments: run(*arguments, *QUICK)
     guard.own_worker().close()
     guard.own_worker.cache_clear()
 

@@ -2,30 +2,19 @@
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.building.anatomy import template_of
-from experiments.common.config import plain, register
+from experiments.common.config import plain
 from experiments.common.places import ANATOMIES
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
-from tests.places import CONF
+from tests.experiments.configured import composed
 
 NORMAL = [name for name in ANATOMIES if name.startswith("normal")]
 
 
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
-
-
 def anatomy(name: str) -> Template:
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [f"valve={name}"])
-    return template_of(plain(config, ("hydra", "paths", "tracking")))
+    return template_of(plain(composed(f"valve={name}"), ("hydra", "paths", "tracking")))
 
 
 def diameters(template: Template) -> tuple[float, float]:

@@ -1,11 +1,9 @@
 """A case from the command line: its settings, its record, and what is refused."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.cases.findings import fields_of, outcome_of_case
 from experiments.common.cases.own_case import read_configured, settings_of
@@ -15,7 +13,6 @@ from experiments.common.config import hash_of
 from experiments.common.records.record import NOT_GATED, read_record, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.run import main
 from experiments.studies.case.settings import Settings
 from experiments.studies.case.study import STUDY, run_own_case
 from mvest.cases.writer import write_case
@@ -23,16 +20,10 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.personalise import Treatment, personalise_case
 from mvest.problem.verdict import ONE_STATE
 from mvest.reporting.case.fields import read_case_fields
-from tests.experiments.common.test_config import composed, plain
+from tests.experiments.configured import composed, plain
 from tests.made_up_closure import made_up_case, use
 
 OWN = ("experiment=own_valve", "personal.mesh.source=structured", "figures=false")
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 @pytest.fixture(scope="module")
@@ -53,20 +44,6 @@ def personalising(values):
 
 def outcome_of(values, folder):
     return run_own_case(Job(values, build(Settings, values), folder))
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The studies of a whole cycle, on a few elements that the pressure hardly moves."""
 
-import json
 import sys
 
 import numpy as np
@@ -49,20 +48,8 @@ TINY = (
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, record, folder and what it said."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str):
-        monkeypatch.setattr(
-            sys, "argv", ["experiments.run", *arguments, *TINY, "hydra.run.dir=here"]
-        )
-        status = main()
-        folder = tmp_path / "here"
-        record = json.loads((folder / "result.json").read_text())
-        return status, record, folder, capsys.readouterr()
-
-    return call
+def run(run_here):
+    return lambda *arguments: run_here(*arguments, *TINY)
 
 
 def test_sets_of_frames_are_spread_over_the_cycle():

@@ -1,24 +1,18 @@
 """The study of the recorded donor valve, on a small made-up recording and without any."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
-from experiments.common.config import register
 from experiments.common.records.record import read_record
 from experiments.common.schema import build
-from experiments.run import main
 from experiments.studies.donor.findings import Findings
 from experiments.studies.donor.settings import CITATION, DATA_VARIABLE, DonorSettings
 from experiments.studies.donor.study import build_donor
 from mvest.valve.mesh.embedding import embed
-from tests.places import ROOT
+from tests.experiments.configured import composed, plain
 from tests.valve.io.recorded import CASE, NAMES, skirt, write
 
 TRUTH = np.array([2.0, 1.0, 3.0])
@@ -42,40 +36,12 @@ SMALL = [
 """Sucked outwards, so that nothing touches or buckles; the annulus narrows by a tenth."""
 
 
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["experiments.run", *arguments])
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
-
-
-def settings(*overrides: str) -> dict:
-    register()
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose("config", list(overrides))
-    GlobalHydra.instance().clear()
-    return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
-
-
 def made_up_recording(folder: Path) -> str:
     """A skirt whose last frame is our own closure with the moduli ``TRUTH``."""
     data = skirt()
     write(folder, data)
     place = f"donor.recording={folder}"
-    config = settings(*SMALL, place)
+    config = plain(composed(*SMALL, place))
     study = build_donor(config, build(DonorSettings, config["donor"]))
     closed = study.model().close(TRUTH, sensitivities=False).simulation
     assert closed.converged

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from experiments.common.records.record import read_record
-from experiments.run import main
 from experiments.studies.external.findings import Findings
 from mvest.external import write_points
 from tests.external.programs import SPRINGS, springs
@@ -16,9 +15,8 @@ NOISE = 0.01
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
+def run(run, tmp_path):
     """Run the application in an empty folder with the program and its observation."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "solve.py").write_text(SPRINGS)
     write_points(tmp_path / "observed.csv", springs(*M)[0].reshape(-1, 3))
     command = (
@@ -40,19 +38,14 @@ def run(tmp_path, monkeypatch, capsys):
     def call(*without: str, **changed: str):
         given = {key: value for key, value in settings.items() if key not in without} | changed
         words = [f"{key}={value}" for key, value in given.items()]
-        monkeypatch.setattr(
-            sys, "argv", ["experiments.run", command, *words] if "command" not in without
-            else ["experiments.run", *words]
-        )  # fmt: skip
-        status = main()
-        return status, capsys.readouterr()
+        return run(*words) if "command" in without else run(command, *words)
 
     return call
 
 
 def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
-    status, said = run()
-    assert status == 0, said.err
+    status, out, err = run()
+    assert status == 0, err
     record = read_record(tmp_path / "here" / "result.json", Findings)
     # Data without noise; the prior's weight is that of 0.01 mm against 3 N/mm, about 1e-3.
     np.testing.assert_allclose(record.findings.estimate, M, rtol=2e-3)
@@ -66,10 +59,10 @@ def test_a_program_s_parameters_are_estimated_from_a_file(run, tmp_path):
     assert not program.own_jacobian
     names = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"external.csv", "external.md", "external_iterates.png", "fitted.csv", "done"} <= names
-    assert "N/mm" in said.out
-    assert "differences of its predictions" in said.out
+    assert "N/mm" in out
+    assert "differences of its predictions" in out
     # The runs are kept: the same study again starts no program.
-    status, said = run()
+    status, out, err = run()
     record = read_record(tmp_path / "here" / "result.json", Findings)
     assert (status, record.findings.program.runs) == (0, 0)
     assert record.findings.program.reused == program.runs
@@ -89,32 +82,32 @@ def test_a_program_that_was_edited_is_run_again(run, tmp_path):
 
 
 def test_check_runs_the_program_once_and_compares_its_derivatives(run, tmp_path):
-    status, said = run(check="true")
-    assert status == 0, said.err
-    assert "2 points" in said.out
-    assert "derivatives: by differences" in said.out
+    status, out, err = run(check="true")
+    assert status == 0, err
+    assert "2 points" in out
+    assert "derivatives: by differences" in out
     source = (tmp_path / "solve.py").read_text().replace('how == ["exact"]', "True")
     (tmp_path / "solve.py").write_text(source)
-    status, said = run(check="true", **{"external.reuse": "false"})
-    assert "apart from differences by k1 " in said.out
+    status, out, _ = run(check="true", **{"external.reuse": "false"})
+    assert "apart from differences by k1 " in out
     # A wrong sign in the program is told: 200 %.
     (tmp_path / "solve.py").write_text(source.replace("-2 / k1**2", "2 / k1**2"))
-    status, said = run(check="true", **{"external.reuse": "false"})
-    assert "k1 2e+02 %, k2" in said.out
+    status, out, _ = run(check="true", **{"external.reuse": "false"})
+    assert "k1 2e+02 %, k2" in out
 
 
 def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     (tmp_path / "solve.py").write_text("import sys; sys.exit('out of licences')")
-    status, said = run()
+    status, _, err = run()
     assert status == 1
     record = read_record(tmp_path / "here" / "result.json", Findings)
     assert record.status == "failed"
     assert "out of licences" in record.detail
     assert record.findings.estimate is None
-    assert "out of licences" in said.err
-    status, said = run(check="true")
+    assert "out of licences" in err
+    status, _, err = run(check="true")
     assert status == 2
-    assert "at the initial values: run-" in said.err
+    assert "at the initial values: run-" in err
 
 
 @pytest.mark.parametrize(
@@ -137,7 +130,7 @@ def test_a_program_that_fails_is_recorded_with_its_words(run, tmp_path):
     ],
 )
 def test_a_wrong_request_is_told_in_one_line(run, without, changed, message):
-    status, said = run(*without, **changed)
+    status, _, err = run(*without, **changed)
     assert status == 2
-    assert message in said.err
-    assert len(said.err.strip().splitlines()) == 1
+    assert message in err
+    assert len(err.strip().splitlines()) == 1

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
 from experiments.common.building.filters import build_filter
-from experiments.common.config import plain, register
+from experiments.common.config import plain
 from experiments.common.records.record import read_record
 from experiments.run import main
 from experiments.studies.filters.findings import Findings
@@ -32,16 +31,15 @@ from mvest.estimation import (
     UnscentedFilter,
 )
 from mvest.kept import Entry
-from tests.experiments.studies.test_gate_study import CONF, SMALL
+from tests.experiments.configured import composed
+from tests.experiments.studies.test_gate_study import SMALL
 
 SHORT = "{chains: 2, walkers: 8, steps: 60}"
 NAMES = ("E_f.anterior", "E_f.posterior")
 
 
 def filter_settings(name: str, *overrides: str) -> dict:
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(compose("config", [f"filter={name}", *overrides]))["filter"]
+    return plain(composed(f"filter={name}", *overrides))["filter"]
 
 
 @pytest.mark.parametrize(

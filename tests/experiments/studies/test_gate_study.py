@@ -1,21 +1,13 @@
 """The studies of the forward model, in a size that takes seconds: configuration, record, tables."""
 
-import json
-import sys
-
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
 from experiments.common.building.closure import closure_model
-from experiments.common.config import register
-from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.closure.robustness import GATE_CASES, GateCase
 from mvest.estimation import Prediction
-from tests.places import CONF
+from tests.experiments.configured import composed, plain
 
 SMALL = (
     "mesh.columns=12",
@@ -36,34 +28,12 @@ ONE = ("hydra.mode=RUN",)
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, record, folder and what it said."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str):
-        monkeypatch.setattr(
-            sys, "argv", ["experiments.run", *SMALL, *arguments, "hydra.run.dir=here"]
-        )
-        status = main()
-        folder = tmp_path / "here"
-        record = json.loads((folder / "result.json").read_text())
-        return status, record, folder, capsys.readouterr()
-
-    return call
-
-
-def composed(*overrides: str) -> dict:
-    register()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("config", list(overrides))
-        return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
-    finally:
-        GlobalHydra.instance().clear()
+def run(run_here):
+    return lambda *arguments: run_here(*SMALL, *arguments)
 
 
 def test_each_case_changes_its_own_setting_only():
-    config = composed("experiment=gate", "mesh.columns=12", "mesh.rows=2")
+    config = plain(composed("experiment=gate", "mesh.columns=12", "mesh.rows=2"))
     base = closure_model(config)
 
     def described(model: ClosureModel) -> dict:
@@ -87,15 +57,17 @@ def test_each_case_changes_its_own_setting_only():
     for case in GATE_CASES:
         varied = described(closure_model(config, case))
         changed[case.name] = {k for k, v in varied.items() if v != reference[k]}
-    plain = GateCase("x")
+    unchanged = GateCase("x")
     for case in GATE_CASES:
-        asked = {k for k in plain.__slots__ if getattr(case, k) != getattr(plain, k)} - {"name"}
+        asked = {k for k in unchanged.__slots__ if getattr(case, k) != getattr(unchanged, k)} - {
+            "name"
+        }
         # No mesh is coarser than that of 24 x 3 cells which guides are on.
         assert changed[case.name] == asked - {"guided"}
     (finer,) = (closure_model(config, c).mesh for c in GATE_CASES if c.mesh != 1)
     assert len(finer.elements) == 18 * 3
     (guided,) = (c for c in GATE_CASES if c.guided)
-    usual = composed("experiment=gate")
+    usual = plain(composed("experiment=gate"))
     assert closure_model(usual).guide is None
     assert len(closure_model(usual, guided).guide.mesh.elements) < 54 * 6
     assert closure_model(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(

@@ -3,7 +3,6 @@
 import sys
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.records.record import read_record
 from experiments.run import main
@@ -26,12 +25,6 @@ SMALL = [
     "heart.gate=[perturbed start]",
     "tracking.enabled=false",
 ]
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 def run(monkeypatch, *arguments):

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.records.record import read_record
 from experiments.run import main
@@ -29,12 +28,6 @@ TINY = (
     "designs.known=[chord_stiffness,pressure_scale]",
     "publish=false",
 )
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 def call(folder, monkeypatch, capsys, *arguments):

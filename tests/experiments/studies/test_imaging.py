@@ -9,12 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
 from experiments import tables
-from experiments.common.config import register
 from experiments.common.records.record import Record, read_record
 from experiments.common.schema import build
 from experiments.results.keep import publish
@@ -35,7 +31,7 @@ from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection import trained_model as detection_model
 from mvest.imaging.detection.trained_model import STAGES, default_model, load_model
 from mvest.imaging.simulator import SMALL
-from tests.places import CONF
+from tests.experiments.configured import composed, plain
 
 STUDY = (
     "experiment=imaging",
@@ -47,20 +43,8 @@ STUDY = (
 )
 
 
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
-
-
-def composed(*overrides: str) -> dict:
-    register()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("config", ["experiment=imaging", "imaging=small", *overrides])
-        return OmegaConf.to_container(config, resolve=True)  # type: ignore[return-value]
-    finally:
-        GlobalHydra.instance().clear()
+def values_of(*overrides: str) -> dict:
+    return plain(composed("experiment=imaging", "imaging=small", *overrides))
 
 
 def call(place: Path, *arguments: str) -> int:
@@ -68,10 +52,7 @@ def call(place: Path, *arguments: str) -> int:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         patch.setattr(sys, "argv", ["experiments.run", *STUDY, *arguments])
-        try:
-            return main()
-        finally:
-            GlobalHydra.instance().clear()
+        return main()
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +64,11 @@ def done(tmp_path_factory) -> Path:
 
 
 def settings_of(*overrides: str) -> ImagingSettings:
-    return build(Settings, composed(*overrides)).imaging
+    return build(Settings, values_of(*overrides)).imaging
 
 
 def store_of(*overrides: str) -> ImagingStore:
-    return ImagingStore(composed(*overrides), settings_of(*overrides))
+    return ImagingStore(values_of(*overrides), settings_of(*overrides))
 
 
 def record_of(place: Path, run: str = "run") -> Record[Findings]:

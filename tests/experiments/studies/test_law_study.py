@@ -1,12 +1,8 @@
 """The study of the material laws in a size that takes seconds."""
 
-import sys
-
 import numpy as np
 import pytest
 
-from experiments.common.records.record import read_record
-from experiments.run import main
 from experiments.studies.law.findings import Findings
 
 SMALL = (
@@ -35,21 +31,8 @@ SMALL = (
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the study in an empty folder: exit status, record, folder and what it said."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str):
-        monkeypatch.setattr(
-            sys, "argv", ["experiments.run", *SMALL, *arguments, "hydra.run.dir=here"]
-        )
-        status = main()
-        folder = tmp_path / "here"
-        file = folder / "result.json"
-        record = read_record(file, Findings) if file.is_file() else None
-        return status, record, folder, capsys.readouterr()
-
-    return call
+def run(run_here):
+    return lambda *arguments: run_here(*SMALL, *arguments, findings=Findings)
 
 
 def test_the_study_fits_both_laws_to_the_same_data(run):

@@ -5,7 +5,6 @@ anywhere, as in a scanner's coordinates, and meshed anew where frames do not cor
 """
 
 import json
-import sys
 
 import meshio
 import numpy as np
@@ -14,7 +13,6 @@ import yaml
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from experiments.run import main
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
@@ -194,18 +192,10 @@ def write(folder, seen, save, place, corresponds, **more):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
+def run(run):
     """Run the one command on a case: exit status, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(folder, *arguments):
-        line = ["experiments.run", "experiment=own_valve", f"case={folder}", *COARSE, *arguments]
-        monkeypatch.setattr(sys, "argv", line)
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
+    own = ("experiment=own_valve", *COARSE)
+    return lambda folder, *arguments: run(*own, f"case={folder}", *arguments)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.building import patient_store
 from experiments.common.building.virtual_patients import PatientSettings
@@ -25,15 +24,9 @@ from mvest.problem.verdict import ONE_STATE
 from mvest.provenance import write_json
 from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
-from tests.experiments.common.test_config import composed, plain
+from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up_patients import an_outcome
 from tests.made_up_closure import TRUE, made_up_case, use
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 def config_of(folder, *overrides):

@@ -4,15 +4,12 @@ In place of the mechanics there is a stretch that is known in closed form; that 
 scenarios is checked in tests/prediction.
 """
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.common.records.record import read_record
-from experiments.run import main
 from experiments.studies.prediction import study as prediction
 from experiments.studies.prediction.figure import PANELS, prediction_figure
 from experiments.studies.prediction.findings import Findings
@@ -76,21 +73,10 @@ def buckled(self, m, *, sensitivities=True, every_frame=False):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, record, folder and what it said."""
-    monkeypatch.chdir(tmp_path)
+def run(run_here, monkeypatch):
     monkeypatch.setattr(prediction, "MEASURED_ON", (24, 7))
     monkeypatch.setattr(ClosureModel, "close", stretched)
-
-    def call(*arguments: str):
-        command = ["experiments.run", *SMALL, *arguments, "hydra.run.dir=here"]
-        monkeypatch.setattr(sys, "argv", command)
-        status = main()
-        path = tmp_path / "here" / "result.json"
-        record = read_record(path, Findings) if path.is_file() else None
-        return status, record, tmp_path / "here", capsys.readouterr()
-
-    return call
+    return lambda *arguments: run_here(*SMALL, *arguments, findings=Findings)
 
 
 def test_the_study_predicts_every_scenario_and_compares_with_the_truth(run):

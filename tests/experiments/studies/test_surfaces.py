@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 
 from experiments.common.building import patient_store
 from experiments.common.records.record import Outcome
@@ -29,7 +28,7 @@ from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
 from mvest.reporting.case.findings import PosteriorCheck
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.cases.folders import template_case
-from tests.experiments.common.test_config import composed, plain
+from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import findings_of, patient
 from tests.made_up_closure import TRUE, made_up_case
@@ -59,12 +58,6 @@ def through(door, folder):
 def laid_out_by(door):
     """Whether nothing but surfaces and tips goes through."""
     return door in ("slicerheart", "labels")
-
-
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
 
 
 # Half a thickness is 0.6 mm, the shift to LPS 144 mm; 0.3 mm to one side are less off a surface.

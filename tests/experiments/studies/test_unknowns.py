@@ -1,8 +1,6 @@
 """The studies of chordae by family and of a stiff patch, on a few elements that hardly move."""
 
-import json
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,6 @@ import pytest
 
 from experiments.common.building.whole_cycle import Bound
 from experiments.common.records.record import Record
-from experiments.run import main
 from experiments.studies.chord.findings import Findings as ChordFindings
 from experiments.studies.chord.findings import Fit as ChordFit
 from experiments.studies.chord.study import STUDY as CHORD
@@ -48,19 +45,8 @@ TINY = (
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run the application in an empty folder: exit status, record, folder and what it said."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: str):
-        given = ["experiments.run", *TINY, *arguments, "hydra.run.dir=here"]
-        monkeypatch.setattr(sys, "argv", given)
-        status = main()
-        folder = tmp_path / "here"
-        record = json.loads((folder / "result.json").read_text())
-        return status, record, folder, capsys.readouterr()
-
-    return call
+def run(run_here):
+    return lambda *arguments: run_here(*TINY, *arguments)
 
 
 FEW = (

@@ -4,14 +4,12 @@ The detectors are stood for by the valve that is in the volume; they have tests 
 """
 
 import json
-import sys
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.run import main
 from mvest.cases.folder import read_case
 from mvest.cases.from_images import valve_axes
 from mvest.errors import InputError
@@ -37,7 +35,7 @@ def volume(tmp_path):
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys, volume):
+def run(run, monkeypatch, volume):
     """Run the one command: exit status, standard output and error; what detectors were told."""
     rng = np.random.default_rng(2)
     accuracy = DetectionAccuracy(
@@ -59,21 +57,14 @@ def run(tmp_path, monkeypatch, capsys, volume):
         told.append((volume, landmarks))
         return sequence()
 
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("experiments.common.cases.volume.load_model", lambda path: model)
     monkeypatch.setattr("experiments.common.cases.volume.default_model", lambda: model)
     monkeypatch.setattr("experiments.common.cases.volume.detect_valve", detect)
 
     def call(*arguments, pressure=True):
-        line = ["experiments.run", "experiment=volume", f"volume={volume}", *arguments]
+        given = [*arguments, "imaged.pressure_mmHg=110"] if pressure else arguments
         # In this process, where the detectors are replaced.
-        line.append("time_limit_s=null")
-        if pressure:
-            line.append("imaged.pressure_mmHg=110")
-        monkeypatch.setattr(sys, "argv", line)
-        status = main()
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
+        return run("experiment=volume", f"volume={volume}", *given, "time_limit_s=null")
 
     call.told, call.model = told, model
     return call

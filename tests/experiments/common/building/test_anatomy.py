@@ -20,7 +20,7 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.measure.annulus import measure_annulus
 from tests.cases.folders import template_case
-from tests.experiments.common.test_config import composed
+from tests.experiments.configured import composed
 
 SMALL = (
     "mesh.columns=16",

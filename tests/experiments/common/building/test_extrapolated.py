@@ -11,7 +11,7 @@ from experiments.common.building.store import StoredModel
 from experiments.common.building.twin import build_twin
 from mvest.errors import ConfigurationError
 from mvest.estimation.prediction import Prediction
-from tests.experiments.common.test_config import composed, plain
+from tests.experiments.configured import composed, plain
 
 
 def stored(folder: Path, size: float, converged: bool = True) -> StoredModel:

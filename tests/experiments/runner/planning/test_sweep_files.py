@@ -47,12 +47,6 @@ DEBUG = (
 """Any job in seconds: the settings of the quick check."""
 
 
-@pytest.fixture(autouse=True)
-def no_hydra_left_over():
-    yield
-    GlobalHydra.instance().clear()
-
-
 def jobs(name: str, size: str) -> list[list[str]]:
     config = compose("config", [f"sweep={name}", f"sweep.size={size}"], return_hydra_config=True)
     assert config.hydra.mode.name == "MULTIRUN"
