@@ -4,9 +4,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.dimensions import AnnulusDimensions
+from mvest.valve.anatomy.template import Template, TemplateParameters
 
 HALF_GAP = 0.5
 """mm from the coaptation line to either closed midsurface."""
@@ -28,6 +30,25 @@ def leaflets(layout, closure):
     closed[:, 2] -= 1.5 * (4 * u * (1 - u))[:, 0]
     closed[:, 2] -= COAPTATION * np.clip((s - at) / (1 - at), 0, 1)
     return (1 - closure) * template.position(phi, s) + closure * closed
+
+
+def descending_valve(layout):
+    """An anatomy of its own in two open frames, of which the second lies 1 mm lower."""
+    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
+    valve = template.valve(layout.columns, layout.rows)
+    phi, s, _, tip = template.chord_places()
+    vertices = valve.surface.vertices
+    return MovingValve(
+        "not in any training",
+        layout,
+        np.array([0.0, 0.04]),
+        np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
+        np.stack([valve.papillary_tips] * 2),
+        valve.surface.thickness,
+        np.asarray(phi, float),
+        np.asarray(s, float),
+        np.asarray(tip, np.int64),
+    )
 
 
 def pose():

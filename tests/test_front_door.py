@@ -14,12 +14,10 @@ import pytest
 
 import mvest
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume
 from mvest.imaging.writing import write_sequence_nrrd
-from mvest.valve.anatomy.dimensions import AnnulusDimensions
-from mvest.valve.anatomy.template import Template, TemplateParameters
 from tests.made_up_closure import made_up_case, use
+from tests.made_up_sequence import descending_valve
 from tests.places import ROOT
 
 REGIONS = ("anterior", "posterior")
@@ -79,22 +77,7 @@ def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def simulated_volume(folder: Path) -> Path:
     """A file as a user has one: a valve of its own, closing a little, in simulated echo."""
-    layout = ValveLayout(64, 15)
-    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
-    valve = template.valve(layout.columns, layout.rows)
-    phi, s, _, tip = template.chord_places()
-    vertices = valve.surface.vertices
-    moving = MovingValve(
-        "made up",
-        layout,
-        np.array([0.0, 0.04]),
-        np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
-        np.stack([valve.papillary_tips] * 2),
-        valve.surface.thickness,
-        phi,
-        s,
-        tip,
-    )
+    moving = descending_valve(ValveLayout(64, 15))
     probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))
     return write_sequence_nrrd(
         folder / "v.seq.nrrd", simulate_volume(moving, Acquisition(), probe, 3)

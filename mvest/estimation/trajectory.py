@@ -97,16 +97,6 @@ class Trajectory:
         """Standard deviations (f, p)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-    @classmethod
-    def of_stacked(cls, stacked: Gaussian, frames: int) -> "Trajectory":
-        """The marginal of each frame out of ``frames`` stacked blocks of parameters."""
-        p, rest = divmod(stacked.size, frames)
-        if rest:
-            raise InputError(f"{stacked.size} parameters are not those of {frames} frames")
-        blocks = stacked.covariance.reshape(frames, p, frames, p)
-        at = np.arange(frames)
-        return cls(stacked.mean.reshape(frames, p), blocks[at, :, at, :])
-
 
 def filter_frames(
     prior: Gaussian, frames: Sequence[LinearFrame], Q: float | FloatArray = 0.0

@@ -217,21 +217,16 @@ READERS = (
     Reader("surface.stl-merged", lambda path: read_regions(path, {1: "both"}), (text_stl,)),
     Reader("surface.obj", regions, (obj,)),
     Reader("surface.ply", regions, (text_ply, binary_ply)),
-    Reader(
-        "surface.vtp",
-        regions,
-        tuple(
-            lambda folder, form=form: vtk(folder / "a.vtp", form)
-            for form in ("ascii", "binary", "appended")
-        ),
-    ),
-    Reader(
-        "surface.vtu",
-        regions,
-        tuple(
-            lambda folder, form=form: vtk(folder / "a.vtu", form)
-            for form in ("ascii", "binary", "appended")
-        ),
+    *(
+        Reader(
+            f"surface.{kind}",
+            regions,
+            tuple(
+                lambda folder, name=f"a.{kind}", form=form: vtk(folder / name, form)
+                for form in ("ascii", "binary", "appended")
+            ),
+        )
+        for kind in ("vtp", "vtu")
     ),
     Reader(
         "surface.vtk",

@@ -11,10 +11,8 @@ from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.landmarks import LANDMARKS, landmarks
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.evaluation import surface_distances
-from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.simulator import Acquisition, draw_probe, simulate_volume, true_sequence
-from mvest.valve.anatomy.dimensions import AnnulusDimensions
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from tests.made_up_sequence import descending_valve
 
 LAYOUT = ValveLayout(64, 15)
 
@@ -27,21 +25,7 @@ def model():
 @pytest.fixture(scope="module")
 def seen():
     """Two open frames of a valve with an anatomy of its own, and where it truly is."""
-    template = Template(TemplateParameters(AnnulusDimensions(17.2, 13.4)))
-    valve = template.valve(LAYOUT.columns, LAYOUT.rows)
-    phi, s, _, tip = template.chord_places()
-    vertices = valve.surface.vertices
-    moving = MovingValve(
-        "not in any training",
-        LAYOUT,
-        np.array([0.0, 0.04]),
-        np.stack([vertices, vertices + np.array([0.0, 0.0, -1.0])]),
-        np.stack([valve.papillary_tips] * 2),
-        valve.surface.thickness,
-        np.asarray(phi, float),
-        np.asarray(s, float),
-        np.asarray(tip, np.int64),
-    )
+    moving = descending_valve(LAYOUT)
     probe = draw_probe(np.random.default_rng(5), tilt_deg=(0.0, 25.0))
     return simulate_volume(moving, Acquisition(), probe, 3), true_sequence(moving, probe)
 

@@ -4,7 +4,7 @@ import base64
 import io
 import re
 import shutil
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
 from mvest.reporting.case.report import write_case_report
 from tests.experiments.results.test_report import publish
 from tests.experiments.sweeps.synthetic_sweeps import TRUTH, job, run, sweep
-from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case
+from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case, poisoned
 
 needs_browser = pytest.mark.skipif(
     not (shutil.which("chromium") or shutil.which("chromium-browser")),
@@ -75,20 +75,6 @@ def widths(page: Path) -> tuple[int, int]:
     return int(held), int(window)
 
 
-def poisoned(value, key=""):
-    """Findings in which every text is an attack, but for what a page decides by."""
-    if is_dataclass(value):
-        names = [field.name for field in fields(value)]
-        return replace(value, **{k: poisoned(getattr(value, k), k) for k in names})
-    if isinstance(value, dict):
-        return {k: poisoned(v, k) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return type(value)(poisoned(v, key) for v in value)
-    if not isinstance(value, str) or key in ("kind", "treatment"):
-        return value
-    return value + LONG
-
-
 def images(folder: Path) -> ImageStep:
     """From images to a valve, all of whose words are an attack."""
     return ImageStep(
@@ -111,7 +97,7 @@ def case_page(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("case")
     findings, shapes = made_up_case(folder)
     hostile = replace(
-        poisoned(findings),
+        poisoned(findings, LONG),
         settings={LONG: LONG},
         measurements={LONG: {LONG: {LONG: 1.0}}},
         image_step=images(folder),
@@ -119,7 +105,9 @@ def case_page(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvest.reporting.figures.DPI", 30)
         patch.setattr("mvest.reporting.case.drawing.MAX_SPLITS", 0)
-        return write_case_report(folder, hostile, shapes, poisoned(LINE), poisoned(PROVENANCE))[0]
+        return write_case_report(
+            folder, hostile, shapes, poisoned(LINE, LONG), poisoned(PROVENANCE, LONG)
+        )[0]
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,15 @@ from mvest.processes import run
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.json_file import read_mapping
 
-__all__ = ["ESTIMATE", "SECRET", "estimate_blindly", "main", "read_estimate", "seal"]
+__all__ = [
+    "ESTIMATE",
+    "SECRET",
+    "estimate_blindly",
+    "estimated_or_reason",
+    "main",
+    "read_estimate",
+    "seal",
+]
 
 ESTIMATE = "estimate.json"
 """What the process leaves in the output folder."""
@@ -116,6 +124,16 @@ def estimate_blindly(
         last = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
         raise InputError(f"the estimation of {case} left no result: {last.removeprefix('error: ')}")
     return read_estimate(folder)
+
+
+def estimated_or_reason(
+    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
+) -> Outcome[Findings] | str:
+    """What the estimation left, or why it left nothing; as `estimate_blindly` is asked."""
+    try:
+        return estimate_blindly(values, folder, case, sealed)
+    except InputError as fault:
+        return str(fault)
 
 
 def read_estimate(folder: Path) -> Outcome[Findings]:

@@ -56,11 +56,6 @@ def peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GB
 
 
-def resident_gb() -> float:
-    """What this process has in memory."""
-    return _resident_and_reserved()[0] / GB
-
-
 def default_memory_gb(jobs: int = 1) -> float:
     """Limit of each of so many jobs that run on this machine at a time: their part of ``SHARE``."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

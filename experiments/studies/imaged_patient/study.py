@@ -20,7 +20,7 @@ from experiments.common.building.virtual_patients import (
     require_patient,
 )
 from experiments.common.cases import findings as of_cases
-from experiments.common.cases.blind import estimate_blindly
+from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.records.record import Outcome, Status
 from experiments.common.study import Job, Section, Study
 from experiments.studies.imaged_patient.findings import (
@@ -110,7 +110,7 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
     place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
     hidden = read_mapping(place.truth / HIDDEN)
     stated = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
-    volume = _estimated(stated, folder, place.volume, place.hidden)
+    volume = estimated_or_reason(stated, folder, place.volume, place.hidden)
     # Of the known shape nothing is in error but what the estimator cannot know.
     known, segmented = (
         _beside(values, folder / case.name, case, place.truth)
@@ -151,16 +151,9 @@ Estimation = Outcome[of_cases.Findings] | str
 """What an estimation apart left, or why it left nothing."""
 
 
-def _estimated(values: Values, folder: Path, case: Path, sealed: Path) -> Estimation:
-    try:
-        return estimate_blindly(values, folder, case, sealed)
-    except InputError as fault:
-        return str(fault)
-
-
 def _beside(values: Values, folder: Path, case: Path, sealed: Path) -> Estimation:
     folder.mkdir(exist_ok=True)
-    return _estimated(values, folder, case, sealed)
+    return estimated_or_reason(values, folder, case, sealed)
 
 
 def _kept(found: Estimation) -> KnownGeometry:

@@ -19,8 +19,9 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from mvest.cases.case import Frame
 from mvest.errors import ConfigurationError
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface
 
-__all__ = ["landmarks_on", "write_label_map", "write_slicerheart"]
+__all__ = ["drawn_leaflets", "landmarks_on", "write_label_map", "write_slicerheart"]
 
 SCENE = "simulated"
 FINE_MM = 0.2
@@ -164,7 +165,7 @@ def write_label_map(
         ``(n,)``
     voxel_mm : float
     """
-    drawn, low = _drawn(frame, normals, thickness_mm)
+    drawn, low = drawn_leaflets(frame, normals, thickness_mm)
     shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
     # Voxels lie anywhere against the leaflets.
     start = 0.37 * voxel_mm
@@ -184,8 +185,8 @@ def write_label_map(
     nibabel.save(image(labels.astype(np.uint8), affine), file)
 
 
-def _drawn(
-    frame: Frame, normals: FloatArray, thickness_mm: FloatArray
+def drawn_leaflets(
+    frame: Frame | LeafletSurface, normals: FloatArray, thickness_mm: FloatArray
 ) -> tuple[NDArray[np.uint8], FloatArray]:
     """Labels on a fine grid, and where its first point is (LPS mm)."""
     vertices, triangles = frame.vertices, frame.triangles

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import resource
 import shutil
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments.common.building.patient_store import make_patient
-from experiments.common.cases import findings as of_cases
-from experiments.common.cases.blind import estimate_blindly
+from experiments.common.cases.blind import estimated_or_reason
 from experiments.common.cases.settings import PersonalSettings
 from experiments.common.records.record import Outcome
 from experiments.common.study import Job, Section, Study
@@ -24,7 +20,6 @@ from experiments.studies.surfaces.settings import Settings
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.cases.writer import write_case
-from mvest.errors import InputError
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import MODULUS, UnknownRow
 
@@ -55,7 +50,7 @@ def run_surfaces(job: Job[Settings]) -> Outcome[Findings]:
     )
     case = write_case(job.folder / "case", arrived.case)
     before = _cpu_of_children()
-    estimated = _estimated(job.values, job.folder, case, place.hidden)
+    estimated = estimated_or_reason(job.values, job.folder, case, place.hidden)
     cpu = _cpu_of_children() - before
     left = None if isinstance(estimated, str) else estimated.findings.case
     unknowns = _believed(job.settings.personal) if left is None else left.unknowns
@@ -89,16 +84,6 @@ def run_surfaces(job: Job[Settings]) -> Outcome[Findings]:
         model=estimated.model,
         gate=estimated.gate,
     )
-
-
-def _estimated(
-    values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
-) -> Outcome[of_cases.Findings] | str:
-    """What the estimation left, or why it left nothing."""
-    try:
-        return estimate_blindly(values, folder, case, sealed)
-    except InputError as fault:
-        return str(fault)
 
 
 def _believed(personal: PersonalSettings) -> tuple[UnknownRow, ...]:

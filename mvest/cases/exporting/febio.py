@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -84,18 +84,7 @@ class FebioOptions:
     @property
     def febio(self) -> FebSettings:
         """What is chosen in FEBio."""
-        return FebSettings(
-            self.law,
-            self.contact,
-            self.contact_gap_mm,
-            self.contact_reach_mm,
-            self.penalty,
-            self.dynamic,
-            self.density_factor,
-            self.steps,
-            self.quasi_newton,
-            self.tolerance,
-        )
+        return FebSettings(**{own.name: getattr(self, own.name) for own in fields(FebSettings)})
 
 
 def export_febio(source: Path, target: Path, options: FebioOptions) -> Path:

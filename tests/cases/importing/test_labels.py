@@ -37,10 +37,7 @@ def tips(valve: Valve) -> tuple[float, ...]:
 
 @pytest.fixture(scope="module")
 def image(valve: Valve) -> SimpleITK.Image:
-    surface = valve.surface
-    return voxelised(
-        surface.vertices, surface.triangles, surface.region, surface.thickness, voxel_mm=0.8
-    )
+    return voxelised(valve.surface, voxel_mm=0.8)
 
 
 @pytest.fixture(scope="module")

@@ -309,7 +309,7 @@ def test_a_run_by_itself_is_held_to_its_memory(run, monkeypatch):
             kept.append(b"x" * 2**24)
 
     monkeypatch.setattr(study, "STUDY", replace(study.STUDY, run=hog))
-    limit = round(limits.resident_gb() + 0.2, 2)
+    limit = round(limits._resident_and_reserved()[0] / limits.GB + 0.2, 2)
     before = resource.getrlimit(resource.RLIMIT_DATA)
     status, _, err = run("experiment=debug", f"memory_limit_gb={limit}")
     assert status == 1

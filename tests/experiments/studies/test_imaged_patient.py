@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from experiments.common.building.virtual_patients import PatientSettings
+from experiments.common.cases import blind
 from experiments.common.study import Job
 from experiments.results.keep import publish
 from experiments.studies.imaged_patient import study as imaged_patient
@@ -93,7 +94,7 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
         return an_outcome(5.0, 2.5)
 
     monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
-    monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
+    monkeypatch.setattr(blind, "estimate_blindly", blindly)
     one = PatientSettings(name="one", description="")
     settings = SimpleNamespace(patient=one, echo=None)
     outcome = imaged_patient.run_imaged_patient(Job({"imaged": {}, "seed": 1}, settings, tmp_path))
@@ -121,7 +122,7 @@ def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(monkeypatch, 
         return outcome
 
     monkeypatch.setattr(imaged_patient, "make_imaged_patient", lambda *asked: place)
-    monkeypatch.setattr(imaged_patient, "estimate_blindly", blindly)
+    monkeypatch.setattr(blind, "estimate_blindly", blindly)
     settings = SimpleNamespace(patient=PatientSettings(name="one", description=""), echo=None)
     outcome = imaged_patient.run_imaged_patient(Job({"imaged": {}, "seed": 1}, settings, tmp_path))
     assert (outcome.status, outcome.findings.repeats) == ("failed", ())

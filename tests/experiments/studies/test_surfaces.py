@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from experiments.common.building import patient_store
+from experiments.common.cases import blind
 from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job
@@ -145,7 +146,7 @@ def test_the_estimator_gets_the_case_and_not_the_truth(job, monkeypatch):
         case = replace(findings.case, unknowns=rows, verdict=Verdict(TRUSTWORTHY), posterior=check)
         return Outcome(findings=replace(findings, case=case), reason="converged")
 
-    monkeypatch.setattr(study, "estimate_blindly", blindly)
+    monkeypatch.setattr(blind, "estimate_blindly", blindly)
     outcome = study.run_surfaces(job)
     found = outcome.findings
     assert not given["case"].frame(Role.CLOSED).corresponds
@@ -161,7 +162,7 @@ def test_an_estimation_that_leaves_nothing_is_a_failure_with_its_prior(job, monk
     def blindly(*_):
         raise InputError("does not close")
 
-    monkeypatch.setattr(study, "estimate_blindly", blindly)
+    monkeypatch.setattr(blind, "estimate_blindly", blindly)
     outcome = study.run_surfaces(job)
     assert (outcome.status, outcome.reason) == ("failed", "does not close")
     found = outcome.findings

@@ -5,7 +5,7 @@ higher the pressure, and whose edge sinks with longer chordae. Distances, sensit
 innovations are those of this formula, so that they fit each other; they say nothing about valves.
 """
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -237,3 +237,17 @@ def made_up_case(folder: Path) -> tuple[CaseFindings, Path]:
     path = folder / "fields.npz"
     np.savez(path, **fields)
     return _case(fields), path
+
+
+def poisoned(value, attack: str, key: str = ""):
+    """Findings in which every text ends in an attack, but for what a page decides by."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value)]
+        return replace(value, **{k: poisoned(getattr(value, k), attack, k) for k in names})
+    if isinstance(value, dict):
+        return {k: poisoned(v, attack, k) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return type(value)(poisoned(v, attack, key) for v in value)
+    if not isinstance(value, str) or key in ("kind", "treatment"):
+        return value
+    return value + attack

@@ -1,7 +1,7 @@
 """The page of one case. What it shows is made up; see `tests.reporting.case.made_up_case`."""
 
 import re
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,7 +11,7 @@ from mvest.errors import InputError
 from mvest.reporting.case import words
 from mvest.reporting.case.findings import About, CaseFindings
 from mvest.reporting.case.report import write_case_report
-from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case
+from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case, poisoned
 
 SECTIONS = (
     "case", "valve-shapes", "figure3", "estimates", "identifiability", "iterations", "innovation",
@@ -160,26 +160,16 @@ def hostile_page(case, tmp_path_factory):
     """Findings in which every name and sentence is a script."""
     findings, path = case
 
-    def poisoned(value, key=""):
-        if is_dataclass(value):
-            names = [field.name for field in fields(value)]
-            return replace(value, **{k: poisoned(getattr(value, k), k) for k in names})
-        if isinstance(value, dict):
-            return {k: poisoned(v, k) for k, v in value.items()}
-        if isinstance(value, tuple | list):
-            return type(value)(poisoned(v, key) for v in value)
-        # What the page decides by, and not what it prints.
-        if not isinstance(value, str) or key in ("kind", "treatment"):
-            return value
-        return value + HOSTILE + "$\\frac$"
+    def hostile(value):
+        return poisoned(value, HOSTILE + "$\\frac$")
 
     poisonous = replace(
-        poisoned(findings),
+        hostile(findings),
         settings={HOSTILE: HOSTILE},
         measurements={HOSTILE: {HOSTILE: {HOSTILE: 1.0}}},
     )
     folder = tmp_path_factory.mktemp("hostile")
-    written = quickly(folder, poisonous, path, poisoned(LINE), poisoned(PROVENANCE))
+    written = quickly(folder, poisonous, path, hostile(LINE), hostile(PROVENANCE))
     return written[0].read_text(encoding="utf-8")
 
 
