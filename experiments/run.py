@@ -25,7 +25,7 @@ from experiments.runner.jobs.folder import FailedRunError, nothing_empty
 from experiments.runner.jobs.interruption import interruptible
 from experiments.runner.jobs.request import Request
 from experiments.runner.plugins import FailedSweepError, register_plugins
-from experiments.runner.tracking.beside import Uploader
+from experiments.runner.tracking.beside import logging_beside
 from mvest.errors import MvestError
 
 __all__ = ["main"]
@@ -98,13 +98,13 @@ def run_alone(config: DictConfig) -> None:
             require_admissible(request.values)
             print(plan.summary(), plan.listing(), sep="\n")
             return
-        with Uploader(request.values) as uploader:
+        with logging_beside(request.values) as track:
             try:
                 run_job(request)
             except FailedRunError:
-                uploader.track(request.folder)
+                track(request.folder)
                 raise
-            uploader.track(request.folder)
+            track(request.folder)
 
 
 def explain(error: BaseException) -> str:

@@ -95,7 +95,7 @@ class ConsideredGeometry:
     renewals : int
         How often, at most, all is estimated anew about the geometry that the last estimate expects:
         with it, what is not known of the geometry is of first order about there, and not about what
-        was seen. Each costs somewhat more than the estimate.
+        was seen. Each costs somewhat less than the estimate.
     """
 
     shape_mm: float = 0.3

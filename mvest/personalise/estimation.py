@@ -278,7 +278,7 @@ class CaseEstimation:
 
         z = filtered.transformed.mean
         H = filtered.prediction.jacobian * self.transform.derivative(z)
-        end, residual = posterior.next(z, observation.y - filtered.prediction.y, H)
+        end, residual = posterior.stepped(z, observation.y - filtered.prediction.y, H)
         modes = place.errors.expected_modes(residual, filtered.learned, considered)
         begin = self.transform.forward(place.m)
         was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)

@@ -83,7 +83,7 @@ class JointPosterior:
         seen = predict(self.observation.of(lambda _: prediction), m)
         return self.improbability(self.transform.forward(m), self.observation.y - seen.y, modes)
 
-    def next(
+    def stepped(
         self, z: FloatArray, residual: FloatArray, H: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Parameters ``(p,)`` after one more step to their mode, and the residual ``(k,)`` there.

@@ -14,4 +14,6 @@ def composed(*overrides: str) -> DictConfig:
 
 
 def plain(config: DictConfig) -> dict:
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore
+    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    assert isinstance(values, dict)
+    return values

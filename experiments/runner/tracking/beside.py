@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from subprocess import PIPE
-from types import TracebackType
+from subprocess import PIPE, Popen
 from typing import Any
 
 import experiments
@@ -17,66 +17,55 @@ from experiments.runner.tracking.upload import REMEDY, is_due, track_job
 from mvest.errors import MvestError
 from mvest.processes import Program
 
-__all__ = ["Uploader", "main"]
+__all__ = ["logging_beside", "main"]
 
 LOGGING = "experiments.runner.tracking.beside"
 """Module that the other process runs."""
 
 
-class Uploader(AbstractContextManager["Uploader"]):
-    """A process that logs one run once it is on disk; as a context it ends with it.
+@contextmanager
+def logging_beside(config: Mapping[str, Any]) -> Iterator[Callable[[Path], None]]:
+    """What logs the result in a folder as `track_job` does, and waits until that is done.
+
+    Another process does it, which begins here and ends with this context; where the run is not to
+    be logged there is none.
 
     Parameters
     ----------
     config : mapping
-        Of the run; where it is not to be logged, no process is started.
+        Of the run.
     """
+    if not config["tracking"]["enabled"] or config["check"]:
+        yield lambda _: None
+        return
+    places = [str(Path(experiments.__file__).resolve().parents[1]), os.environ.get("PYTHONPATH")]
+    with Program(
+        [sys.executable, "-m", LOGGING],
+        stdin=PIPE,
+        stderr=PIPE,
+        text=True,
+        encoding="utf-8",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
+    ) as program:
+        yield partial(
+            _order, program.process, {name: config[name] for name in ("name", "paths", "tracking")}
+        )
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
-        self._config = {name: config[name] for name in ("name", "paths", "tracking")}
-        self._program: Program | None = None
-        if config["tracking"]["enabled"] and not config["check"]:
-            places = [
-                str(Path(experiments.__file__).resolve().parents[1]),
-                os.environ.get("PYTHONPATH", ""),
-            ]
-            self._program = Program(
-                [sys.executable, "-m", LOGGING],
-                stdin=PIPE,
-                stderr=PIPE,
-                text=True,
-                encoding="utf-8",
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, places))},
-            )
 
-    def track(self, folder: Path) -> None:
-        """Log the result in a folder, as `track_job` does, and wait until that is done."""
-        if self._program is None:
+def _order(process: Popen[str], config: Mapping[str, Any], folder: Path) -> None:
+    try:
+        if not is_due(folder, config):
             return
-        try:
-            if not is_due(folder, self._config):
-                return
-        except MvestError as error:
-            print(f"warning: {error}; {REMEDY}", file=sys.stderr)
-            return
-        process = self._program.process
-        order = {"folder": str(folder), "config": self._config}
-        _, said = process.communicate(json.dumps(order))
-        print(said, end="", file=sys.stderr)
-        if process.returncode:
-            print(
-                f"warning: uploading to MLflow ended with status {process.returncode}; {REMEDY}",
-                file=sys.stderr,
-            )
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._program is not None:
-            self._program.close()
+    except MvestError as error:
+        print(f"warning: {error}; {REMEDY}", file=sys.stderr)
+        return
+    _, said = process.communicate(json.dumps({"folder": str(folder), "config": config}))
+    print(said, end="", file=sys.stderr)
+    if process.returncode:
+        print(
+            f"warning: uploading to MLflow ended with status {process.returncode}; {REMEDY}",
+            file=sys.stderr,
+        )
 
 
 def main() -> int:
