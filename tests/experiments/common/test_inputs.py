@@ -25,6 +25,7 @@ from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.imaging.writing import write_sequence_nrrd
 from mvest.reading.json_file import read_mapping
 from tests.cases.from_images.test_imaged_case import sequence
+from tests.experiments.configured import composed, plain
 from tests.experiments.studies import test_donor
 from tests.external.programs import SPRINGS, springs
 from tests.made_up_closure import made_up_case
@@ -215,7 +216,7 @@ def test_nothing_is_read_that_is_not_in_the_hash(given, monkeypatch, made):
 
 def test_of_a_recording_nothing_is_read_that_is_not_in_the_hash(given):
     recorded.write(given, recorded.skirt())
-    config = test_donor.settings(*test_donor.SMALL, f"donor.recording={given}")
+    config = plain(composed(*test_donor.SMALL, f"donor.recording={given}"))
     with all_digested(given):
         first = hash_of(config)
         build_donor(config, build(DonorSettings, config["donor"]))

@@ -21,7 +21,7 @@ from experiments.studies.gate.findings import Findings, Followed, Limits, Row
 from experiments.studies.gate.report import gate_answer, gate_table, gate_words, write_gate
 from mvest.closure.robustness import MAX_LIMIT, MEAN_LIMIT
 from mvest.closure.smoothness import JUMP_LIMIT, SEEN, SIDE_LIMIT, SLOPE_LIMIT
-from tests.experiments.studies.test_gate_study import composed
+from tests.experiments.configured import composed, plain
 from tests.places import CONF
 
 LIMITS = Limits(MEAN_LIMIT, MAX_LIMIT, JUMP_LIMIT, SEEN, SLOPE_LIMIT, SIDE_LIMIT)
@@ -48,7 +48,7 @@ def record_of(values, found):
 
 
 def settings(name, *more):
-    return composed("experiment=gate", f"valve={name}", *more) | {"valve_name": name}
+    return plain(composed("experiment=gate", f"valve={name}", *more)) | {"valve_name": name}
 
 
 @pytest.fixture(scope="module")
