@@ -44,6 +44,8 @@ class RestGeometry:
     ----------
     model : ClosureModel
         Its protocol must end in an equilibrium.
+    seen : ClosureModel, optional
+        The one that it was displaced from, if changes are meant from there.
 
     Raises
     ------
@@ -51,15 +53,13 @@ class RestGeometry:
         If it does not: a valve that still moves has a history, which depends on the geometry too.
     """
 
-    def __init__(self, model: ClosureModel) -> None:
+    def __init__(self, model: ClosureModel, seen: ClosureModel | None = None) -> None:
         if not model.settings.protocol.equilibrium:
             raise InputError("derivatives by the geometry need a closure that ends in equilibrium")
-        self.model = model
-        self.surface = model.valve.surface
+        self.model, self.seen = model, seen or model
+        self.surface, nodes = self.seen.valve.surface, self.seen.mesh.nodes
         self._normals = leaflet_normals(self.surface)
-        self._closest = closest_points(
-            model.mesh.nodes, self.surface.vertices, self.surface.triangles
-        )
+        self._closest = closest_points(nodes, self.surface.vertices, self.surface.triangles)
         self._normal = unit_rows(self._at(self._closest, self._normals))
         self._height, self._nodes = self._feet()
 
@@ -69,7 +69,7 @@ class RestGeometry:
         Feet lie in the plane of the closest triangle, and possibly beyond its sides: with them a
         node is exactly foot plus height times normal, so that it turns as the surface does.
         """
-        surface, nodes, normal = self.surface, self.model.mesh.nodes, self._normal
+        surface, nodes, normal = self.surface, self.seen.mesh.nodes, self._normal
         a, b, c = np.moveaxis(surface.vertices[surface.triangles[self._closest.triangle]], 1, 0)
         across = np.cross(b - a, c - a)
         height = np.sum((nodes - a) * across, axis=1) / np.sum(normal * across, axis=1)
@@ -83,13 +83,13 @@ class RestGeometry:
     @cached_property
     def _samples(self) -> ClosestPoints:
         """Where the samples of contact are on the surface."""
-        points = self.model.contact_valve.surface.vertices
+        points = self.seen.contact_valve.surface.vertices
         return closest_points(points, self.surface.vertices, self.surface.triangles)
 
     @cached_property
     def _sampled(self) -> Embedding:
         """The samples of contact in the mesh."""
-        return embed(self.model.mesh, self.model.contact_valve.surface.vertices)
+        return embed(self.seen.mesh, self.seen.contact_valve.surface.vertices)
 
     @cached_property
     def _patches(self) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -133,7 +133,7 @@ class RestGeometry:
 
     def _ends(self, values: FloatArray) -> FloatArray:
         """Values at the chordae's ends, of those ``(n, ...)`` at the surface's vertices."""
-        own, chordae = self.surface, self.model.valve.chordae
+        own, chordae = self.surface, self.seen.valve.chordae
         return self._at(closest_points(chordae.insertion, own.vertices, own.triangles), values)
 
     def thickness(self, factors: FloatArray) -> RestVariation:
@@ -142,7 +142,7 @@ class RestGeometry:
             (self._height * self._at(self._closest, factor))[:, None] * self._normal
             for factor in factors
         ]
-        own = self.model.contact_valve.surface.thickness
+        own = self.seen.contact_valve.surface.thickness
         thickness = [own * self._at(self._samples, factor) for factor in factors]
         return RestVariation(np.array(nodes), thickness=np.array(thickness))
 
@@ -168,7 +168,8 @@ class RestGeometry:
 
     def rest_lengths(self, changes: FloatArray) -> RestVariation:
         """Of the chordae's rest lengths, by relative changes ``(q, c)``."""
-        return RestVariation(self._still(len(changes)), rest_length=changes)
+        share = self.seen.valve.chordae.rest_length / self.model.valve.chordae.rest_length
+        return RestVariation(self._still(len(changes)), rest_length=changes * share)
 
     def insertions(self, moves: FloatArray) -> RestVariation:
         """Of where the chordae end, by displacements ``(q, c, 3)`` mm at rest."""
@@ -210,10 +211,11 @@ class RestGeometry:
         nodes = shape + thicker
         mesh = replace(model.mesh, nodes=model.mesh.nodes + nodes)
         if "fibres" in own:
-            turned = self.fibres(own["fibres"]).fibre
-            assert turned is not None
-            fibre = mesh.fibre + turned[0]
-            mesh = replace(mesh, fibre=fibre / np.linalg.norm(fibre, axis=2, keepdims=True))
+            angle, normal = parts["fibres"][mesh.region][:, None, None], self._normal[mesh.elements]
+            along = np.sum(normal * mesh.fibre, axis=2, keepdims=True) * normal
+            across = np.cross(normal, mesh.fibre)
+            fibre = along + np.cos(angle) * (mesh.fibre - along) + np.sin(angle) * across
+            mesh = replace(mesh, fibre=fibre)
         ends = self._ends(model.observed(nodes)) + parts.get("insertions", 0.0)
         chordae = replace(
             model.valve.chordae,

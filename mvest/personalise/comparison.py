@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from mvest.cases.case import Frame, Role
 from mvest.observation.surfaces import surface_distance
 from mvest.personalise.estimation import CaseEstimation
-from mvest.personalise.model import held_state
 from mvest.personalise.result import FrameDistance
 from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import RegisteredModel
@@ -53,9 +52,7 @@ def predicted_frames(
     frames = {
         frame.name: points for frame, points in zip(estimation.fitted.frames, shown, strict=True)
     }
-    further = {
-        frame.name: held_state(estimation.model, frame) for frame in estimation.case.held_out
-    }
+    further = estimation.held_out()
     states = list(further.values())
     if states:
         if estimation.frames is not None:

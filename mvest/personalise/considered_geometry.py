@@ -38,6 +38,7 @@ __all__ = [
     "GeometryColumns",
     "GeometryModes",
     "closure_at",
+    "displacement",
     "geometry_columns",
     "geometry_modes",
     "observed_change",
@@ -166,37 +167,20 @@ class GeometryColumns:
     rows: tuple[FloatArray, ...]
     columns: tuple[ErrorColumns, ...]
 
-    def expected(
-        self, noise: ObservationNoise, residual: FloatArray, scales: Mapping[str, float]
-    ) -> tuple[FloatArray, ...]:
-        """Each kind's modes ``(q,)``, most probable where the parameters are as estimated.
-
-        Parameters
-        ----------
-        noise : ObservationNoise
-            Of the observation, with what the geometry adds.
-        residual : (k,)
-            Of the estimate.
-        scales : mapping
-            Kind -> its size as it was learned, 1 where it was not.
-        """
-        white = noise.whiten(residual)
-        return tuple(
-            scales.get(own.name, 1.0) ** 2 * (noise.whiten(rows).T @ white)
-            for own, rows in zip(self.modes, self.rows, strict=True)
-        )
-
     def offset(self, modes: Sequence[FloatArray]) -> FloatArray:
         """What modes ``(q,)`` of each kind do to the observation ``(k,)``."""
         return np.sum([rows @ z for rows, z in zip(self.rows, modes, strict=True)], axis=0)
 
-    def displacement(self, modes: Sequence[FloatArray]) -> dict[str, FloatArray]:
-        """What they do to the geometry, for `RestGeometry.displaced`."""
-        total: dict[str, FloatArray] = {}
-        for own, z in zip(self.modes, modes, strict=True):
-            for part, moves in own.parts.items():
-                total[part] = total.get(part, 0.0) + np.tensordot(z, moves, 1)
-        return total
+
+def displacement(
+    modes: Sequence[GeometryModes], sizes: Sequence[FloatArray]
+) -> dict[str, FloatArray]:
+    """What as much ``(q,)`` of each kind does to a geometry, for `RestGeometry.displaced`."""
+    total: dict[str, FloatArray] = {}
+    for own, z in zip(modes, sizes, strict=True):
+        for part, moves in own.parts.items():
+            total[part] = total.get(part, 0.0) + np.tensordot(z, moves, 1)
+    return total
 
 
 def geometry_columns(
@@ -206,6 +190,7 @@ def geometry_columns(
     noise: ObservationNoise,
     m: FloatArray,
     predicted: FloatArray,
+    seen: ClosureModel | None = None,
 ) -> GeometryColumns | str:
     """Errors of an observation from those of the geometry, one kind after another, or why none.
 
@@ -222,11 +207,13 @@ def geometry_columns(
         Parameters at which the model is linearised.
     predicted : array
         All frames as predicted at ``m``, stacked.
+    seen : ClosureModel, optional
+        Of the valve as it was seen, whose errors these are, if that of ``registered`` is displaced.
     """
     if not modes:
         return GeometryColumns((), (), ())
     model, at, states = closure_at(registered, m)
-    geometry = RestGeometry(model)
+    geometry = RestGeometry(model, seen)
     joined = RestVariation.joined([geometry.variation(own.parts) for own in modes])
     change = geometry.change(at, joined, states, TOLERANCE)
     if isinstance(change, str):

@@ -23,10 +23,12 @@ from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.wrappers import SharedStart, of_some
+from mvest.mechanics.valve_system import HeldState
+from mvest.personalise.considered_geometry import displacement
 from mvest.personalise.fitted_frames import FittedFrames
 from mvest.personalise.geometry_errors import WeighedObservation
 from mvest.personalise.joint import JointPosterior
-from mvest.personalise.model import build_model, frames_model, with_pressures
+from mvest.personalise.model import build_model, frames_model, held_state, with_pressures
 from mvest.personalise.observation_errors import ObservationErrors
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.estimate import StudyResult, estimate
@@ -49,8 +51,7 @@ AS_PROMISED = 0.75
 """Part of the gain that a first order promises with which a step is good enough."""
 
 SETTLED = 0.25
-"""Standard deviations of a modulus; a step towards that geometry that moves none by as much is the
-last."""
+"""Standard deviations of a modulus within which an estimate is where the geometry is linearised."""
 
 OnStep = Callable[[float, int], None]
 
@@ -63,6 +64,7 @@ class _CaseClosure:
     frames: FramesModel | None
     registered: RegisteredModel
     shared: SharedStart[ClosedState]
+    displacement: Mapping[str, FloatArray]
 
     @classmethod
     def of(
@@ -71,9 +73,10 @@ class _CaseClosure:
         frames: FramesModel | None,
         names: tuple[str, ...],
         start: FloatArray,
+        displacement: Mapping[str, FloatArray] | None = None,
     ) -> _CaseClosure:
         registered = RegisteredModel(frames or model, names)
-        return cls(model, frames, registered, SharedStart(registered, start))
+        return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
 
     def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> _CaseClosure:
         """Of the valve with another geometry, see `RestGeometry.displaced`.
@@ -82,16 +85,9 @@ class _CaseClosure:
         """
         model, frames = RestGeometry(self.model).displaced(parts), self.frames
         if frames is not None:
-            states = {
-                name: replace(
-                    state,
-                    annulus=state.annulus + parts.get("annulus", 0.0),
-                    papillary_tips=state.papillary_tips + parts.get("tips", 0.0),
-                )
-                for name, state in frames.states.items()
-            }
+            states = {name: _moved(state, parts) for name, state in frames.states.items()}
             frames = replace(frames, model=model, states=states)
-        return self.of(model, frames, self.registered.names, start)
+        return self.of(model, frames, self.registered.names, start, parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,8 +106,8 @@ class CaseEstimation:
     Attributes
     ----------
     moved : float or None
-        Standard deviations by which the last renewed linearisation of the geometry moved a modulus
-        at most; None without one.
+        Standard deviations of a modulus, at most, by which the estimate about the last renewed
+        linearisation of the geometry is away from there; None without one.
     """
 
     def __init__(
@@ -227,19 +223,25 @@ class CaseEstimation:
             before = result or self._estimate_about(place, final=False)
             found = self._nearer(before, place)
             if found is place:
-                self.moved = _standard_deviations(self.transform.forward(place.m), before)
+                self.moved = self._step(before, place)
                 break
             renewed = found if isinstance(found, str) else self._renewed(found)
             if isinstance(found, str) or isinstance(renewed, str):
                 self._use(place)
                 self.errors.unconsidered += (f"about the geometry that is expected: {renewed}",)
                 break
-            assert before.filtered is not None
-            self.moved = _standard_deviations(before.filtered.transformed.mean, renewed)
             place, result = found, renewed
+            self.moved = self._step(renewed, place)
             if self.moved < SETTLED:
                 break
         return place
+
+    def _step(self, result: StudyResult, place: _Place) -> float:
+        """Standard deviations of a modulus, at most, from a place to the estimate about it."""
+        assert result.filtered is not None
+        found, z = result.filtered.transformed, self.transform.forward(place.m)
+        moduli = [name.startswith("E_f.") for name in result.filtered.names]
+        return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
 
     def _renewed(self, place: _Place) -> StudyResult | str:
         """A rough estimate about a place, with its closure and errors, or why there is none."""
@@ -279,7 +281,7 @@ class CaseEstimation:
         z = filtered.transformed.mean
         H = filtered.prediction.jacobian * self.transform.derivative(z)
         end, residual = posterior.stepped(z, observation.y - filtered.prediction.y, H)
-        modes = place.errors.expected_modes(residual, filtered.learned, considered)
+        modes = posterior.expected(residual)
         begin = self.transform.forward(place.m)
         was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
         here = improbability(place)
@@ -314,15 +316,16 @@ class CaseEstimation:
 
         It is closed at ``m (p,)``, and from there with what fits best to this geometry.
         """
-        assert posterior.errors.known is not None
+        known = posterior.errors.known
+        assert known is not None
         try:
-            closure = self._stated.displaced(posterior.errors.known.displacement(modes), m)
+            closure = self._stated.displaced(displacement(known.modes, modes), m)
         except GeometryError as error:  # a leaflet without thickness, a mesh that is torn
             return str(error)
         first = closure.shared(m)
         if not first.converged:
             return first.reason
-        errors = self.errors.about(closure.registered, modes)
+        errors = self.errors.about(closure.registered, modes, self._stated.model)
         better = posterior.refitted(m, first)
         again = predict(closure.shared, better)
         found = [_Place(closure, errors, m, first)]
@@ -347,6 +350,13 @@ class CaseEstimation:
     def frames(self) -> FramesModel | None:
         """All closed frames that are fitted, if they are several."""
         return self._closure.frames
+
+    def held_out(self) -> dict[str, HeldState]:
+        """The loads of frames that are not fitted, their annulus and tips off as those fitted."""
+        return {
+            frame.name: _moved(held_state(self._stated.model, frame), self._closure.displacement)
+            for frame in self.case.held_out
+        }
 
     @property
     def registered(self) -> RegisteredModel:
@@ -429,17 +439,10 @@ class CaseEstimation:
         return replace(posterior, covariance=covariance)
 
 
-def _standard_deviations(z: FloatArray, after: StudyResult) -> float:
-    """By how many of its standard deviations an estimate's modulus differs at most from ``z``.
-
-    Parameters
-    ----------
-    z : (p,)
-        Filter coordinates.
-    after : StudyResult
-        With an estimate.
-    """
-    assert after.filtered is not None
-    found = after.filtered.transformed
-    moduli = [name.startswith("E_f.") for name in after.filtered.names]
-    return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
+def _moved(state: HeldState, parts: Mapping[str, FloatArray]) -> HeldState:
+    """A state whose annulus and tips are displaced, as those of the closed valve are."""
+    return replace(
+        state,
+        annulus=state.annulus + parts.get("annulus", 0.0),
+        papillary_tips=state.papillary_tips + parts.get("tips", 0.0),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import ObservationNoise
+from mvest.estimation.noise import ObservationNoise, low_rank_noise
 from mvest.estimation.prediction import Prediction, predict
 from mvest.estimation.transform import Transform
 from mvest.estimation.update import kalman_update
@@ -55,6 +55,32 @@ class JointPosterior:
         assert self.errors.known is not None
         kinds = [own.name for own in self.errors.known.modes]
         return self.errors.noise(self.learned, without=kinds, beside=self.considered)
+
+    @cached_property
+    def marginal(self) -> ObservationNoise:
+        """Of the observation, with what all modes of the geometry add to it."""
+        return low_rank_noise(self.noise, np.concatenate(self._sized, axis=1))
+
+    @cached_property
+    def _sized(self) -> tuple[FloatArray, ...]:
+        """The observation by modes of unit variance, of each kind ``(k, q)``."""
+        assert self.errors.known is not None
+        sizes = self.errors.sizes(self.learned)
+        return tuple(s * rows for s, rows in zip(sizes, self.errors.known.rows, strict=True))
+
+    def expected(self, residual: FloatArray) -> tuple[FloatArray, ...]:
+        """Most probable modes ``(q,)`` of each kind, where the parameters are as estimated.
+
+        Parameters
+        ----------
+        residual : (k,)
+            Of the estimate, from a geometry as it was seen.
+        """
+        white = self.marginal.whiten(residual)
+        return tuple(
+            s * (self.marginal.whiten(rows).T @ white)
+            for s, rows in zip(self.errors.sizes(self.learned), self._sized, strict=True)
+        )
 
     def improbability(
         self, z: FloatArray, residual: FloatArray, modes: tuple[FloatArray, ...]
@@ -102,10 +128,9 @@ class JointPosterior:
         """
         free, away = self.estimated, z - self.prior.mean
         prior = Gaussian(self.prior.mean[free], self.prior.covariance[np.ix_(free, free)])
-        noise = self.errors.noise(self.learned, beside=self.considered)
         innovation = residual + H[:, free] @ away[free]
         end = np.array(z)
-        end[free] = kalman_update(prior, innovation, H[:, free], noise).posterior.mean
+        end[free] = kalman_update(prior, innovation, H[:, free], self.marginal).posterior.mean
         return end, residual - H @ (end - z)
 
     def refitted(self, m: FloatArray, prediction: Prediction) -> FloatArray:

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from mvest.cases.case import Role
+from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError
 from mvest.estimation.evidence import LearnedNoise
 from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
@@ -66,6 +67,8 @@ class ObservationErrors:
         What is not known of the geometry as it was seen, once it was asked for.
     displaced_by : tuple of (q,)
         Modes of each kind by which the geometry of the model is displaced; empty: it is as seen.
+    seen : ClosureModel or None
+        The closure of the valve as it was seen, if it is displaced.
     """
 
     def __init__(
@@ -74,9 +77,11 @@ class ObservationErrors:
         registered: RegisteredModel,
         geometry_modes: tuple[GeometryModes, ...] | None = None,
         displaced_by: tuple[FloatArray, ...] = (),
+        seen: ClosureModel | None = None,
     ) -> None:
         self.fitted, self.registered = fitted, registered
         self.geometry_modes, self.displaced_by = geometry_modes, displaced_by
+        self.seen = seen
         self.geometry: GeometryErrors | None = None
         self.samples: SampledErrors | None = None
         self.considered: tuple[ErrorColumns, ...] = ()
@@ -123,7 +128,13 @@ class ObservationErrors:
                 )
             noise = self.noise(without=self.kinds)
             geometry = geometry_columns(
-                self.geometry_modes, self.registered, observation, noise, m, predicted
+                self.geometry_modes,
+                self.registered,
+                observation,
+                noise,
+                m,
+                predicted,
+                self.seen,
             )
             found.append(geometry if isinstance(geometry, str) else geometry.columns)
             self.known = None if isinstance(geometry, str) else geometry
@@ -241,7 +252,10 @@ class ObservationErrors:
         )
 
     def about(
-        self, registered: RegisteredModel, displaced_by: tuple[FloatArray, ...] = ()
+        self,
+        registered: RegisteredModel,
+        displaced_by: tuple[FloatArray, ...] = (),
+        seen: ClosureModel | None = None,
     ) -> ObservationErrors:
         """The same errors, of which nothing is found out, about a valve with another geometry.
 
@@ -251,8 +265,10 @@ class ObservationErrors:
             Of that valve.
         displaced_by : tuple of (q,)
             Modes of each kind by which it differs from the one that was seen.
+        seen : ClosureModel, optional
+            The closure of the one that was seen, if it does.
         """
-        return ObservationErrors(self.fitted, registered, self.geometry_modes, displaced_by)
+        return ObservationErrors(self.fitted, registered, self.geometry_modes, displaced_by, seen)
 
     def as_stated(self, registered: RegisteredModel) -> ObservationErrors:
         """The same where geometry and law are known: error samples of the frames remain.
@@ -276,24 +292,6 @@ class ObservationErrors:
         log = (family.prior if learned is None else learned.posterior).mean[: len(family.names)]
         sizes = np.exp(log[-len(family.columns) :]).tolist()
         return {own.name: size for own, size in zip(family.columns, sizes, strict=True)}
-
-    def expected_modes(
-        self, residual: FloatArray, learned: LearnedNoise | None, beside: FloatArray
-    ) -> tuple[FloatArray, ...]:
-        """Most probable errors of the geometry ``(q,)``, kind after kind, at an estimate.
-
-        Parameters
-        ----------
-        residual : (k,)
-            Of the estimate, as `observation` has it.
-        learned : LearnedNoise or None
-            As it was learned with the estimate.
-        beside : (k, q)
-            Columns of parameters that are considered.
-        """
-        assert self.known is not None
-        noise = self.noise(learned, beside=beside)
-        return self.known.expected(noise, residual, self._learned_sizes(learned))
 
     def sizes(self, learned: LearnedNoise | None) -> tuple[float, ...]:
         """Factor on each kind of the geometry's modes, where it is learned."""

@@ -80,8 +80,8 @@ class Personalised:
     budget : tuple of BudgetRow
         What each part of what is not known costs the moduli, where error samples are given.
     moved : float or None
-        Standard deviations by which a modulus moved at most when geometry and moduli were
-        linearised anew for the last time; None where they were not.
+        Standard deviations of a modulus, at most, by which the estimate is away from where geometry
+        and moduli were linearised anew for the last time; None where they were not.
     """
 
     case: ValveCase

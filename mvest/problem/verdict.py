@@ -136,8 +136,8 @@ class Indications:
     gate : bool or None
         Whether the valve has passed the gate (:mod:`mvest.closure.robustness`); None: not asked.
     moved : float or None
-        Standard deviations by which a modulus moved at most when what is not known of the geometry
-        was linearised anew at what is expected of it.
+        Standard deviations of a modulus, at most, by which the estimate is away from where what is
+        not known of the geometry was linearised last.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
     unlike : str
@@ -172,8 +172,8 @@ APPROXIMATION = 2.0
 The check is of the worst direction among all unknowns: moduli lay inside their intervals where it
 failed by less."""
 MOVED = 0.5
-"""Standard deviations by which the last renewed linearisation of the geometry may move a modulus:
-twice what is taken for the end of such steps; by as much again the estimate may still be off."""
+"""Standard deviations of a modulus by which an estimate may be away from where the geometry was
+linearised last: twice what is taken for the end of such steps."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
@@ -263,8 +263,8 @@ def _linear(e: Indications) -> Seen:
         yield Ground(
             "geometry",
             DOUBTFUL,
-            f"a modulus moved by {e.moved:.2f} of its standard deviations when the geometry was "
-            f"linearised anew at what is expected of it, expected at most {MOVED:g}",
+            f"a modulus is {e.moved:.2f} of its standard deviations from where the geometry was "
+            f"linearised last, expected at most {MOVED:g}",
             "allow more such steps (personal.considered_geometry.renewals), or see the open "
             "shape, annulus and tips better",
         )

@@ -92,7 +92,7 @@ def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
     )
 
     class Rest:
-        def __init__(self, model):
+        def __init__(self, model, seen):
             pass
 
         def variation(self, parts):
