@@ -54,7 +54,7 @@ CASES = {
     "no estimate": ({"estimated": False, "ended": "it did not close"}, NONE, "it did not close"),
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
-    "not linear": ({"moved": 1.1 * MOVED}, DOUBTFUL, "is 0.55 of its standard deviations from where"),
+    "not linear": ({"moved": 1.1 * MOVED}, DOUBTFUL, "is 0.55 of its standard deviations from"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
     "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),

@@ -120,6 +120,7 @@ def table3(records: Sequence[Record[Findings]]) -> pd.DataFrame:
         for distance in record.findings.case.distances:
             plain: dict[str, Any] = {
                 "patient": _patient(record),
+                "verdict": verdict_word(record.findings.case),
                 "frame": distance.frame,
                 "shown to the filter": distance.seen,
             }
@@ -218,6 +219,7 @@ def _readable3(table: pd.DataFrame) -> list[dict[str, str]]:
         rows.append(
             {
                 "patient (simulated)": _words(row["patient"]),
+                "verdict": row["verdict"],
                 "frame": frame,
                 **{f"{which} [mm]": _mean_and_sd(row, which) for which in WHICH},
                 "closer": f"{row['closer [%]']:.0f} %",
@@ -321,6 +323,15 @@ def distance_words(table: pd.DataFrame) -> list[str]:
         out.append(
             f"On the mean of the frames that it was not shown: closer than generic for "
             f"{patients} of {len(mean)} patients, than the rigidly laid one for {nearer}."
+        )
+        by_verdict = [
+            f"{verdict} {int((group['closer [%]'] > 0).sum())} of {len(group)}, by "
+            f"{group['closer [%]'].mean():.0f} %"
+            for verdict, group in held.groupby("verdict")
+        ]
+        out.append(
+            "Of the frames that it was not shown, closer than generic by the verdict on the "
+            f"estimate: {'; '.join(by_verdict)} on average."
         )
     columns = [f"{which} to the truth [mm]" for which in WHICH]
     if table[columns].notna().all(axis=None):

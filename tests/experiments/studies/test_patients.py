@@ -156,6 +156,9 @@ def test_moduli_whose_verdict_is_none_are_not_stated(tmp_path):
     text = (tmp_path / "table2.md").read_text(encoding="utf-8")
     row = next(line for line in text.splitlines() if line.startswith("| prolapse"))
     assert row.startswith("| prolapse | none | 6 | none |")
+    third = (tmp_path / "table3.md").read_text(encoding="utf-8")
+    assert third.count("| prolapse | none |") == third.count("| trustworthy |") == 2
+    assert "none 1 of 1, by 20 %; trustworthy 1 of 1, by 20 % on average." in third
     assert "contains the truth for 2 of 2 moduli" in text
     assert "For 1 of 2 the verdict is that there is no estimate (prolapse)" in text
     write_population_tables(tmp_path, [trusted, refused])
