@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,13 @@ import numpy as np
 from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosedState, ClosureModel
-from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
 from mvest.estimation.estimate import Estimate, Filter, OnIterate
 from mvest.estimation.filters.considered import SchmidtFilter
 from mvest.estimation.filters.iterated import IteratedFilter
 from mvest.estimation.filters.paper import PaperFilter
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.prediction import Prediction, predict
+from mvest.estimation.prediction import predict
 from mvest.estimation.sampled import SampledPosterior
 from mvest.estimation.transform import Log, to_filter
 from mvest.estimation.wrappers import SharedStart, of_some
@@ -27,9 +26,10 @@ from mvest.mechanics.valve_system import HeldState
 from mvest.personalise.considered_geometry import displacement
 from mvest.personalise.fitted_frames import FittedFrames
 from mvest.personalise.geometry_errors import WeighedObservation
-from mvest.personalise.joint import JointPosterior
+from mvest.personalise.joint import JointPosterior, damped_step
 from mvest.personalise.model import build_model, frames_model, held_state, with_pressures
 from mvest.personalise.observation_errors import ObservationErrors
+from mvest.personalise.places import CaseClosure, Place
 from mvest.personalise.settings import PaperSettings, PersonaliseSettings, Treatment
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.problem import Observed, Problem
@@ -44,60 +44,10 @@ ROUGH = 0.05
 LEARNED = 4
 """Iterates at which errors are learned beside what is considered, from an estimate without it."""
 
-TRIALS = 4
-"""Of how far a step towards the geometry that is expected is gone."""
-
-AS_PROMISED = 0.75
-"""Part of the gain that a first order promises with which a step is good enough."""
-
 SETTLED = 0.25
 """Standard deviations of a modulus within which an estimate is where the geometry is linearised."""
 
 OnStep = Callable[[float, int], None]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _CaseClosure:
-    """The closure of a case's valve, in the forms in which the parts of an estimation take it."""
-
-    model: ClosureModel
-    frames: FramesModel | None
-    registered: RegisteredModel
-    shared: SharedStart[ClosedState]
-    displacement: Mapping[str, FloatArray]
-
-    @classmethod
-    def of(
-        cls,
-        model: ClosureModel,
-        frames: FramesModel | None,
-        names: tuple[str, ...],
-        start: FloatArray,
-        displacement: Mapping[str, FloatArray] | None = None,
-    ) -> _CaseClosure:
-        registered = RegisteredModel(frames or model, names)
-        return cls(model, frames, registered, SharedStart(registered, start), displacement or {})
-
-    def displaced(self, parts: Mapping[str, FloatArray], start: FloatArray) -> _CaseClosure:
-        """Of the valve with another geometry, see `RestGeometry.displaced`.
-
-        All closed frames have the same errors of annulus and tips, as their derivatives say.
-        """
-        model, frames = RestGeometry(self.model).displaced(parts), self.frames
-        if frames is not None:
-            states = {name: _moved(state, parts) for name, state in frames.states.items()}
-            frames = replace(frames, model=model, states=states)
-        return self.of(model, frames, self.registered.names, start, parts)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Place:
-    """Moduli and geometry at which a valve was closed, and about which errors are linearised."""
-
-    closure: _CaseClosure
-    errors: ObservationErrors
-    m: FloatArray
-    prediction: Prediction
 
 
 class CaseEstimation:
@@ -144,7 +94,7 @@ class CaseEstimation:
         self.transform = Log(tuple(u.is_positive for u in self.unknowns))
         start = self.transform.inverse(self.transform.forward(self.prior.mean))
         several = frames_model(case, settings, model)
-        self._stated = _CaseClosure.of(model, several, self.names, start)
+        self._stated = CaseClosure.of(model, several, self.names, start)
         self._closure = self._stated
         self._held = tuple(u.name for u in free if u.treatment is Treatment.CONSIDERED)
         self.estimated = np.array([name not in self._held for name in self.names])
@@ -197,7 +147,7 @@ class CaseEstimation:
             self.errors.unconsidered = (prediction.reason,)
             return rough
         self.errors.consider(at, prediction.y)
-        place = _Place(self._closure, self.errors, at, prediction)
+        place = Place(self._closure, self.errors, at, prediction)
         if self.errors.samples is not None:
             # They say what is likely of the geometry; nothing is expected of it.
             self.errors.sample_geometry(at, prediction.y)
@@ -205,13 +155,13 @@ class CaseEstimation:
             place = self._expected(place)
         return replace(self._estimate_about(place), seconds=time.perf_counter() - began)
 
-    def _estimate_about(self, place: _Place, *, final: bool = True) -> StudyResult:
+    def _estimate_about(self, place: Place, *, final: bool = True) -> StudyResult:
         """All unknowns from ``place`` on, where closure and errors are linearised."""
         tolerance = self.settings.tolerance if final else max(ROUGH, self.settings.tolerance)
         filter_ = self._filter(tolerance, tuple(place.m.tolist()), final=final)
         return self.estimate(filter_, self.errors.observation())
 
-    def _expected(self, place: _Place) -> _Place:
+    def _expected(self, place: Place) -> Place:
         """Where estimate and geometry are expected: from now on all is linearised there.
 
         Steps of Gauss and Newton for parameters and geometry together: the closure is that of a
@@ -236,14 +186,14 @@ class CaseEstimation:
                 break
         return place
 
-    def _step(self, result: StudyResult, place: _Place) -> float:
+    def _step(self, result: StudyResult, place: Place) -> float:
         """Standard deviations of a modulus, at most, from a place to the estimate about it."""
         assert result.filtered is not None
         found, z = result.filtered.transformed, self.transform.forward(place.m)
         moduli = [name.startswith("E_f.") for name in result.filtered.names]
         return float(np.max(np.abs(found.mean - z)[moduli] / found.std[moduli]))
 
-    def _renewed(self, place: _Place) -> StudyResult | str:
+    def _renewed(self, place: Place) -> StudyResult | str:
         """A rough estimate about a place, with its closure and errors, or why there is none."""
         self._use(place)
         self.errors.consider(place.m, place.prediction.y)
@@ -252,12 +202,10 @@ class CaseEstimation:
         result = self._estimate_about(place, final=False)
         return f"{result.reason} ({result.detail})" if result.estimate is None else result
 
-    def _nearer(self, result: StudyResult, place: _Place) -> _Place | str:
+    def _nearer(self, result: StudyResult, place: Place) -> Place | str:
         """Where estimate and expected geometry are more probable than at ``place``, or why nowhere.
 
-        On the way from ``place`` to them: all of it where the first order on which they rest
-        reaches as far, otherwise as far as a parabola through what is found has it, so that steps
-        across a curved valley do not go to and fro. ``place`` itself, if it is as good as they are.
+        On the way from ``place`` to them (`damped_step`); ``place`` itself, if it is as good.
         """
         filtered, observation, known = result.filtered, result.observation, place.errors.known
         if filtered is None or filtered.prediction is None or observation is None or known is None:
@@ -274,7 +222,7 @@ class CaseEstimation:
             considered,
         )
 
-        def improbability(there: _Place) -> float:
+        def improbability(there: Place) -> float:
             modes = there.errors.displaced_by
             return posterior.improbability_of(there.m, there.prediction, modes)
 
@@ -286,32 +234,24 @@ class CaseEstimation:
         was = place.errors.displaced_by or tuple(np.zeros_like(one) for one in modes)
         here = improbability(place)
         promised = here - posterior.improbability(end, residual - known.offset(modes), modes)
-        best, lowest, share, why = None, here, 1.0, ""
-        for _ in range(TRIALS):
+
+        def trial(share: float) -> tuple[float, Place] | str:
             there = self._displaced(
                 tuple(a + share * (b - a) for a, b in zip(was, modes, strict=True)),
                 self.transform.inverse(begin + share * (end - begin)),
                 posterior,
             )
-            if isinstance(there, str):
-                why, share = there, 0.5 * share
-                continue
-            value = improbability(there)
-            if value < lowest:
-                best, lowest = there, value
-            if promised <= 0.0 or here - value > AS_PROMISED * share * (2.0 - share) * promised:
-                break
-            # Positive: the gain is at most three quarters of what is promised.
-            curvature = (value - here + 2.0 * share * promised) / share**2
-            share = float(np.clip(promised / curvature, 0.2 * share, 0.8 * share))
-        if best is None and not why and promised < SETTLED**2:
+            return there if isinstance(there, str) else (improbability(there), there)
+
+        found = damped_step(trial, here, promised)
+        if found == "" and promised < SETTLED**2:
             # To first order a gain is the square of a distance in standard deviations.
             return place
-        return best or why or "no step to it makes what was seen more probable"
+        return found or "no step to it makes what was seen more probable"
 
     def _displaced(
         self, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior
-    ) -> _Place | str:
+    ) -> Place | str:
         """The valve with a geometry displaced by modes, or why it does not close.
 
         It is closed at ``m (p,)``, and from there with what fits best to this geometry.
@@ -328,9 +268,9 @@ class CaseEstimation:
         errors = self.errors.about(closure.registered, modes, self._stated.model)
         better = posterior.refitted(m, first)
         again = predict(closure.shared, better)
-        found = [_Place(closure, errors, m, first)]
+        found = [Place(closure, errors, m, first)]
         if again.converged:
-            found.append(_Place(closure, errors, better, again))
+            found.append(Place(closure, errors, better, again))
         return min(found, key=lambda one: posterior.improbability_of(one.m, one.prediction, modes))
 
     def take_as_stated(self) -> None:
@@ -338,7 +278,7 @@ class CaseEstimation:
         self._closure = self._stated
         self.errors = self.errors.as_stated(self.registered)
 
-    def _use(self, place: _Place) -> None:
+    def _use(self, place: Place) -> None:
         self._closure, self.errors = place.closure, place.errors
 
     @property
@@ -354,7 +294,7 @@ class CaseEstimation:
     def held_out(self) -> dict[str, HeldState]:
         """The loads of frames that are not fitted, their annulus and tips off as those fitted."""
         return {
-            frame.name: _moved(held_state(self._stated.model, frame), self._closure.displacement)
+            frame.name: self._closure.held(held_state(self._stated.model, frame))
             for frame in self.case.held_out
         }
 
@@ -437,12 +377,3 @@ class CaseEstimation:
         covariance = np.array(posterior.covariance)
         covariance[np.ix_(estimated, estimated)] += learned.covariance
         return replace(posterior, covariance=covariance)
-
-
-def _moved(state: HeldState, parts: Mapping[str, FloatArray]) -> HeldState:
-    """A state whose annulus and tips are displaced, as those of the closed valve are."""
-    return replace(
-        state,
-        annulus=state.annulus + parts.get("annulus", 0.0),
-        papillary_tips=state.papillary_tips + parts.get("tips", 0.0),
-    )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,7 +19,15 @@ from mvest.personalise.observation_errors import ObservationErrors
 from mvest.problem.problem import Observed
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["JointPosterior"]
+__all__ = ["JointPosterior", "damped_step"]
+
+T = TypeVar("T")
+
+TRIALS = 4
+"""Of how far a step towards the geometry that is expected is gone."""
+
+AS_PROMISED = 0.75
+"""Part of the gain that a first order promises with which a step is good enough."""
 
 
 @dataclass(frozen=True)
@@ -151,3 +161,40 @@ class JointPosterior:
         slope -= precision @ (z - self.prior.mean)[free]
         z[free] += np.linalg.solve(H.T @ H + precision, slope)
         return self.transform.inverse(z)
+
+
+def damped_step(
+    trial: Callable[[float], tuple[float, T] | str], here: float, promised: float
+) -> T | str:
+    """What is most probable on the way of a step of Gauss and Newton, or why there is nothing.
+
+    All of the way where the first order on which it rests reaches as far, otherwise as far as a
+    parabola through what is found has it, so that steps across a curved valley do not go to and
+    fro. Empty if all of it could be tried and nothing was more probable than where it begins.
+
+    Parameters
+    ----------
+    trial : callable
+        Share of the way -> twice the negative logarithm of the density there and what is there, or
+        why there is nothing.
+    here : float
+        The same where it begins.
+    promised : float
+        By how much it falls on all of the way, to first order.
+    """
+    best: T | None = None
+    lowest, share, why = here, 1.0, ""
+    for _ in range(TRIALS):
+        found = trial(share)
+        if isinstance(found, str):
+            why, share = found, 0.5 * share
+            continue
+        value, there = found
+        if value < lowest:
+            best, lowest = there, value
+        if promised <= 0.0 or here - value > AS_PROMISED * share * (2.0 - share) * promised:
+            break
+        # Positive: the gain is at most three quarters of what is promised.
+        curvature = (value - here + 2.0 * share * promised) / share**2
+        share = float(np.clip(promised / curvature, 0.2 * share, 0.8 * share))
+    return why if best is None else best

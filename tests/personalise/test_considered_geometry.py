@@ -33,8 +33,9 @@ from mvest.personalise.considered_geometry import (
     rest_lengths_by_tips,
     smooth_modes,
 )
-from mvest.personalise.estimation import SETTLED, CaseEstimation, _CaseClosure
+from mvest.personalise.estimation import SETTLED, CaseEstimation
 from mvest.personalise.indications import indications_of
+from mvest.personalise.places import CaseClosure
 from mvest.problem.registration import REGISTRATION, RegisteredModel
 from mvest.problem.verdict import MOVED
 from tests.cases.test_uncertainty import corresponding
@@ -282,7 +283,7 @@ def bent_case(monkeypatch, curve, std):
         return GeometryColumns((MODE,), (slope,), (ErrorColumns(MODE.name, slope),))
 
     monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
-    monkeypatch.setattr("mvest.personalise.estimation.RestGeometry", BentGeometry)
+    monkeypatch.setattr("mvest.personalise.places.RestGeometry", BentGeometry)
     straight = made_up_case(std, displaced=False)
     closed = straight.frame(Role.CLOSED)
     frame = replace(closed, vertices=bent(closed.vertices.ravel(), 0.6).reshape(-1, 3))
@@ -424,7 +425,7 @@ def test_all_closed_frames_are_displaced_as_their_derivatives_say():
     motion = model.contact_valve.motion
     state = HeldState(0.3, motion.annulus[-1], motion.papillary_tips[-1])
     frames = FramesModel(model, "closed", {"early": state}, 1.0)
-    closure = _CaseClosure.of(model, frames, model.names, AT)
+    closure = CaseClosure.of(model, frames, model.names, AT)
     rng = np.random.default_rng(2)
     parts = {
         "annulus": np.broadcast_to(rng.normal(0.0, 0.02, 3), motion.annulus[-1].shape),
@@ -498,7 +499,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
         return GeometryColumns((MODE,), (BENT[:, None],), (ErrorColumns(MODE.name, BENT[:, None]),))
 
     monkeypatch.setattr("mvest.personalise.observation_errors.geometry_columns", columns)
-    monkeypatch.setattr("mvest.personalise.estimation.RestGeometry", Torn)
+    monkeypatch.setattr("mvest.personalise.places.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
         personalise_case(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))

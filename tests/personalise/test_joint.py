@@ -8,7 +8,7 @@ from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.noise import low_rank_noise, observation_noise
 from mvest.estimation.transform import Log
 from mvest.personalise.considered_geometry import GeometryColumns, GeometryModes
-from mvest.personalise.joint import JointPosterior
+from mvest.personalise.joint import JointPosterior, damped_step
 
 K, Q, SIZE = 40, 6, 4.0
 """Observations, modes of the geometry, and how much larger these are learned to be."""
@@ -47,3 +47,23 @@ def test_a_step_of_parameters_and_modes_is_that_of_least_squares():
     for change in 1e-3 * np.eye(Q):
         moved = (found[0] + change,)
         assert posterior.improbability(end, left - rows @ moved[0], moved) > lowest
+
+
+def test_a_step_is_gone_as_far_as_a_parabola_through_it_falls():
+    asked = []
+
+    def curved(curvature):
+        def trial(share):
+            asked.append(share)
+            return 10.0 - 2.0 * 3.0 * share + curvature * share**2, share
+
+        return trial
+
+    # To first order all of the way gains 3: as promised, or four times as curved.
+    assert damped_step(curved(3.0), 10.0, 3.0) == 1.0
+    assert asked == [1.0]
+    assert damped_step(curved(12.0), 10.0, 3.0) == 0.25
+    # What does not close is left for half of the way; nothing is better, and nothing closes.
+    assert damped_step(lambda s: "torn" if s > 0.6 else (5.0, s), 10.0, 3.0) == 0.5
+    assert damped_step(lambda share: (11.0, share), 10.0, -1.0) == ""
+    assert damped_step(lambda share: "torn", 10.0, 3.0) == "torn"
