@@ -10,15 +10,9 @@ from mvest.mechanics.integrate import simulate
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Step
 from mvest.mechanics.valve_system import boundary_loading
-from tests.benchmark.valves import CELLS, VALUES, Closed, close, closed, parameters
+from tests.benchmark.valves import CELLS, VALUES, Closed, close, closed, farther, parameters
 
 ROUNDS = {"2k": 5, "default": 5, "3k": 5, "7k": 3, "25k": 2}
-
-
-def farther(size):
-    """Moduli that a closed valve is taken on to: by 30 %, or by 10 % where it gets no farther."""
-    factor = 1.1 if size == "25k" else 1.3
-    return VALUES * [factor, 1 / factor]
 
 
 @pytest.fixture(scope="module", params=[f"{e}-{s}" for e, s in CELLS])

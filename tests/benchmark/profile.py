@@ -25,12 +25,9 @@ from mvest.mechanics.solid import Solid
 from mvest.mechanics.solver import PardisoSolver
 from mvest.mechanics.system import System
 from mvest.typing import FloatArray
-from tests.benchmark.valves import VALUES, Closed, closed, model
+from tests.benchmark.valves import VALUES, Closed, closed, farther, model
 
 SIZES = ("default", "25k")
-CLOSURES = {"guided": VALUES, "continued": VALUES * [1.3, 1 / 1.3]}
-"""What is closed, one after another: first from the open valve, then from where that ended."""
-
 PARTS: dict[str, tuple[Callable[..., Any], ...]] = {
     "factorisation": (PardisoSolver.factorize,),
     "solves (GMRES, back-substitution)": (PardisoSolver.solve,),
@@ -69,12 +66,16 @@ def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
     return float(np.median(taken))
 
 
-def shares(valve: ClosureModel) -> list[dict[str, Any]]:
-    """Iterations and seconds of each part of a closure, on the finest mesh and on its guides."""
+def shares(valve: ClosureModel, size: str) -> list[dict[str, Any]]:
+    """Iterations and seconds of each part of a closure, on the finest mesh and on its guides.
+
+    From the open valve first, then from where that ended.
+    """
     assert valve.close(1.01 * VALUES).simulation.converged  # builds the mechanics
     valve.restart(None)
     valve.continuation = True
-    return [{"closure": kind, **_shares(valve, m)} for kind, m in CLOSURES.items()]
+    closures = {"guided": VALUES, "continued": farther(size)}
+    return [{"closure": kind, **_shares(valve, m)} for kind, m in closures.items()]
 
 
 def _shares(valve: ClosureModel, m: FloatArray) -> dict[str, Any]:
@@ -154,7 +155,7 @@ def main(arguments: list[str]) -> None:
     for size in arguments[1:] or SIZES:
         case = closed("hex18", size)  # compiles, and builds what the bounds are measured on
         rows = [row | {"machine": limits[row["bound by"]]} for row in bounds(case)]
-        for entry in shares(model("hex18", size).fresh()):
+        for entry in shares(model("hex18", size).fresh(), size):
             found.append({"size": size, "nodes": case.nodes, **entry, "bounds": rows})
             print(json.dumps({key: found[-1][key] for key in entry}, indent=1))
     Path(arguments[0]).write_text(json.dumps({"profile": found}, indent=2) + "\n", encoding="utf-8")
