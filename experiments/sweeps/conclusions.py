@@ -80,7 +80,7 @@ def _failures(runs: Sequence[Run]) -> list[str]:
     lost = [run for run in runs if not run.converged]
     if not lost:
         return [f"{_count(len(runs), 'run')}, none failed."]
-    counts = Counter(run.reason for run in lost)
+    counts = Counter(run.ended for run in lost)
     reasons = "; ".join(f"{n} × {reason}" for reason, n in counts.most_common())
     whole = sum(run.seed is None for run in lost)
     jobs = f" ({_count(whole, 'job')} left no result at all)" if whole else ""

@@ -18,6 +18,7 @@ from experiments.common.records.estimates import SeedRun, Spread
 from experiments.common.records.record import HASH_DIGITS
 from experiments.common.records.report import bracketed_unit
 from experiments.sweeps.collected import Cost, Sweep, SweepJob
+from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -92,6 +93,12 @@ class Run:
     forward_solves: int | None
     iterates: FloatArray
     iterate_std: FloatArray
+
+    @property
+    def ended(self) -> str:
+        """Why it ended, without the numbers of the filter's check."""
+        before, unlike, _ = self.reason.partition(NOT_THE_POSTERIOR)
+        return before + unlike
 
     @property
     def error(self) -> FloatArray:

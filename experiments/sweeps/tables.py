@@ -329,7 +329,7 @@ def _yes(found: Coverage) -> str:
 
 
 def _reasons(runs: Sequence[Run]) -> str:
-    counts = Counter(run.reason for run in runs if not run.converged)
+    counts = Counter(run.ended for run in runs if not run.converged)
     return "; ".join(f"{n} x {reason}" if n > 1 else reason for reason, n in counts.items())
 
 
@@ -338,7 +338,7 @@ def failure_rows(sweep: Sweep) -> list[Reading]:
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs_of(sweep):
         if not run.converged:
-            groups.setdefault((run.job, run.reason), []).append(run)
+            groups.setdefault((run.job, run.ended), []).append(run)
     return [
         {"run": lost[0].row, "seed": _seeds(lost), "reason": reason, "job": job}
         for (job, reason), lost in groups.items()

@@ -19,6 +19,9 @@ from mvest.estimation.transform import Transform, covariance_to_physical
 from mvest.estimation.update import Update
 from mvest.typing import FloatArray
 
+NOT_THE_POSTERIOR = ", but the posterior is not what the filter assumes"
+"""In the reason of a filter whose check fails, before the check's sentence."""
+
 OnIterate: TypeAlias = Callable[[int, FloatArray, float], None]
 """Called after each iterate with its number, the parameters (p,) and the objective."""
 
@@ -195,10 +198,7 @@ class Estimate:
         """Why the filter stopped, and what is wrong with its posterior if anything is."""
         if self.check is None or self.check.holds:
             return self.reason.value
-        return (
-            f"{self.reason.value}, but the posterior is not what the filter assumes: "
-            f"{self.check.sentence}"
-        )
+        return f"{self.reason.value}{NOT_THE_POSTERIOR}: {self.check.sentence}"
 
     @property
     def iterations(self) -> int:

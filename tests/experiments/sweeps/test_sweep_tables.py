@@ -8,6 +8,7 @@ from experiments.sweeps.conclusions import conclusions, question
 from experiments.sweeps.families import covariance_lines, discrepancies, noise_groups
 from experiments.sweeps.rows import runs_of
 from experiments.sweeps.tables import failure_rows, summary, table_note
+from mvest.estimation.estimate import NOT_THE_POSTERIOR
 from tests.experiments.sweeps.synthetic_sweeps import (
     ALL,
     FAILED,
@@ -78,6 +79,17 @@ def test_noise_conclusions_follow_from_the_numbers() -> None:
     assert said[1] == "It is above that for “correlated, 0.5 mm”."
     assert "smallest coverage is 50 % (correlated, 0.5 mm; anterior)" in said[2]
     assert said[-1] == "2 of 10 runs failed: 2 × no."
+
+
+def test_failures_are_counted_by_their_kind_whatever_their_numbers() -> None:
+    doubts = [f"no rounds left{NOT_THE_POSTERIOR}: {x} above 0.25" for x in (0.31, 0.72)]
+    lost = [failed_run(k, reason) for k, reason in enumerate([*doubts, "no rounds left"], 2)]
+    runs = [run(1, TRUTH, [0.1, 0.1]), *lost]
+    made = sweep("noise", [job({"kind": "white", "noise_mm": 0.5}, runs)])
+    assert conclusions(made)[-1] == (
+        f"3 of 4 runs failed: 2 × no rounds left{NOT_THE_POSTERIOR}; 1 × no rounds left."
+    )
+    assert [row["seed"] for row in failure_rows(made)] == ["2, 3", "4"]
 
 
 def test_starts_are_counted_per_filter_below_the_papers_row() -> None:
