@@ -17,6 +17,7 @@ from mvest.personalise.comparison import (
     predicted_frames,
 )
 from mvest.personalise.estimation import CaseEstimation, OnStep
+from mvest.personalise.expected import geometry_shifts, law_share
 from mvest.personalise.result import Personalised
 from mvest.personalise.settings import PersonaliseSettings
 from mvest.typing import FloatArray
@@ -78,6 +79,7 @@ def personalise_case(
         stds = narrower(estimation, result)
     share = image_share(estimation, result)
     budget = error_budget(estimation, result)
+    shifts, share_of_law = geometry_shifts(estimation, result), law_share(estimation, result)
     unconsidered, geometry = estimation.errors.unconsidered, estimation.errors.geometry
     moduli_only = paper = confirmed = None
     if settings.confirm and frames.distances:
@@ -116,4 +118,6 @@ def personalise_case(
         unconsidered,
         budget,
         estimation.moved,
+        shifts,
+        share_of_law,
     )

@@ -27,7 +27,7 @@ from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel
 from mvest.typing import FloatArray
 
-__all__ = ["law_columns"]
+__all__ = ["LAW", "law_columns"]
 
 LAW = "law"
 """What the columns are called."""

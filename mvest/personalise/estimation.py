@@ -208,19 +208,11 @@ class CaseEstimation:
         On the way from ``place`` to them (`damped_step`); ``place`` itself, if it is as good.
         """
         filtered, observation, known = result.filtered, result.observation, place.errors.known
-        if filtered is None or filtered.prediction is None or observation is None or known is None:
+        posterior = self.joint(result, place.errors)
+        if posterior is None or known is None or observation is None:
             return result.reason
-        held = ~self.estimated
-        considered = filtered.prediction.jacobian[:, held] * self.prior.std[held]
-        posterior = JointPosterior(
-            to_filter(self.transform, self.prior),
-            self.transform,
-            self.fitted.observation(),
-            place.errors,
-            filtered.learned,
-            self.estimated,
-            considered,
-        )
+        assert filtered is not None
+        assert filtered.prediction is not None
 
         def improbability(there: Place) -> float:
             modes = there.errors.displaced_by
@@ -248,6 +240,25 @@ class CaseEstimation:
             # To first order a gain is the square of a distance in standard deviations.
             return place
         return found or "no step to it makes what was seen more probable"
+
+    def joint(self, result: StudyResult, errors: ObservationErrors) -> JointPosterior | None:
+        """Of the parameters and the geometry, to first order about an estimate made with errors.
+
+        None without an estimate, or where nothing of the geometry is considered.
+        """
+        filtered = result.filtered
+        if filtered is None or filtered.prediction is None or errors.known is None:
+            return None
+        held = ~self.estimated
+        return JointPosterior(
+            to_filter(self.transform, self.prior),
+            self.transform,
+            self.fitted.observation(),
+            errors,
+            filtered.learned,
+            self.estimated,
+            filtered.prediction.jacobian[:, held] * self.prior.std[held],
+        )
 
     def _displaced(
         self, modes: tuple[FloatArray, ...], m: FloatArray, posterior: JointPosterior

@@ -56,6 +56,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
             f"{q.name} of the errors": q.stretch if q.name == LENGTH else max(q.stretch, 0.0)
             for q in filtered.learned.quantities
         }
+    moved |= {f"{own.name} of the valve": own.stretch for own in fit.expected_geometry}
     ratio = after.std / prior.std
     by_frame = {one.frame: one for one in fit.distances}
     shown = [one for one in fit.distances if one.seen] if closed.name in by_frame else []
@@ -100,6 +101,7 @@ def indications_of(fit: Personalised, gate: bool | None = None) -> Indications:
         again=None if fit.confirmed_mm is None else fit.confirmed_mm <= SAME_MM,
         gate=gate,
         moved=fit.moved,
+        law=fit.law_share,
         mistakes=mistakes,
         doubts=doubtful,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from mvest.cases.case import ValveCase
 from mvest.estimation.gaussian import Gaussian
 from mvest.personalise.error_budget import BudgetRow
+from mvest.personalise.expected import GeometryShift
 from mvest.personalise.geometry_errors import GeometryErrors
 from mvest.personalise.settings import PersonaliseSettings
 from mvest.problem.estimate import StudyResult
@@ -82,6 +83,10 @@ class Personalised:
     moved : float or None
         Standard deviations of a modulus, at most, by which the estimate is away from where geometry
         and moduli were linearised anew for the last time; None where they were not.
+    expected_geometry : tuple of GeometryShift
+        By how much the geometry is expected to differ from what was seen.
+    law_share : float or None
+        How far the tissue is expected to be on its way from the linear law to another.
     """
 
     case: ValveCase
@@ -104,6 +109,8 @@ class Personalised:
     unconsidered: tuple[str, ...] = ()
     budget: tuple[BudgetRow, ...] = ()
     moved: float | None = None
+    expected_geometry: tuple[GeometryShift, ...] = ()
+    law_share: float | None = None
 
     def __str__(self) -> str:
         distances = [

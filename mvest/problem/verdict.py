@@ -138,6 +138,8 @@ class Indications:
     moved : float or None
         Standard deviations of a modulus, at most, by which the estimate is away from where what is
         not known of the geometry was linearised last.
+    law : float or None
+        How far the tissue is expected to be on its way from the linear law to an exponential one.
     doubts, mistakes : tuple of str
         About the case itself, see `mvest.cases.plausibility`.
     unlike : str
@@ -162,6 +164,7 @@ class Indications:
     again: bool | None = None
     gate: bool | None = None
     moved: float | None = None
+    law: float | None = None
     doubts: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     unlike: str = ""
@@ -174,6 +177,8 @@ failed by less."""
 MOVED = 0.5
 """Standard deviations of a modulus by which an estimate may be away from where the geometry was
 linearised last: twice what is taken for the end of such steps."""
+LAW = 0.5
+"""Share of the way to an exponential law beyond which that explains better what was seen."""
 STRETCH = (2.5, 3.5)
 """Standard deviations by which a prior may be moved: beyond the first it is doubtful (1 % of right
 ones are), beyond the second it is contradicted (1 in 2000)."""
@@ -267,6 +272,20 @@ def _linear(e: Indications) -> Seen:
             f"linearised last, expected at most {MOVED:g}",
             "allow more such steps (personal.considered_geometry.renewals), or see the open "
             "shape, annulus and tips better",
+        )
+
+
+def _stiffens(e: Indications) -> Seen:
+    if e.law is None:
+        yield None
+    elif e.law > LAW:
+        yield Ground(
+            "law",
+            DOUBTFUL,
+            f"what was seen puts the tissue at {e.law:.2f} of the way from the linear law to an "
+            f"exponential one, expected at most {LAW:g}: that one explains it better",
+            "moduli of the linear law depend on how far leaflets are stretched: compare them "
+            "with those of other valves only at like stretches",
         )
 
 
@@ -416,6 +435,7 @@ CHECKS = {
     "iterations": _ended,
     "approximation": _approximated,
     "geometry": _linear,
+    "law": _stiffens,
     "case": _plausible,
     "size of what is left over": _innovation,
     "pattern of what is left over": _structure,

@@ -8,6 +8,7 @@ from mvest.problem.verdict import (
     ALIKE,
     DOUBTFUL,
     FARTHER,
+    LAW,
     LEAK,
     MOVED,
     NARROWING,
@@ -38,6 +39,7 @@ GOOD = Indications(
     again=True,
     gate=True,
     moved=0.4,
+    law=0.2,
 )
 
 
@@ -45,9 +47,9 @@ def test_an_estimate_against_which_nothing_speaks_is_trustworthy():
     verdict = judge(GOOD)
     assert verdict.trust == TRUSTWORTHY
     assert verdict.grounds == ()
-    assert len(verdict.passed) == 13
+    assert len(verdict.passed) == 14
     assert verdict.missing == ()
-    assert str(verdict) == "trustworthy: 13 checks passed"
+    assert str(verdict) == "trustworthy: 14 checks passed"
 
 
 CASES = {
@@ -55,6 +57,7 @@ CASES = {
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
     "not linear": ({"moved": 1.1 * MOVED}, DOUBTFUL, "is 0.55 of its standard deviations from"),
+    "stiffening": ({"law": 1.2 * LAW}, DOUBTFUL, "0.60 of the way from the linear law"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
     "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
@@ -90,6 +93,8 @@ def test_each_ground_counts_and_says_its_number(changes, trust, words):
     [
         {"nis": 0.3},
         {"moved": MOVED},
+        {"law": LAW},
+        {"law": -1.0},
         {"nis": 1.04},
         {"stretch": {"x": STRETCH[0]}},
         {"narrowing": {"x": NARROWING[0]}},
@@ -113,7 +118,7 @@ def test_the_worst_ground_decides_and_stands_first():
 
 def test_what_there_was_nothing_to_look_at_for_is_named_and_not_counted_as_passed():
     verdict = judge(Indications(estimated=True))
-    assert len(verdict.missing) == 11
+    assert len(verdict.missing) == 12
     # Of these, four are needed.
     assert verdict.trust == DOUBTFUL
     assert [ground.check for ground in verdict.grounds] == list(NEEDED)

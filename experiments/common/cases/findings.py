@@ -31,6 +31,7 @@ from mvest.reporting.case.findings import (
     Cost,
     ErrorRow,
     FrameDistances,
+    GeometryRow,
     ImageErrors,
     ImageStep,
     ModuliAlone,
@@ -178,6 +179,10 @@ def _case_findings(
         innovation=innovation_of(result.filtered),
         whiteness=_whiteness(fit),
         errors=_errors(result),
+        geometry=tuple(
+            GeometryRow(own.name, own.unit, own.size, own.stretch) for own in fit.expected_geometry
+        ),
+        law_share=fit.law_share,
         identifiability=identified_of(result),
         observation_std_mm=fit.case.uncertainty.typical_mm,
         narrow=_narrow(fit),

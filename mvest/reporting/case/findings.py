@@ -13,10 +13,9 @@ from typing import Any
 from mvest.problem.verdict import NONE, Verdict
 from mvest.reporting.findings import Identified, Innovation, Spread, Vector
 
-__all__ = ["About", "CaseFindings", "Cost", "ErrorRow", "FrameDistances", "ImageErrors",
-           "ImageStep", "ModuliAlone", "ModulusRow", "Narrower", "Picture", "PosteriorCheck",
-           "ToTruth",
-           "UnknownRow", "VolumeAbout", "WhitenessTest"]  # fmt: skip
+__all__ = ["About", "CaseFindings", "Cost", "ErrorRow", "FrameDistances", "GeometryRow",
+           "ImageErrors", "ImageStep", "ModuliAlone", "ModulusRow", "Narrower", "Picture",
+           "PosteriorCheck", "ToTruth", "UnknownRow", "VolumeAbout", "WhitenessTest"]  # fmt: skip
 
 MODULUS, NUISANCE = "modulus", "nuisance"
 """Kinds of an unknown."""
@@ -148,6 +147,20 @@ class ErrorRow:
 
 
 @dataclass(frozen=True, slots=True)
+class GeometryRow:
+    """By how much one kind of a geometry is expected to differ from what was seen.
+
+    Root of the mean square in ``unit``; the mode that is moved most, by ``stretch`` standard
+    deviations. See `mvest.personalise.expected.GeometryShift`.
+    """
+
+    name: str
+    unit: str
+    size: float
+    stretch: float
+
+
+@dataclass(frozen=True, slots=True)
 class WhitenessTest:
     """A test of the standardised innovation."""
 
@@ -266,6 +279,11 @@ class CaseFindings:
         None where a prediction failed.
     errors : tuple of ErrorRow
         Empty where errors were taken as they are stated.
+    geometry : tuple of GeometryRow
+        Empty where it was taken as it was seen.
+    law_share : float or None
+        How far the tissue is expected to be on its way from the linear law to an exponential one;
+        None where only the first was considered.
     observation_std_mm : float or None
         Of an observed coordinate, as stated.
     measurements : mapping
@@ -293,6 +311,8 @@ class CaseFindings:
     innovation: Innovation | None = None
     whiteness: tuple[WhitenessTest, ...] = ()
     errors: tuple[ErrorRow, ...] = ()
+    geometry: tuple[GeometryRow, ...] = ()
+    law_share: float | None = None
     identifiability: Identified | None = None
     observation_std_mm: float | None = None
     narrow: tuple[Narrower, ...] = ()

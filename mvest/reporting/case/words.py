@@ -14,6 +14,7 @@ from mvest.problem.verdict import DOUBTFUL, NONE, ONE_STATE, TRUSTWORTHY
 from mvest.reporting.case.findings import (
     CaseFindings,
     ErrorRow,
+    GeometryRow,
     ModulusRow,
     Narrower,
     UnknownRow,
@@ -25,10 +26,10 @@ from mvest.reporting.findings import Innovation, Spread
 from mvest.reporting.markup import MISSING, ended, number
 
 __all__ = ["answer", "badges", "confirmation", "distance_rows", "distance_words", "error_rows",
-           "frame_rows", "identifiability_words", "image_error_words", "innovation_words",
-           "leaflet_names", "measurement_rows", "moduli_rows", "narrow_words", "parameter_rows",
-           "percent", "provenance_note", "setting_rows", "verdict_words",
-           "whiteness_rows"]  # fmt: skip
+           "frame_rows", "geometry_rows", "identifiability_words", "image_error_words",
+           "innovation_words", "law_words", "leaflet_names", "measurement_rows", "moduli_rows",
+           "narrow_words", "parameter_rows", "percent", "provenance_note",
+           "setting_rows", "verdict_words", "whiteness_rows"]  # fmt: skip
 
 Rows = list[dict[str, str]]
 
@@ -298,6 +299,28 @@ def error_rows(errors: Sequence[ErrorRow]) -> Rows:
         }
         for row in errors
     ]
+
+
+def geometry_rows(geometry: Sequence[GeometryRow]) -> Rows:
+    """By how much the geometry is expected to differ from what was seen."""
+    return [
+        {
+            "geometry": row.name,
+            "expected off by": f"{number(row.size)} {row.unit}",
+            "most, in standard deviations": number(row.stretch),
+        }
+        for row in geometry
+    ]
+
+
+def law_words(share: float | None) -> str:
+    """How far the tissue is on its way to another law; empty where that was not considered."""
+    if share is None:
+        return ""
+    return (
+        "Of the way from the linear law (0) to an exponential one (1), what was seen puts the "
+        f"tissue at {share:.2f}."
+    )
 
 
 def iterate_rows(case: CaseFindings) -> Rows:
