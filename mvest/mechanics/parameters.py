@@ -74,6 +74,9 @@ KINDS: dict[str, Kind] = {
     "c2": Kind("", True, NamePart.REGION, False, "its exponent of the fibres' stretch"),
     "mu": Kind("MPa", True, NamePart.REGION, False, "its shear modulus at rest"),
     "kappa": Kind("MPa", True, NamePart.REGION, False, "its bulk modulus"),
+    "stiffening": Kind(
+        "", True, NamePart.REGION, False, "share of the exponential law over that of the linear one"
+    ),
 }
 
 

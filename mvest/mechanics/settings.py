@@ -92,10 +92,14 @@ class TissueSettings:
         ``A`` or ``C`` (see :class:`mvest.mechanics.law.biot.PoissonReading`).
     law : str
         ``biot``, the linear law, to which all of the above belongs, ``corotational``, its usual
-        form on linear tetrahedra (:mod:`mvest.mechanics.law.corotational`), or ``exponential``
-        (:mod:`mvest.mechanics.law.exponential`).
+        form on linear tetrahedra (:mod:`mvest.mechanics.law.corotational`), ``exponential``
+        (:mod:`mvest.mechanics.law.exponential`), or ``stiffening``, on the way from the first to
+        the last (:mod:`mvest.mechanics.law.stiffening`).
     exponential : ExponentialTissue, optional
-        Coefficients of the exponential law, where they are not parameters.
+        Coefficients of the exponential law, where they are not parameters; of a stiffening one
+        their common scale does not matter.
+    stiffening : float
+        How far on that way, where it is no parameter.
     """
 
     ratio: float
@@ -103,14 +107,18 @@ class TissueSettings:
     reading: str = "A"
     law: str = "biot"
     exponential: ExponentialTissue | None = None
+    stiffening: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.law not in ("biot", "corotational", "exponential"):
+        if self.law not in ("biot", "corotational", "exponential", "stiffening"):
             raise InputError(
-                f"law of a tissue = {self.law!r}, expected biot, corotational or exponential"
+                f"law of a tissue = {self.law!r}, expected biot, corotational, exponential or "
+                "stiffening"
             )
-        if self.law == "exponential" and self.exponential is None:
-            raise InputError("law of a tissue = 'exponential': its coefficients are missing")
+        if self.law in ("exponential", "stiffening") and self.exponential is None:
+            raise InputError(f"law of a tissue = {self.law!r}: its coefficients are missing")
+        if not (np.isfinite(self.stiffening) and self.stiffening >= 0.0):
+            raise InputError(f"stiffening of a tissue = {self.stiffening}, expected >= 0")
         known = [reading.value for reading in PoissonReading]
         if self.reading not in known:
             raise InputError(
@@ -131,7 +139,8 @@ class TissueSettings:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of parameters that the tissue has."""
-        return EXPONENTIAL_KINDS if self.law == "exponential" else ("E_f", "ratio", "G")
+        kinds = {"exponential": EXPONENTIAL_KINDS, "stiffening": ("E_f", "stiffening")}
+        return kinds.get(self.law, ("E_f", "ratio", "G"))
 
     def coefficients(self, values: Mapping[str, float]) -> ExponentialTissue:
         """Coefficients of the exponential law, some of them (by kind) replaced.

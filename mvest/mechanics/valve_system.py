@@ -23,6 +23,7 @@ from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
 from mvest.mechanics.law.regional import RegionalLaw
+from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue, MechanicsSettings
 from mvest.mechanics.solid import Law, Solid
@@ -206,18 +207,19 @@ def material_law(
     tissues = [_tissue(region, settings, values) for region in mesh.region_names]
     linear = [t for t in tissues if isinstance(t, LeafletModuli)]
     exponential = [t for t in tissues if isinstance(t, ExponentialTissue)]
+    alike = len(tissues) in (len(linear), len(exponential))
     corotational = {settings.tissue[r].law == "corotational" for r in mesh.region_names}
     if len(corotational) > 1:
         raise InputError("the corotational law is that of all regions of a mesh, or of none")
     law: Law
     if corotational == {True}:
         law = LinearLaw.of_moduli(linear, corotational=True)
-    elif not exponential:
-        law = BiotLaw.of_moduli(linear)
-    elif not linear:
-        law = ExponentialLaw.of(exponential)
-    else:
+    elif not alike:
         law = RegionalLaw(tuple(map(_law_of_one, tissues)), mesh.region)
+    elif linear:
+        law = BiotLaw.of_moduli(linear)
+    else:
+        law = ExponentialLaw.of(exponential)
     if variation is None:
         return law
     coefficients = {
@@ -229,8 +231,8 @@ def material_law(
 
 def _tissue(
     region: str, settings: MechanicsSettings, values: Mapping[str, float]
-) -> LeafletModuli | ExponentialTissue:
-    """What the law of one region is made of."""
+) -> LeafletModuli | ExponentialTissue | StiffeningLaw:
+    """The law of one region, or what it is made of."""
     tissue = settings.tissue.get(region)
     if tissue is not None and tissue.law == "exponential":
         names = {kind: f"{kind}.{region}" for kind in EXPONENTIAL_KINDS}
@@ -240,13 +242,18 @@ def _tissue(
             f"region {region!r} of the mesh has no tissue or modulus; given are "
             f"{', '.join(sorted(settings.tissue))} and {', '.join(sorted(values))}"
         )
+    if tissue.law == "stiffening":
+        stiffening = values.get(f"stiffening.{region}", tissue.stiffening)
+        return StiffeningLaw.of(tissue, values[f"E_f.{region}"], stiffening)
     return tissue.moduli(
         values[f"E_f.{region}"], values.get(f"ratio.{region}"), values.get(f"G.{region}")
     )
 
 
-def _law_of_one(tissue: LeafletModuli | ExponentialTissue) -> Law:
+def _law_of_one(tissue: LeafletModuli | ExponentialTissue | StiffeningLaw) -> Law:
     """The law of a body of one region."""
+    if isinstance(tissue, StiffeningLaw):
+        return tissue
     if isinstance(tissue, LeafletModuli):
         return BiotLaw.of_moduli([tissue])
     return ExponentialLaw.of([tissue])

@@ -338,14 +338,16 @@ class CaseEstimation:
     def estimate_moduli(
         self, filter_: Filter, observation: Observed, *, log: bool, variance: float | None = None
     ) -> StudyResult:
-        """The moduli alone, everything else at its prior mean."""
+        """The moduli alone, everything else at its prior mean, and no tissue that stiffens."""
         moduli = np.array([k for k, u in enumerate(self.unknowns) if u.is_modulus])
+        stiffens = [u.name.startswith("stiffening.") for u in self.unknowns]
+        known = np.where(stiffens, 0.0, self.shared.start)
         prior = Gaussian(self.prior.mean[moduli], self.prior.covariance[np.ix_(moduli, moduli)])
         if variance is not None:
             prior = Gaussian.from_variance(prior.mean, variance)
         problem = Problem(
             tuple(self.names[k] for k in moduli),
-            of_some(self.shared, self.shared.start, moduli, snap=1e-14),
+            of_some(self.shared, known, moduli, snap=1e-14),
             prior,
             filter_,
             Log() if log else Log((False,) * len(moduli)),

@@ -55,6 +55,7 @@ LABELS = {
     OFFSET: "offset of pressures",
     "chord_stiffness": "chordal stiffness (factor)",
     "chord_rest_length": "chordal rest length (factor)",
+    "stiffening": "stiffening",
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
+from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.personalise.chain import personalise_case
 from mvest.personalise.model import with_pressures
 from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
@@ -30,6 +32,9 @@ Values = Mapping[str, Any]
 
 FIELDS = "fields.npz"
 """Arrays of the report, in the folder of a run."""
+
+STIFFENS = "stiffening."
+"""How the unknowns begin that say how far a leaflet's tissue stiffens."""
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
@@ -52,9 +57,11 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
                 f"{', '.join(known)}"
             )
         unknowns.append(Unknown(name, about.mean, about.std, Treatment(about.treatment)))
+    stiffens = {name.partition(".")[2] for name in personal.unknowns if name.startswith(STIFFENS)}
+    curves = personal.considered_law
     return PersonaliseSettings(
         tuple(unknowns),
-        mechanics_of(values),
+        _stiffening(mechanics_of(values), {r: curves.get(r) for r in sorted(stiffens)}),
         personal.mesh,
         personal.tolerance,
         personal.max_iterations,
@@ -65,9 +72,34 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
         personal.correspondence,
         personal.errors,
         considered_geometry=personal.considered_geometry,
-        considered_law=personal.considered_law,
+        considered_law={r: curve for r, curve in curves.items() if r not in stiffens},
         pressures=personal.pressures,
     )
+
+
+def _stiffening(
+    mechanics: MechanicsSettings, curves: Mapping[str, ExponentialTissue | None]
+) -> MechanicsSettings:
+    """The mechanics where linear tissue of some leaflets is on its way to a curve.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such leaflet or no curve, or its tissue follows another law.
+    """
+    tissue = dict(mechanics.tissue)
+    for region, curve in curves.items():
+        unknown = f"personal.unknowns.{STIFFENS}{region}"
+        if region not in tissue or tissue[region].law != "biot":
+            own = f"follows the {tissue[region].law} law" if region in tissue else "has no tissue"
+            raise ConfigurationError(f"{unknown}: {region} {own}, expected the linear one (biot)")
+        if curve is None:
+            raise ConfigurationError(
+                f"{unknown}: personal.considered_law.{region} is missing, the law that the tissue "
+                "is on its way to"
+            )
+        tissue[region] = replace(tissue[region], law="stiffening", exponential=curve)
+    return replace(mechanics, tissue=tissue)
 
 
 def read_configured(place: str | None) -> ValveCase:

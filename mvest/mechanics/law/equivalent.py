@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -22,9 +23,7 @@ def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> E
 
     At `CLOSED_STRETCHES` the stresses along and across the fibres then have the same mean.
     """
-    stretches = np.array([CLOSED_STRETCHES])
-    wanted = biaxial_stress(BiotLaw.of([linear.moduli(E_f).material]), stretches).mean()
-    factor = float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())
+    factor = E_f * _scale(tissue, linear)
     exponents = {"c1", "c2"}
     return replace(
         tissue,
@@ -34,3 +33,11 @@ def as_stiff(tissue: ExponentialTissue, linear: TissueSettings, E_f: float) -> E
             if each.name not in exponents
         },
     )
+
+
+@lru_cache(maxsize=64)
+def _scale(tissue: ExponentialTissue, linear: TissueSettings) -> float:
+    """Factor on the tissue for a modulus of 1 MPa, to which all stresses are in proportion."""
+    stretches = np.array([CLOSED_STRETCHES])
+    wanted = biaxial_stress(BiotLaw.of([linear.moduli(1.0).material]), stretches).mean()
+    return float(wanted / biaxial_stress(ExponentialLaw.of([tissue]), stretches).mean())

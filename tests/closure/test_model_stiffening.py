@@ -1,0 +1,132 @@
+"""A valve whose leaflets are between the linear law and an exponential one.
+
+On the same small valve as in test_model.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.closure.coordinates import STIFFENED, Coordinates
+from mvest.mechanics.law.regional import RegionalLaw
+from mvest.mechanics.law.stiffening import StiffeningLaw
+from mvest.mechanics.settings import ExponentialTissue
+from mvest.mechanics.valve_system import material_law
+from tests.closure.test_model import (
+    CLOSING,
+    GENTLE,
+    OPEN,
+    SMALL,
+    TINY,
+    TISSUE,
+    continued,
+    model_of,
+    step_study,
+)
+
+CURVE = ExponentialTissue(0.06, 4.3, 900.0)
+ANTERIOR = replace(TISSUE["anterior"], law="stiffening", exponential=CURVE)
+MIXED = {**TISSUE, "anterior": ANTERIOR}
+NAMES = ("E_f.anterior", "E_f.posterior", "stiffening.anterior")
+AT = np.array([6.23, 2.09, 0.5])
+
+
+def mixed(protocol, names=NAMES, tissue=MIXED, **changes):
+    model = model_of(protocol, names, **changes)
+    model.settings = replace(model.settings, tissue=tissue)
+    return model
+
+
+def test_derivatives_of_a_moving_valve_agree_with_differences():
+    # No equilibrium at the end: the history of the damped strain is in the derivative.
+    names, at = (*NAMES, "damping"), np.array([*AT, 0.12])
+    model = mixed(OPEN, names, **SMALL)
+    simulation = model.close(at).simulation
+    assert simulation.converged
+    exact = simulation.sensitivities[-1]
+
+    def run(values):
+        result = model.close(values, sensitivities=False).simulation
+        assert result.converged
+        return result.frames[-1]
+
+    for k, name in enumerate(names):
+        assert np.linalg.norm(exact[k]) * at[k] > 1e-3, name
+        coarse, fine, best = step_study(exact[k], run, at, k, 1.6e-3)
+        assert coarse / fine == pytest.approx(16, rel=0.2) or coarse < 1e-5, name
+        assert best < 1e-6, name
+
+
+def test_derivatives_of_the_closed_valve_agree_with_differences_in_contact():
+    model = mixed(CLOSING, continuation=True)
+    simulation = model.close(AT).simulation
+    assert simulation.converged
+    assert simulation.records[-1].active_contacts > 100
+    start = simulation.frames[-1]
+    for k, name in enumerate(NAMES):
+        exact = simulation.sensitivities[-1][k]
+        assert np.linalg.norm(exact) * AT[k] > 0.05, name
+        coarse, fine, best = step_study(
+            exact, lambda m: continued(model, start, m).frames[-1], AT, k, 3.2e-3
+        )
+        assert coarse / fine == pytest.approx(16, rel=0.1) or coarse < 1e-6, name
+        assert best < 1e-6, name
+
+
+def test_each_leaflet_has_its_own_share_and_without_a_value_that_of_its_settings():
+    model = mixed(OPEN, **TINY)
+
+    def laws(values, tissue=MIXED):
+        settings = replace(model.settings, tissue=tissue)
+        law = material_law(model.mesh, settings, values)
+        assert isinstance(law, RegionalLaw)
+        return law.laws
+
+    values = dict(zip(NAMES, AT, strict=True))
+    anterior, _ = laws(values)
+    assert isinstance(anterior, StiffeningLaw)
+    assert anterior.stiffening == 0.5
+    del values["stiffening.anterior"]
+    assert laws(values)[0].stiffening == 0.0
+    assert laws(values, {**MIXED, "anterior": replace(ANTERIOR, stiffening=2.0)})[0].stiffening == 2
+    # Both of them, so that it is not the difference of laws that divides the body.
+    both = {**MIXED, "posterior": ANTERIOR}
+    assert [law.stiffening for law in laws({**values, "stiffening.posterior": 1.0}, both)] == [0, 1]
+
+
+def test_a_way_begins_without_any_stiffening():
+    coordinates = Coordinates.of(NAMES, mixed(OPEN, **TINY).settings)
+    none = np.array([6.23, 2.09, 0.0])
+    np.testing.assert_allclose(coordinates(none), [np.log(6.23), np.log(2.09), 0.0])
+    np.testing.assert_allclose(coordinates.parameters(coordinates(AT)), AT, rtol=1e-14)
+    assert coordinates.change(none, AT)[2] == pytest.approx(STIFFENED * np.log(1.5))
+    h = 1e-6
+    for k, rate in enumerate(coordinates.rates(AT)):
+        step = h * np.eye(3)[k]
+        by = (coordinates.parameters(coordinates(AT) + step) - AT)[k] / h
+        assert by == pytest.approx(rate, rel=1e-5)
+    assert coordinates(np.array([6.23, 2.09, -1.5])) is None
+
+
+def test_a_closure_begins_with_linear_tissue_and_ends_where_any_other_does():
+    # Without contact there is one equilibrium.
+    direct = mixed(GENTLE, **SMALL)
+    ends = direct.close(AT).simulation
+    model = mixed(GENTLE, continuation=True, **SMALL)
+    begun, closing = [], model._counted
+
+    def followed(m, *given, **more):
+        begun.append(m[2])
+        return closing(m, *given, **more)
+
+    model._counted = followed
+    found = model.close(AT).simulation
+    assert begun[0] == 0.0
+    assert begun[-1] == AT[2]
+    np.testing.assert_allclose(found.frames[-1], ends.frames[-1], atol=1e-7)
+    # From there on it is gone on from.
+    model.close(AT * [1.0, 1.0, 1.1])
+    assert 0.0 not in begun[1:]
+    linear = mixed(GENTLE, **SMALL).close(AT * [1.0, 1.0, 0.0]).simulation
+    assert np.abs(linear.frames[-1] - ends.frames[-1]).max() > 0.01
