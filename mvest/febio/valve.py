@@ -207,6 +207,8 @@ def _law(
     }
     if tissue.law == "exponential":
         return febio_law(tissue.coefficients(own), settings.law)
+    if tissue.law == "stiffening":
+        raise InputError(f"{region}: its tissue is between two laws, expected one of them")
     moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
     return febio_law(moduli.material, settings.law)
 

@@ -284,8 +284,8 @@ def _stiffens(e: Indications) -> Seen:
             DOUBTFUL,
             f"what was seen puts the tissue at {e.law:.2f} of the way from the linear law to an "
             f"exponential one, expected at most {LAW:g}: that one explains it better",
-            "moduli of the linear law depend on how far leaflets are stretched: compare them "
-            "with those of other valves only at like stretches",
+            "estimate how far each leaflet stiffens (personal=stiffening); moduli of the linear "
+            "law are those of its stretch alone",
         )
 
 

@@ -171,6 +171,12 @@ def model_of_case(
         Region -> its tissue.
     """
     names = case.surface.region_names
+    stiffens = [name for name in values if name.startswith("stiffening.")]
+    if stiffens:
+        raise InputError(
+            f"{', '.join(stiffens)}: the run's tissue is between two laws, which this file has "
+            "no law for; export a run without it"
+        )
     fixed = {name: value for name, value in values.items() if "." not in name or _is_valve(name)}
     settings = {}
     for k, name in enumerate(names):

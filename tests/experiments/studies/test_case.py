@@ -1,6 +1,7 @@
 """A case from the command line: its settings, its record, and what is refused."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -340,3 +341,43 @@ def test_a_check_is_no_part_of_the_result(folder):
     assert hash_of(plainly) == hash_of(checked)
     other = composed(*OWN, f"case={folder}", "personal.confirm=false")
     assert hash_of(plainly) != hash_of(other)
+
+
+def stiffening() -> dict[str, Any]:
+    """The configuration of tissue that stiffens."""
+    return plain(composed(*OWN, "personal=stiffening"))
+
+
+def test_tissue_whose_stiffening_is_unknown_is_on_its_way_to_the_law_that_is_considered() -> None:
+    settings = personalising(stiffening())
+    assert settings.considered_law == {}
+    for region, tissue in settings.mechanics.tissue.items():
+        assert tissue.law == "stiffening"
+        assert tissue.exponential is not None
+        assert f"stiffening.{region}" in [u.name for u in settings.unknowns]
+    known = personalising(plain(composed(*OWN, "personal=renewed")))
+    assert {tissue.law for tissue in known.mechanics.tissue.values()} == {"biot"}
+    assert known.considered_law == {
+        region: tissue.exponential for region, tissue in settings.mechanics.tissue.items()
+    }
+    values = stiffening()
+    del values["personal"]["unknowns"]["stiffening.posterior"]
+    one = personalising(values)
+    assert list(one.considered_law) == ["posterior"]
+    assert one.mechanics.tissue["posterior"].law == "biot"
+
+
+def test_stiffening_of_what_cannot_stiffen_is_refused() -> None:
+    values = stiffening()
+    del values["personal"]["considered_law"]["anterior"]
+    with pytest.raises(ConfigurationError, match=r"considered_law\.anterior is missing"):
+        personalising(values)
+    values = stiffening()
+    unknowns = values["personal"]["unknowns"]
+    unknowns["stiffening.septal"] = unknowns["stiffening.anterior"]
+    with pytest.raises(ConfigurationError, match="septal has no tissue"):
+        personalising(values)
+    values = stiffening()
+    values["mechanics"]["tissue"]["anterior"]["law"] = "corotational"
+    with pytest.raises(ConfigurationError, match="anterior follows the corotational law"):
+        personalising(values)
