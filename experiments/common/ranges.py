@@ -134,6 +134,7 @@ RANGES = (
         "list has all", "c1 c1.* c2 c2.* excised.*",
     ),
     Range(0.001, 1000, "", "one modulus over another", "ratio ratio.*"),
+    Range(0, 1e6, "", "one law over another", "stiffening stiffening.*"),
     Range(-1, 0.4999, "", "stable, and not quite incompressible", "nu poisson"),
     Range(
         0, 100_000, "N, N/mm or N/mm²", "far stiffer than what it holds",

@@ -77,9 +77,8 @@ def geometry_shifts(estimation: CaseEstimation, result: StudyResult) -> tuple[Ge
 def law_share(estimation: CaseEstimation, result: StudyResult) -> float | None:
     """How far all tissue is on its way from the linear law to the other that is considered.
 
-    Where what was seen is most probable, to first order about the estimate: above a half it is
-    more probable with the other law than with the linear one. It rests on the same errors and
-    priors as the estimate. None where no law was considered, or there is no estimate.
+    Where what was seen is most probable, to first order about the estimate. It rests on the same
+    errors and priors as the estimate. None where no law was considered, or there is no estimate.
     """
     errors, filtered = estimation.errors, result.filtered
     columns = [own.columns for own in errors.considered if own.name == LAW]

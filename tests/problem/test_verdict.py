@@ -57,7 +57,7 @@ CASES = {
     "not converged": ({"converged": False, "ended": "20 iterations"}, NONE, "20 iterations"),
     "approximation": ({"approximation": "bent"}, DOUBTFUL, "not that of the posterior: bent"),
     "not linear": ({"moved": 1.1 * MOVED}, DOUBTFUL, "is 0.55 of its standard deviations from"),
-    "stiffening": ({"law": 1.2 * LAW}, DOUBTFUL, "0.60 of the way from the linear law"),
+    "stiffening": ({"law": 1.2 * LAW}, DOUBTFUL, "0.24 of the way from the linear law"),
     "a mistake": ({"mistakes": ("units: is it in cm?",)}, NONE, "is it in cm?"),
     "an unlike volume": ({"unlike": "seen with 0.7"}, NONE, "seen with 0.7"),
     "a doubt": ({"doubts": ("thickness: 4 mm",)}, DOUBTFUL, "thickness: 4 mm"),
