@@ -77,6 +77,9 @@ KINDS: dict[str, Kind] = {
     "stiffening": Kind(
         "", True, NamePart.REGION, False, "share of the exponential law over that of the linear one"
     ),
+    "prestretch": Kind(
+        "", True, NamePart.REGION, False, "length of the open leaflet over that free of stress"
+    ),
 }
 
 

@@ -100,6 +100,10 @@ class TissueSettings:
         their common scale does not matter.
     stiffening : float
         How far on that way, where it is no parameter.
+    prestretch : float
+        How many times as long in its plane the open leaflet was seen as it would be free of stress
+        (:mod:`mvest.mechanics.law.prestretch`), where it is no parameter; not of the corotational
+        law.
     """
 
     ratio: float
@@ -108,6 +112,7 @@ class TissueSettings:
     law: str = "biot"
     exponential: ExponentialTissue | None = None
     stiffening: float = 0.0
+    prestretch: float = 1.0
 
     def __post_init__(self) -> None:
         if self.law not in ("biot", "corotational", "exponential", "stiffening"):
@@ -119,6 +124,10 @@ class TissueSettings:
             raise InputError(f"law of a tissue = {self.law!r}: its coefficients are missing")
         if not (np.isfinite(self.stiffening) and self.stiffening >= 0.0):
             raise InputError(f"stiffening of a tissue = {self.stiffening}, expected >= 0")
+        if not (np.isfinite(self.prestretch) and self.prestretch > 0.0):
+            raise InputError(f"prestretch of a tissue = {self.prestretch}, expected > 0")
+        if self.law == "corotational" and self.prestretch != 1.0:
+            raise InputError("prestretch of a tissue: the corotational law has none")
         known = [reading.value for reading in PoissonReading]
         if self.reading not in known:
             raise InputError(
@@ -140,7 +149,8 @@ class TissueSettings:
     def kinds(self) -> tuple[str, ...]:
         """Kinds of parameters that the tissue has."""
         kinds = {"exponential": EXPONENTIAL_KINDS, "stiffening": ("E_f", "stiffening")}
-        return kinds.get(self.law, ("E_f", "ratio", "G"))
+        own = kinds.get(self.law, ("E_f", "ratio", "G"))
+        return own if self.law == "corotational" else (*own, "prestretch")
 
     def coefficients(self, values: Mapping[str, float]) -> ExponentialTissue:
         """Coefficients of the exponential law, some of them (by kind) replaced.

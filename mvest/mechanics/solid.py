@@ -174,8 +174,8 @@ class Solid:
         self.enhanced_parameters = np.zeros((len(self.mesh.elements), self.n_modes))
 
     def initial_strain(self) -> FloatArray:
-        """Strain measure of the reference state, zeros ``(e, q, 6)``."""
-        return np.zeros((*self.volumes.shape, 6))
+        """Strain measure of the reference state ``(e, q, 6)``: zero without prestretch."""
+        return self.law.strain(np.zeros((*self.volumes.shape, 6)))
 
     def evaluate(self, x: FloatArray, previous: FloatArray, rate: float) -> SolidState:
         """Strain, stress and tangent at nodal positions ``x (n, 3)`` mm."""

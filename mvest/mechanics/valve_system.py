@@ -22,6 +22,7 @@ from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.law.field import FieldBasis, FieldLaw, at_quadrature
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli
+from mvest.mechanics.law.prestretch import PrestretchedLaw
 from mvest.mechanics.law.regional import RegionalLaw
 from mvest.mechanics.law.stiffening import StiffeningLaw
 from mvest.mechanics.parameters import NamePart, check_names, kind_of
@@ -220,6 +221,9 @@ def material_law(
         law = BiotLaw.of_moduli(linear)
     else:
         law = ExponentialLaw.of(exponential)
+    prestretch = _prestretch(mesh, settings, values)
+    if np.any(prestretch != 1.0) or any(name.startswith("prestretch.") for name in values):
+        law = PrestretchedLaw(law, prestretch, mesh.region)
     if variation is None:
         return law
     coefficients = {
@@ -227,6 +231,21 @@ def material_law(
         for region, own in variation.modes.items()
     }
     return FieldLaw(law, variation.modes, coefficients, variation.given)
+
+
+def _prestretch(
+    mesh: SolidMesh, settings: MechanicsSettings, values: Mapping[str, float]
+) -> FloatArray:
+    """Of each region ``(r,)``; InputError if one is not positive."""
+    found = np.array(
+        [
+            values.get(f"prestretch.{region}", settings.tissue[region].prestretch)
+            for region in mesh.region_names
+        ]
+    )
+    if not np.all(found > 0.0):
+        raise InputError(f"prestretch of tissue = {found.tolist()}, expected > 0")
+    return found
 
 
 def _tissue(

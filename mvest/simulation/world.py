@@ -63,6 +63,8 @@ class World:
     exponential : mapping
         Region -> tissue of the exponential law that takes the place of the linear one, its stresses
         scaled to that one's (see `MechanicsSettings`); empty: the linear law.
+    prestretch : float
+        How many times as long in their plane open leaflets are as they would be free of stress.
     """
 
     kernel: str = "matern"
@@ -75,6 +77,7 @@ class World:
     outliers: float = 0.0
     outlier_mm: float = 4.0
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
+    prestretch: float = 1.0
 
     def __post_init__(self) -> None:
         if self.kernel not in ("matern", *KERNELS):
@@ -87,6 +90,8 @@ class World:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"{name} = {value} of a world, expected >= 0")
+        if not (np.isfinite(self.prestretch) and self.prestretch > 0.0):
+            raise InputError(f"prestretch = {self.prestretch} of a world, expected > 0")
         for name in ("missing", "outliers"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)}, expected a share below 1")
@@ -125,6 +130,11 @@ class World:
         InputError
             If a region has no exponential tissue.
         """
+        if self.prestretch != 1.0:
+            longer = {
+                r: replace(t, prestretch=self.prestretch) for r, t in mechanics.tissue.items()
+            }
+            mechanics = replace(mechanics, tissue=longer)
         if not self.exponential:
             return mechanics
         if set(self.exponential) != set(mechanics.tissue):

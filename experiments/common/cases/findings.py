@@ -56,6 +56,7 @@ LABELS = {
     "chord_stiffness": "chordal stiffness (factor)",
     "chord_rest_length": "chordal rest length (factor)",
     "stiffening": "stiffening",
+    "prestretch": "stretch when seen open (factor)",
 }
 
 

@@ -1,0 +1,156 @@
+"""Leaflets that are stretched as they were seen: against the law of the body free of stress."""
+
+import numpy as np
+import pytest
+
+from mvest.errors import InputError
+from mvest.mechanics.law.biaxial import biaxial_stress
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.prestretch import PrestretchedLaw
+from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.settings import ExponentialTissue, TissueSettings
+
+TISSUE = TissueSettings(2.6)
+LINEAR = BiotLaw.of_moduli([TISSUE.moduli(5.0), TISSUE.moduli(2.0)])
+EXPONENTIAL = ExponentialLaw.of([ExponentialTissue(0.06, 4.3, 900.0)] * 2)
+RNG = np.random.default_rng(3)
+GREEN = RNG.uniform(-0.08, 0.12, (8, 3, 6))
+REGION = np.arange(8) % 2
+PRESTRETCH = np.array([1.06, 0.97])
+NONE = np.zeros_like(GREEN)
+
+
+def prestretched(base=LINEAR, prestretch=PRESTRETCH, region=REGION):
+    return PrestretchedLaw(base, np.asarray(prestretch), region)
+
+
+def deformation(green):
+    """F ``(e, q, 3, 3)``, symmetric, of strains with engineering shear."""
+    C = np.zeros((*green.shape[:2], 3, 3))
+    for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))):
+        C[..., i, j] = C[..., j, i] = 1.0 + 2.0 * green[..., k] if i == j else green[..., k]
+    values, vectors = np.linalg.eigh(C)
+    return vectors @ (np.sqrt(values)[..., None] * np.swapaxes(vectors, -1, -2))
+
+
+def six(tensor, shear):
+    parts = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+    factor = [1.0, 1.0, 1.0, shear, shear, shear]
+    return np.stack([f * tensor[..., i, j] for f, (i, j) in zip(factor, parts, strict=True)], -1)
+
+
+@pytest.mark.parametrize("base", [LINEAR, EXPONENTIAL])
+def test_cauchy_stress_is_that_of_the_whole_deformation(base):
+    # By tensors, from the deformation of the body that is free of stress.
+    F = deformation(GREEN)
+    stretch = PRESTRETCH[REGION]
+    G = np.zeros((8, 1, 3, 3))
+    G[:, 0, 0, 0] = G[:, 0, 1, 1] = stretch
+    G[:, 0, 2, 2] = stretch**-2
+    whole = F @ G
+    green = six(0.5 * (np.swapaxes(whole, -1, -2) @ whole - np.eye(3)), 2.0)
+    S0 = base.response(green, REGION, NONE, 0.0)[0]
+    S = prestretched(base).response(GREEN, REGION, NONE, 0.0)[0]
+
+    def cauchy(F, S):
+        full = np.empty((*S.shape[:2], 3, 3))
+        for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))):
+            full[..., i, j] = full[..., j, i] = S[..., k]
+        J = np.linalg.det(F)[..., None, None]
+        return six(F @ full @ np.swapaxes(F, -1, -2) / J, 1.0)
+
+    expected = cauchy(whole, S0)
+    np.testing.assert_allclose(cauchy(F, S), expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_sheet_pulls_as_the_smaller_one_that_it_was_made_of():
+    seen = np.array([[1.02, 1.05], [1.0, 0.99]])
+    law = prestretched(prestretch=[1.06, 1.06], region=np.zeros(2, dtype=np.int64))
+    whole = biaxial_stress(LINEAR, 1.06 * seen)
+    # Of nominal stress: its section is narrower by the prestretch, and thicker by its square.
+    np.testing.assert_allclose(biaxial_stress(law, seen), 1.06 * whole, rtol=1e-9)
+
+
+def test_without_prestretch_it_is_the_law_itself():
+    law = prestretched(prestretch=[1.0, 1.0])
+    previous = LINEAR.strain(0.5 * GREEN)
+    for one, other in zip(
+        law.response(GREEN, REGION, previous, 0.7),
+        LINEAR.response(GREEN, REGION, previous, 0.7),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_at_rest_it_pulls_and_damping_does_not():
+    law = prestretched()
+    rest = law.strain(NONE)
+    assert np.abs(rest).max() > 0.02
+    damped = law.response(NONE, REGION, rest, 0.7)[0]
+    still = law.response(NONE, REGION, rest, 0.0)[0]
+    np.testing.assert_allclose(damped, still, atol=1e-12)
+    longer = REGION == 0
+    assert np.all(still[longer][..., :2] > 0)
+    assert np.all(still[~longer][..., :2] < 0)
+
+
+@pytest.mark.parametrize("base", [LINEAR, EXPONENTIAL])
+def test_derivatives_agree_with_differences(base):
+    law, rate, h = prestretched(base), 0.7, 1e-6
+    previous = law.strain(0.5 * GREEN)
+
+    def stress(green=GREEN, before=previous, own=law):
+        return own.response(green, REGION, before, rate)[0]
+
+    tangent = law.response(GREEN, REGION, previous, rate)[1]
+    for i in range(6):
+        step = h * np.eye(6)[i]
+        by = (stress(GREEN + step) - stress(GREEN - step)) / (2 * h)
+        np.testing.assert_allclose(tangent[..., i], by, atol=1e-6 * np.abs(tangent).max())
+    change = RNG.standard_normal(GREEN.shape)
+    by = (stress(before=previous + h * change) - stress(before=previous - h * change)) / (2 * h)
+    found = law.history_stress(GREEN, REGION, change, rate)
+    np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
+    by = (law.strain(GREEN + h * change) - law.strain(GREEN - h * change)) / (2 * h)
+    np.testing.assert_allclose(law.strain_change(GREEN, change), by, atol=1e-7 * np.abs(by).max())
+
+
+@pytest.mark.parametrize("base", [LINEAR, EXPONENTIAL])
+@pytest.mark.parametrize("which", [0, 1])
+def test_derivative_by_a_prestretch_agrees_with_differences(base, which):
+    h = 1e-6
+
+    def stress(step):
+        moved = PRESTRETCH + step * np.eye(2)[which]
+        return prestretched(base, moved).response(GREEN, REGION, NONE, 0.0)[0]
+
+    by = (stress(h) - stress(-h)) / (2 * h)
+    law = prestretched(base)
+    name = Parameter("prestretch.anterior", PRESTRETCH[which])
+    given = {"which": which, "stress": stress(0.0)}
+    found = law.partial_stress(name, GREEN, REGION, NONE, 0.0, **given)
+    np.testing.assert_allclose(found, by, atol=1e-6 * np.abs(by).max())
+    assert not found[which != REGION].any()
+    with pytest.raises(InputError, match="at an equilibrium only"):
+        law.partial_stress(name, GREEN, REGION, NONE, 0.7, **given)
+
+
+def test_derivative_by_a_modulus_agrees_with_differences():
+    def stress(E):
+        base = BiotLaw.of_moduli([TISSUE.moduli(E), TISSUE.moduli(2.0)])
+        return prestretched(base).response(GREEN, REGION, NONE, 0.0)[0]
+
+    by = (stress(5.0 + 1e-6) - stress(5.0 - 1e-6)) / 2e-6
+    found = prestretched().partial_stress(
+        Parameter("E_f.anterior", 5.0), GREEN, REGION, NONE, 0.0, which=0, stress=stress(5.0)
+    )
+    np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
+
+
+def test_settings_refuse_what_is_no_prestretch():
+    with pytest.raises(InputError, match="prestretch of a tissue = 0"):
+        TissueSettings(2.6, prestretch=0.0)
+    with pytest.raises(InputError, match="the corotational law has none"):
+        TissueSettings(2.6, law="corotational", prestretch=1.1)
+    assert "prestretch" not in TissueSettings(2.6, law="corotational").kinds
