@@ -135,7 +135,7 @@ RANGES = (
     ),
     Range(0.001, 1000, "", "one modulus over another", "ratio ratio.*"),
     Range(0, 1e6, "", "one law over another", "stiffening stiffening.*"),
-    Range(0.2, 5, "", "leaflets are not seen five times as long", "prestretch prestretch.*"),
+    Range(0, 5, "", "leaflets are not seen five times as long", "prestretch prestretch.*"),
     Range(-1, 0.4999, "", "stable, and not quite incompressible", "nu poisson"),
     Range(
         0, 100_000, "N, N/mm or N/mm²", "far stiffer than what it holds",
