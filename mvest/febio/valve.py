@@ -205,10 +205,12 @@ def _law(
     own = {
         kind: values[f"{kind}.{region}"] for kind in tissue.kinds if f"{kind}.{region}" in values
     }
+    if tissue.law == "stiffening" or own.pop("prestretch", tissue.prestretch) != 1.0:
+        raise InputError(
+            f"{region}: its tissue is between two laws or prestretched; the file has no such law"
+        )
     if tissue.law == "exponential":
         return febio_law(tissue.coefficients(own), settings.law)
-    if tissue.law == "stiffening":
-        raise InputError(f"{region}: its tissue is between two laws, expected one of them")
     moduli = tissue.moduli(own["E_f"], own.get("ratio"), own.get("G"))
     return febio_law(moduli.material, settings.law)
 

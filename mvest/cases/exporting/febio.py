@@ -171,11 +171,10 @@ def model_of_case(
         Region -> its tissue.
     """
     names = case.surface.region_names
-    stiffens = [name for name in values if name.startswith("stiffening.")]
-    if stiffens:
+    unlike = [name for name in values if name.startswith(("stiffening.", "prestretch."))]
+    if unlike:
         raise InputError(
-            f"{', '.join(stiffens)}: the run's tissue is between two laws, which this file has "
-            "no law for; export a run without it"
+            f"{', '.join(unlike)}: the file has no law for such tissue; export a run without it"
         )
     fixed = {name: value for name, value in values.items() if "." not in name or _is_valve(name)}
     settings = {}

@@ -201,17 +201,18 @@ def test_a_run_is_exported_with_its_estimates(folder, tmp_path):
     assert points[-1, 1] == pytest.approx(0.5 * 121.3 * 133.322e-6, rel=1e-4)
 
 
-def test_tissue_between_two_laws_is_not_exported_as_linear(folder, tmp_path):
+@pytest.mark.parametrize("unlike", ["stiffening.anterior", "prestretch.posterior"])
+def test_tissue_that_the_file_has_no_law_for_is_not_exported(folder, tmp_path, unlike):
     unknowns = [
         {"name": name, "prior_mean": 1.0, "estimate": 2.0}
-        for name in ("E_f.anterior", "E_f.posterior", "stiffening.anterior")
+        for name in ("E_f.anterior", "E_f.posterior", unlike)
     ]
     own = {"ratio": 2.0, "nu": 0.4, "reading": "C"}
     settings = {"mechanics": {"tissue": {"anterior": own, "posterior": own}}}
     record = {"findings": {"case": {"unknowns": unknowns, "settings": settings}}}
     (tmp_path / "result.json").write_text(json.dumps(record))
     (tmp_path / "config.json").write_text(json.dumps({"case": str(folder)}))
-    with pytest.raises(InputError, match=r"stiffening\.anterior: the run's tissue is between two"):
+    with pytest.raises(InputError, match=f"{unlike}: the file has no law for such tissue"):
         export_febio(tmp_path, tmp_path / "a.feb", FebioOptions(columns=12, rows=2))
 
 
