@@ -247,7 +247,8 @@ class CaseEstimation:
         None without an estimate, or where nothing of the geometry is considered.
         """
         filtered = result.filtered
-        if filtered is None or filtered.prediction is None or errors.known is None:
+        known = errors.known
+        if filtered is None or filtered.prediction is None or known is None or not known.modes:
             return None
         held = ~self.estimated
         return JointPosterior(

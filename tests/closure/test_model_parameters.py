@@ -51,8 +51,10 @@ def step_of(name, default):
 
 
 def test_there_is_a_value_of_every_kind_here():
-    # Those of the exponential law are in test_model_exponential.py.
-    assert {name.partition(".")[0] for name in NAMES} == set(KINDS) - set(EXPONENTIAL_KINDS)
+    # The others are in test_model_exponential.py, test_model_stiffening.py and
+    # test_model_prestretch.py.
+    others = {*EXPONENTIAL_KINDS, "stiffening", "prestretch"}
+    assert {name.partition(".")[0] for name in NAMES} == set(KINDS) - others
 
 
 def test_derivatives_of_a_moving_valve_agree_with_differences_for_every_kind():

@@ -27,7 +27,7 @@ def test_a_name_is_read_as_kind_region_and_mode():
 def test_only_coefficients_of_a_field_may_be_negative():
     assert not is_positive("field.anterior.0")
     others = ("E_f.a", "ratio.a", "G.a", "pressure_scale", "chord_stiffness", "damping")
-    others += ("c0.a", "c1.a", "c2.a", "mu.a", "kappa.a")
+    others += ("c0.a", "c1.a", "c2.a", "mu.a", "kappa.a", "stiffening.a", "prestretch.a")
     assert all(map(is_positive, others))
     # Every kind has been thought of here: a new one must be added above.
     assert {name.partition(".")[0] for name in others} | {"field", "chord_rest_length"} == set(

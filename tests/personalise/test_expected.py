@@ -129,3 +129,11 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
         g for g in judge(indications_of(fit)).grounds if g.check == "what was known beforehand"
     ]
     assert ground.text.startswith(f"fibres of the valve was moved by {fibres.stretch:.1f} of its")
+
+
+def test_a_geometry_of_which_nothing_is_in_doubt_is_not_told(monkeypatch):
+    use(monkeypatch)
+    fit = personalise_case(
+        made_up_case(STD), settings(considered_geometry=ConsideredGeometry(renewals=1))
+    )
+    assert fit.expected_geometry == ()
