@@ -24,7 +24,12 @@ from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.geometry.leaflet_fields import fields_of_masks, thick_leaflets
+from mvest.valve.geometry.leaflet_fields import (
+    CLOSED_STEP_MM,
+    STEP_MM,
+    fields_of_masks,
+    thick_leaflets,
+)
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 
 __all__ = ["LabelsOptions", "import_labels"]
@@ -206,7 +211,8 @@ def _surface(
     derived: list[str],
 ) -> tuple[Midsurface, FloatArray]:
     """The midsurface of a frame in LPS mm, and the lengths of its seams."""
-    fields, first = fields_of_masks(masks, volume.spacing, options.blur_voxels)
+    step = STEP_MM if seams is None else CLOSED_STEP_MM
+    fields, first = fields_of_masks(masks, volume.spacing, options.blur_voxels, step)
     origin = volume.origin + volume.direction @ (volume.spacing * first)
 
     def local(points: FloatArray) -> FloatArray:
@@ -214,6 +220,9 @@ def _surface(
 
     def label(points: FloatArray) -> IntArray:
         return fields.label(local(points))
+
+    def world(points: FloatArray) -> FloatArray:
+        return np.asarray(origin + points @ volume.direction.T)
 
     solid = thick_leaflets(fields, local(tips), seams)
     if solid.pieces:
@@ -223,10 +232,11 @@ def _surface(
     if solid.contact_mm2:
         derived.append(f"leaflets cut apart where they touch, over {solid.contact_mm2:.0f} mm^2")
     surface = midsurface(
-        origin + solid.vertices @ volume.direction.T,
+        world(solid.vertices),
         solid.triangles,
         tips=tips,
         label=label,
+        closed_again=lambda points: world(solid.closed_again(local(points))),
         edge_mm=options.edge_mm,
     )
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)

@@ -207,7 +207,12 @@ def _joined(
         return fields.label(points - origin)
 
     surface = midsurface(
-        origin + solid.vertices, solid.triangles, tips=tips, label=label, edge_mm=options.edge_mm
+        origin + solid.vertices,
+        solid.triangles,
+        tips=tips,
+        label=label,
+        closed_again=lambda points: origin + solid.closed_again(points - origin),
+        edge_mm=options.edge_mm,
     )
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)
     line = f"leaflets joined where they meet, on a grid of {STEP_MM:g} mm"

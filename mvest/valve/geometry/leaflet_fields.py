@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -40,10 +39,12 @@ marching_cubes: Any = measure.marching_cubes
 MARGIN_MM = 3.0
 STEP_MM = 0.4
 """mm, of the grid on which a surface is drawn."""
+CLOSED_STEP_MM = 0.2
+"""The same where leaflets are cut apart: a cut has to leave most of a leaflet of one millimetre."""
 CUT_STEPS = 2.0
 """Width of the cut between leaflets in contact, in steps of the grid; closed again afterwards."""
-CUT_REACH_MM = 2.0
-"""From where leaflets meet, how far the cut between them goes on."""
+SEAM_REACH_MM = 2.0
+"""From where leaflets meet as one piece, how far they are drawn as one."""
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
 """Of a voxel, by which leaflets are made thicker until they have no more holes than an orifice."""
 ON_GRID = 0.02
@@ -104,7 +105,7 @@ class LeafletFields:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThickLeaflets:
-    """The closed surface of two leaflets.
+    """The closed surface of two leaflets, with a cut between them where they are in contact.
 
     Attributes
     ----------
@@ -118,6 +119,12 @@ class ThickLeaflets:
         By which all walls lie too far out, since the leaflets had holes otherwise.
     pieces : int
         Loose pieces that were left out.
+    half : (I, J, K) mm
+        On the grid, half the difference of the distances to the leaflets: 0 between them.
+    parted : (I, J, K)
+        Where on the grid leaflets were cut apart if they meet.
+    step : float
+        mm between points of the grid.
     """
 
     vertices: FloatArray
@@ -126,10 +133,42 @@ class ThickLeaflets:
     contact_mm2: float
     grown_mm: float
     pieces: int
+    half: FloatArray
+    parted: BoolArray
+    step: float
+
+    def closed_again(self, points: FloatArray) -> FloatArray:
+        """Points ``(k, 3)`` mm of the surface, those on both faces of the cut at its middle.
+
+        Walls are told apart before, where a cut still is between them.
+        """
+        if not self.parted.any():
+            return points
+        at = (points / self.step).T
+        value = ndimage.map_coordinates(self.half, at, order=1)
+        inside = ndimage.map_coordinates(self.parted.astype(np.float64), at, order=1) > 0.5
+        cut = 0.5 * CUT_STEPS * self.step
+        face = inside & (np.abs(np.abs(value) - cut) < 0.5 * self.step)
+        gradient = np.stack(
+            [
+                ndimage.map_coordinates(
+                    np.gradient(self.half, self.step, axis=k), at[:, face], order=1
+                )
+                for k in range(3)
+            ],
+            axis=1,
+        )
+        squared = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25)
+        moved = points.copy()
+        moved[face] -= (value[face] / squared)[:, None] * gradient
+        return moved
 
 
 def fields_of_masks(
-    masks: tuple[BoolArray, BoolArray], spacing: FloatArray, blur: float
+    masks: tuple[BoolArray, BoolArray],
+    spacing: FloatArray,
+    blur: float,
+    step_mm: float = STEP_MM,
 ) -> tuple[LeafletFields, FloatArray]:
     """Signed distances to two sets of voxels.
 
@@ -141,6 +180,8 @@ def fields_of_masks(
         ``(3,)`` mm.
     blur
         Standard deviation of the smoothing in voxels.
+    step_mm
+        Largest step of the finer grid, such as `STEP_MM` or, of a closed valve, `CLOSED_STEP_MM`.
 
     Returns
     -------
@@ -163,7 +204,7 @@ def fields_of_masks(
     pad = np.ceil(MARGIN_MM / spacing).astype(int)
     low = np.array([part.start for part in box]) - pad
     high = np.array([part.stop for part in box]) + pad
-    step = min(STEP_MM, voxel)
+    step = min(step_mm, voxel)
     shape = np.ceil((high - 1 - low) * spacing / step).astype(int) + 1
     if np.prod(shape.astype(float)) > MAX_VOXELS:
         size = " x ".join(f"{extent:.0f}" for extent in (high - low) * spacing)
@@ -261,14 +302,14 @@ def thick_leaflets(
     meet, half = _meet(fields)
     if not meet.any():
         raise GeometryError("the leaflets meet nowhere, expected at two commissures")
-    contact, lengths = _contact(fields, meet, tips, seams)
+    joined, lengths = _joined(fields, meet, tips, seams)
     cut = 0.5 * CUT_STEPS * fields.step
     said = ""
     for level in LEVELS:
         grown = level * fields.voxel_mm
-        together = fields.union + grown
-        if contact.any():
-            together = np.where(contact, np.minimum(together, np.abs(half) - cut), together)
+        anterior, posterior = fields.distance + grown
+        parted = np.maximum(np.minimum(anterior, half - cut), np.minimum(posterior, -half - cut))
+        together = np.where(joined, fields.union + grown, parted)
         # No corner at a point of the grid, where triangles would have no area.
         close = np.abs(together) < ON_GRID * fields.step
         together = np.where(close, np.copysign(ON_GRID * fields.step, together), together)
@@ -284,10 +325,11 @@ def thick_leaflets(
             f"leaflets with {said}, expected 0, one orifice: fill the holes of the leaflets, join "
             "them at the commissures, and part them elsewhere where they are open"
         )
-    area = 0.0
-    if contact.any():
-        vertices, area = _closed_again(fields, vertices, contact, half, cut)
-    return ThickLeaflets(vertices, triangles, lengths, area, grown, pieces)
+    touching = meet & ~joined & (np.abs(half) <= 0.5 * fields.step)
+    area = float(touching.sum()) * fields.step**2
+    return ThickLeaflets(
+        vertices, triangles, lengths, area, grown, pieces, half, ~joined, fields.step
+    )
 
 
 def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:
@@ -297,10 +339,12 @@ def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:
     return (np.abs(half) <= fields.step) & (fields.union > 0) & near, half
 
 
-def _contact(
+def _joined(
     fields: LeafletFields, meet: BoolArray, tips: FloatArray, seams: FloatArray | None
 ) -> tuple[BoolArray, FloatArray]:
-    """Points of the grid near to where leaflets are in contact, and the lengths of both seams.
+    """Points of the grid near to where leaflets are one piece, and the lengths of both seams.
+
+    All of them if the leaflets meet nowhere else.
 
     A seam begins where the leaflets meet farthest up and out to the side of its papillary tip.
     """
@@ -325,9 +369,9 @@ def _contact(
     touching = np.zeros(meet.shape, dtype=np.bool_)
     touching[meet] = far > 0
     if not touching.any():
-        return touching, lengths
+        return ~touching, lengths
     away, nearest = ndimage.distance_transform_edt(~meet, return_indices=True)
-    return touching[tuple(nearest)] & (away * fields.step <= CUT_REACH_MM), lengths
+    return ~touching[tuple(nearest)] & (away * fields.step <= SEAM_REACH_MM), lengths
 
 
 def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
@@ -338,28 +382,3 @@ def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, Int
     kept = np.bincount(piece).argmax()
     used, inverse = np.unique(triangles[piece[triangles[:, 0]] == kept], return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3), int(pieces) - 1
-
-
-def _closed_again(
-    fields: LeafletFields,
-    vertices: FloatArray,
-    contact: NDArray[np.bool_],
-    half: FloatArray,
-    cut: float,
-) -> tuple[FloatArray, float]:
-    """Vertices on both faces of a cut moved to its middle, and the area of the cut in mm²."""
-    at = (vertices / fields.step).T
-    value = ndimage.map_coordinates(half, at, order=1)
-    inside = ndimage.map_coordinates(contact.astype(np.float64), at, order=1) > 0.5
-    face = inside & (np.abs(np.abs(value) - cut) < 0.5 * fields.step)
-    gradient = np.stack(
-        [
-            ndimage.map_coordinates(np.gradient(half, fields.step, axis=k), at[:, face], order=1)
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    squared = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25)
-    moved = vertices.copy()
-    moved[face] -= (value[face] / squared)[:, None] * gradient
-    return moved, float(contact[np.abs(half) <= 0.5 * fields.step].sum()) * fields.step**2
