@@ -45,6 +45,10 @@ CUT_STEPS = 2.0
 """Width of the cut between leaflets in contact, in steps of the grid; closed again afterwards."""
 SEAM_REACH_MM = 2.0
 """From where leaflets meet as one piece, how far they are drawn as one."""
+SEAM_THICKNESSES = 1.5
+"""How wide a seam is at most, in thicknesses; leaflets that meet farther in are in contact."""
+LAYER_MM = 0.5
+"""Of depth below the annulus, in which the outermost point of a seam is sought."""
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
 """Of a voxel, by which leaflets are made thicker until they have no more holes than an orifice."""
 ON_GRID = 0.02
@@ -346,7 +350,9 @@ def _joined(
 
     All of them if the leaflets meet nowhere else.
 
-    A seam begins where the leaflets meet farthest up and out to the side of its papillary tip.
+    A seam begins where the leaflets meet farthest up and out to the side of its papillary tip, and
+    follows what meets farthest out from there. All that meets farther in, where leaflets fold on
+    each other beside a commissure, is in contact.
     """
     where = np.argwhere(meet) * fields.step
     tissue = np.argwhere(fields.union > 0).mean(axis=0) * fields.step
@@ -355,8 +361,11 @@ def _joined(
     side = tips[0] - tips[1]
     side -= (side @ up) * up
     side /= np.linalg.norm(side)
-    far = np.full(len(where), np.inf)
+    # Distances in a sheet of thickness t are a quarter of it on average.
+    width = SEAM_THICKNESSES * 4 * float(fields.distance[fields.distance > 0].mean())
+    apart = np.full(len(where), seams is not None)
     lengths = np.zeros(2)
+    depth = where @ up
     outward = (where - where.mean(axis=0)) @ side
     for k, sign in enumerate((1.0, -1.0)):
         beginning = where[np.argmax(where @ up + sign * outward)]
@@ -364,14 +373,26 @@ def _joined(
         own = sign * outward > 0
         if not own.any():
             raise GeometryError("the leaflets meet on one side alone, expected at two commissures")
-        lengths[k] = distance[own].max() if seams is None else seams[k]
-        far = np.where(own, distance - lengths[k], far)
+        if seams is None:
+            lengths[k] = distance[own].max()
+        else:
+            lengths[k] = seams[k]
+            behind = _behind_outermost(depth[own], sign * outward[own])
+            apart[own] = (distance[own] > seams[k]) | (behind > width)
     touching = np.zeros(meet.shape, dtype=np.bool_)
-    touching[meet] = far > 0
+    touching[meet] = apart
     if not touching.any():
         return ~touching, lengths
     away, nearest = ndimage.distance_transform_edt(~meet, return_indices=True)
     return ~touching[tuple(nearest)] & (away * fields.step <= SEAM_REACH_MM), lengths
+
+
+def _behind_outermost(depth: FloatArray, outward: FloatArray) -> FloatArray:
+    """How far ``(k,)`` mm points lie behind that farthest out at about their depth ``(k,)`` mm."""
+    layer = np.floor((depth - depth.min()) / LAYER_MM).astype(np.int64)
+    farthest = np.full(layer.max() + 1, -np.inf)
+    np.maximum.at(farthest, layer, outward)
+    return np.asarray(ndimage.maximum_filter1d(farthest, 3)[layer] - outward)
 
 
 def _largest(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray, int]:
