@@ -45,8 +45,9 @@ CUT_STEPS = 2.0
 """Width of the cut between leaflets in contact, in steps of the grid; closed again afterwards."""
 SEAM_REACH_MM = 2.0
 """From where leaflets meet as one piece, how far they are drawn as one."""
-SEAM_THICKNESSES = 1.5
-"""How wide a seam is at most, in thicknesses; leaflets that meet farther in are in contact."""
+SEAM_THICKNESSES = 2.5
+"""How wide a seam is at most; leaflets that meet farther in are in contact. Of the thickness by the
+mean distance, which rims and voxels make a quarter too small: too narrow a seam has holes."""
 LAYER_MM = 0.5
 """Of depth below the annulus, in which the outermost point of a seam is sought."""
 LEVELS = (0.0, 0.1, 0.2, 0.3, 0.4)
@@ -361,8 +362,9 @@ def _joined(
     side = tips[0] - tips[1]
     side -= (side @ up) * up
     side /= np.linalg.norm(side)
-    # Distances in a sheet of thickness t are a quarter of it on average.
-    width = SEAM_THICKNESSES * 4 * float(fields.distance[fields.distance > 0].mean())
+    # Distances in a sheet are a quarter of its thickness on average.
+    thickness = fields.true_thickness(4 * fields.distance[fields.distance > 0].mean())
+    width = SEAM_THICKNESSES * float(thickness)
     apart = np.full(len(where), seams is not None)
     lengths = np.zeros(2)
     depth = where @ up
