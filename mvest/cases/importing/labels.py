@@ -221,22 +221,22 @@ def _surface(
     def label(points: FloatArray) -> IntArray:
         return fields.label(local(points))
 
-    def world(points: FloatArray) -> FloatArray:
-        return np.asarray(origin + points @ volume.direction.T)
-
     solid = thick_leaflets(fields, local(tips), seams)
     if solid.pieces:
         derived.append(f"{solid.pieces} loose pieces of the leaflets left out")
     if solid.grown_mm:
         derived.append(f"walls drawn {solid.grown_mm:.2g} mm farther out, so that no hole is left")
     if solid.contact_mm2:
-        derived.append(f"leaflets cut apart where they touch, over {solid.contact_mm2:.0f} mm^2")
+        lengths = " and ".join(f"{length:.1f}" for length in solid.seams)
+        derived.append(
+            f"leaflets cut apart where they touch, over {solid.contact_mm2:.0f} mm^2, and one "
+            f"piece within {lengths} mm of the annulus at the commissures, as in the open frame"
+        )
     surface = midsurface(
-        world(solid.vertices),
+        origin + solid.vertices @ volume.direction.T,
         solid.triangles,
         tips=tips,
         label=label,
-        closed_again=lambda points: world(solid.closed_again(local(points))),
         edge_mm=options.edge_mm,
     )
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)

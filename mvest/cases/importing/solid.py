@@ -22,6 +22,7 @@ from mvest.cases.surface_files import read_regions
 from mvest.errors import GeometryError, InputError, MvestError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.leaflet_fields import (
+    CLOSED_STEP_MM,
     STEP_MM,
     fields_of_masks,
     inside_surfaces,
@@ -199,7 +200,9 @@ def _joined(
     scale: float,
 ) -> tuple[Midsurface, FloatArray]:
     masks, origin = inside_surfaces([_read(path, scale) for path in paths], STEP_MM)
-    fields, first = fields_of_masks((masks[0], masks[1]), np.full(3, STEP_MM), BLUR_VOXELS)
+    step = STEP_MM if seams is None else CLOSED_STEP_MM
+    spacing = np.full(3, STEP_MM)
+    fields, first = fields_of_masks((masks[0], masks[1]), spacing, BLUR_VOXELS, step)
     origin = origin + STEP_MM * first
     solid = thick_leaflets(fields, tips - origin, seams)
 
@@ -207,12 +210,7 @@ def _joined(
         return fields.label(points - origin)
 
     surface = midsurface(
-        origin + solid.vertices,
-        solid.triangles,
-        tips=tips,
-        label=label,
-        closed_again=lambda points: origin + solid.closed_again(points - origin),
-        edge_mm=options.edge_mm,
+        origin + solid.vertices, solid.triangles, tips=tips, label=label, edge_mm=options.edge_mm
     )
     thickness = fields.true_thickness(surface.thickness - 2 * solid.grown_mm)
     line = f"leaflets joined where they meet, on a grid of {STEP_MM:g} mm"

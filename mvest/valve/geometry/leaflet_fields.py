@@ -3,7 +3,7 @@
 Where two leaflets meet they are either one piece of tissue, at a commissure, or only in contact,
 and a segmentation shows both alike. In an open valve they meet at the commissures alone, and how
 far down from the annulus they do is a length that a valve keeps. So in a closed one they are cut
-apart wherever they meet farther from the annulus.
+apart wherever they meet farther from the annulus, or farther in than they are thick.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ STEP_MM = 0.4
 CLOSED_STEP_MM = 0.2
 """The same where leaflets are cut apart: a cut has to leave most of a leaflet of one millimetre."""
 CUT_STEPS = 2.0
-"""Width of the cut between leaflets in contact, in steps of the grid; closed again afterwards."""
+"""Width of the cut between leaflets in contact, in steps of the grid. It is not closed again: a
+wall that nothing touches loses as much by smoothing, and the middle stays where it is."""
 SEAM_REACH_MM = 2.0
 """From where leaflets meet as one piece, how far they are drawn as one."""
 SEAM_THICKNESSES = 2.5
@@ -124,12 +125,6 @@ class ThickLeaflets:
         By which all walls lie too far out, since the leaflets had holes otherwise.
     pieces : int
         Loose pieces that were left out.
-    half : (I, J, K) mm
-        On the grid, half the difference of the distances to the leaflets: 0 between them.
-    parted : (I, J, K)
-        Where on the grid leaflets were cut apart if they meet.
-    step : float
-        mm between points of the grid.
     """
 
     vertices: FloatArray
@@ -138,35 +133,6 @@ class ThickLeaflets:
     contact_mm2: float
     grown_mm: float
     pieces: int
-    half: FloatArray
-    parted: BoolArray
-    step: float
-
-    def closed_again(self, points: FloatArray) -> FloatArray:
-        """Points ``(k, 3)`` mm of the surface, those on both faces of the cut at its middle.
-
-        Walls are told apart before, where a cut still is between them.
-        """
-        if not self.parted.any():
-            return points
-        at = (points / self.step).T
-        value = ndimage.map_coordinates(self.half, at, order=1)
-        inside = ndimage.map_coordinates(self.parted.astype(np.float64), at, order=1) > 0.5
-        cut = 0.5 * CUT_STEPS * self.step
-        face = inside & (np.abs(np.abs(value) - cut) < 0.5 * self.step)
-        gradient = np.stack(
-            [
-                ndimage.map_coordinates(
-                    np.gradient(self.half, self.step, axis=k), at[:, face], order=1
-                )
-                for k in range(3)
-            ],
-            axis=1,
-        )
-        squared = np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25)
-        moved = points.copy()
-        moved[face] -= (value[face] / squared)[:, None] * gradient
-        return moved
 
 
 def fields_of_masks(
@@ -312,9 +278,8 @@ def thick_leaflets(
     said = ""
     for level in LEVELS:
         grown = level * fields.voxel_mm
-        anterior, posterior = fields.distance + grown
-        parted = np.maximum(np.minimum(anterior, half - cut), np.minimum(posterior, -half - cut))
-        together = np.where(joined, fields.union + grown, parted)
+        together = fields.union + grown
+        together = np.where(joined, together, np.minimum(together, np.abs(half) - cut))
         # No corner at a point of the grid, where triangles would have no area.
         close = np.abs(together) < ON_GRID * fields.step
         together = np.where(close, np.copysign(ON_GRID * fields.step, together), together)
@@ -332,9 +297,7 @@ def thick_leaflets(
         )
     touching = meet & ~joined & (np.abs(half) <= 0.5 * fields.step)
     area = float(touching.sum()) * fields.step**2
-    return ThickLeaflets(
-        vertices, triangles, lengths, area, grown, pieces, half, ~joined, fields.step
-    )
+    return ThickLeaflets(vertices, triangles, lengths, area, grown, pieces)
 
 
 def _meet(fields: LeafletFields) -> tuple[BoolArray, FloatArray]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -85,7 +85,6 @@ def midsurface(
     commissures: FloatArray | None = None,
     anterior: FloatArray | None = None,
     label: Callable[[FloatArray], IntArray] | None = None,
-    closed_again: Callable[[FloatArray], FloatArray] | None = None,
     edge_mm: float = EDGE_MM,
 ) -> Midsurface:
     """The midsurface of the closed surface of two thick leaflets round one orifice.
@@ -104,9 +103,6 @@ def midsurface(
         Otherwise the anterior leaflet is the taller one.
     label
         Leaflet (0 anterior, 1 posterior) of points ``(k, 3)``, if known; then nothing is derived.
-    closed_again
-        Where points ``(k, 3)`` of the surface truly are, if leaflets were cut apart to tell their
-        walls: `mvest.valve.geometry.leaflet_fields.ThickLeaflets.closed_again`.
     edge_mm
         Edge length of the triangles, on average.
 
@@ -116,10 +112,6 @@ def midsurface(
         No closed surface of one thin band, or leaflets that cannot be told apart.
     """
     first, second = walls(*closed_band(vertices, triangles))
-    if closed_again is not None:
-        first, second = (
-            replace(wall, vertices=closed_again(wall.vertices)) for wall in (first, second)
-        )
     derived: list[str] = []
     annulus = _annulus(first, tips, derived)
     pair = _PairedWalls(first, second, annulus)
