@@ -108,13 +108,28 @@ def _slicerheart(patient: Arrived, closed: Frame, door: DoorSettings, folder: Pa
 def _labels(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -> Arrived:
     if door.voxel_mm is None:
         raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
-    file, surface = folder / "open.nii.gz", patient.case.surface
     opened, closed = (_in_lps(frame) for frame in (patient.opened, closed))
-    normals = smooth_vertex_normals(opened.vertices, opened.triangles)
-    write_label_map(file, opened, normals, surface.thickness, door.voxel_mm)
-    tips = tuple(opened.papillary_tips.ravel().tolist())
-    imported = import_labels(file, LabelsOptions(tips=tips, observer_mm=0.0))
-    return _posed(patient, _with_closed(imported, closed, door.std_mm, folder / "by_hand"))
+    thickness = patient.case.surface.thickness
+    files = []
+    for frame in (opened, closed) if door.closed else (opened,):
+        files.append(folder / f"{frame.name}.nii.gz")
+        normals = smooth_vertex_normals(frame.vertices, frame.triangles)
+        write_label_map(files[-1], frame, normals, thickness, door.voxel_mm)
+    options = LabelsOptions(tips=_numbers(opened.papillary_tips), observer_mm=0.0)
+    if not door.closed:
+        imported = import_labels(files[0], options)
+        return _posed(patient, _with_closed(imported, closed, door.std_mm, folder / "by_hand"))
+    options = replace(
+        options,
+        closed=str(files[1]),
+        tips_closed=_numbers(closed.papillary_tips),
+        pressure_mmHg=closed.pressure_mmHg,
+    )
+    return _posed(patient, import_labels(files[0], options))
+
+
+def _numbers(points: FloatArray) -> tuple[float, ...]:
+    return tuple(points.ravel().tolist())
 
 
 def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:

@@ -18,6 +18,7 @@ class DoorSettings:
     label: str  # what tables call it
     seen_with_errors: bool = False  # the closed surface has the errors of the patient's case
     voxel_mm: float | None = None  # of a label map
+    closed: bool = False  # the closed frame is a label map as well
     std_mm: float = 0.6  # of the closed surface, where the case itself does not say it
 
 

@@ -46,6 +46,7 @@ DOORS = {
     "with errors": DoorSettings(kind="surfaces", label="with errors", seen_with_errors=True),
     "slicerheart": DoorSettings(kind="slicerheart", label="SlicerHeart"),
     "labels": DoorSettings(kind="labels", label="labels", voxel_mm=0.8),
+    "closed": DoorSettings(kind="labels", label="closed", voxel_mm=0.8, closed=True),
 }
 
 
@@ -58,7 +59,7 @@ def through(door, folder):
 
 def laid_out_by(door):
     """Whether nothing but surfaces and tips goes through."""
-    return door in ("slicerheart", "labels")
+    return door in ("slicerheart", "labels", "closed")
 
 
 # Half a thickness is 0.6 mm, the shift to LPS 144 mm; 0.3 mm to one side are less off a surface.
@@ -70,6 +71,7 @@ def laid_out_by(door):
         ("with errors", False, (0.0, 1e-9), (0.05, 0.3)),
         ("slicerheart", False, (0.0, 0.06), (0.0, 0.06)),
         pytest.param("labels", False, (0.02, 0.2), (0.0, 1e-5), marks=pytest.mark.slow),
+        pytest.param("closed", False, (0.02, 0.2), (0.02, 0.2), marks=pytest.mark.slow),
     ],
 )
 def test_surfaces_arrive_where_they_are(door, corresponds, opened_mm, closed_mm, tmp_path):
