@@ -2,9 +2,9 @@
 
 Formats without labels (STL, PLY without a ``region`` property, OBJ without groups) carry the
 regions through the files' names: ``{anterior: a.stl, posterior: p.stl}``. Coincident vertices of
-such files, of STL files as a whole, and of OBJ files whose objects have vertices of their own, are
-merged and numbered in the order in which the triangles name them, so that two files with the same
-triangles in the same order correspond.
+such files, of STL and GLB files as a whole, and of OBJ files whose objects have vertices of their
+own, are merged and numbered in the order in which the triangles name them, so that two files with
+the same triangles in the same order correspond.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 
 from mvest.errors import GeometryError, InputError
 from mvest.reading.bounded import refusing
-from mvest.reading.text import MAX_NUMBER
+from mvest.reading.text import MAX_NUMBER, one_line
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
 
-__all__ = ["MERGE_TOLERANCE", "RegionSurface", "merged", "read_regions"]
+__all__ = ["MERGE_TOLERANCE", "RegionSurface", "merged", "part_of", "read_regions"]
 
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""
@@ -58,13 +58,17 @@ class RegionSurface:
     point_data: Mapping[str, NDArray[np.generic]]
 
 
-def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -> RegionSurface:
+def read_regions(
+    files: Path | Mapping[str, Path],
+    regions: Mapping[int, str],
+    part: str | None = None,
+) -> RegionSurface:
     """Read a surface and which region each of its triangles belongs to.
 
     Labels are looked for, in this order, in the file names (one file for each region), in the cell
     data ``region``, in the point data ``region`` (a triangle belongs to the region of at least two
-    of its corners), and in the names of OBJ groups or objects. With one region there is nothing to
-    label.
+    of its corners), and in the names of groups or objects (OBJ, GLB). With one region there is
+    nothing to label.
 
     Parameters
     ----------
@@ -72,6 +76,8 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
         One file, or one for each name of a region.
     regions
         Name of every label, in order.
+    part
+        Of each file no more than the group or object of this name.
 
     Raises
     ------
@@ -80,18 +86,20 @@ def read_regions(files: Path | Mapping[str, Path], regions: Mapping[int, str]) -
     """
     if isinstance(files, Path):
         with refusing(files, "surface"):
-            return _checked(_of_one_file(files, regions), regions)
-    return _checked(merged(_joined(files, list(regions.values()))), regions)
+            return _checked(_of_one_file(files, regions, part), regions)
+    return _checked(merged(_joined(files, list(regions.values()), part)), regions)
 
 
-def _of_one_file(file: Path, regions: Mapping[int, str]) -> RegionSurface:
-    whole = _read(file)
+def _of_one_file(file: Path, regions: Mapping[int, str], part: str | None) -> RegionSurface:
+    whole = _read(file, part)
     surface = RegionSurface(
         whole.vertices, whole.triangles, _labels(whole, regions), whole.point_data
     )
     suffix = file.suffix.lower()
     return (
-        merged(surface) if suffix == ".stl" or (suffix == ".obj" and _apart(surface)) else surface
+        merged(surface)
+        if suffix in (".stl", ".glb") or (suffix == ".obj" and _apart(surface))
+        else surface
     )
 
 
@@ -103,12 +111,14 @@ def _checked(surface: RegionSurface, regions: Mapping[int, str]) -> RegionSurfac
     return surface
 
 
-def _read(file: Path) -> SurfaceFile:
+def _read(file: Path, part: str | None) -> SurfaceFile:
     surface = read_surface(file)
+    if part is not None:
+        surface = part_of(surface, part)
     if len(surface.triangles) > MAX_TRIANGLES:
         raise GeometryError(
             f"{file}: {len(surface.triangles)} triangles, expected at most {MAX_TRIANGLES}; make "
-            "them larger"
+            "them larger, or take one of several parts"
         )
     far = np.flatnonzero((np.abs(surface.vertices) > MAX_NUMBER).any(axis=1))
     if len(far):
@@ -116,6 +126,28 @@ def _read(file: Path) -> SurfaceFile:
             f"{file}: points {far[:5].tolist()} have coordinates beyond {MAX_NUMBER:g}"
         )
     return surface
+
+
+def part_of(surface: SurfaceFile, name: str) -> SurfaceFile:
+    """The triangles of one group or object, and the vertices that these have.
+
+    Raises
+    ------
+    InputError
+        There is no such one; the message lists some that there are.
+    """
+    own = np.array([group == name for group in surface.groups], dtype=np.bool_)
+    if not own.any():
+        known = one_line(", ".join(sorted(set(surface.groups))[:20]) or "none", 500)
+        raise InputError(f"no part is called {one_line(name, 80)}; there are {known}")
+    used, triangles = np.unique(surface.triangles[own], return_inverse=True)
+    return SurfaceFile(
+        surface.vertices[used],
+        triangles.reshape(-1, 3).astype(np.int64),
+        {key: values[used] for key, values in surface.point_data.items()},
+        {key: values[own] for key, values in surface.cell_data.items()},
+        (name,) * int(own.sum()),
+    )
 
 
 def _apart(surface: RegionSurface) -> bool:
@@ -126,14 +158,14 @@ def _apart(surface: RegionSurface) -> bool:
     return len(np.unique(corners, axis=0)) == len(np.unique(surface.triangles))
 
 
-def _joined(files: Mapping[str, Path], names: list[str]) -> RegionSurface:
+def _joined(files: Mapping[str, Path], names: list[str], part: str | None) -> RegionSurface:
     unknown = [name for name in files if name not in names]
     if unknown:
         raise InputError(f"a file for the region {unknown[0]!r}; known are {', '.join(names)}")
     missing = [name for name in names if name not in files]
     if missing:
         raise InputError(f"no file for the region {', '.join(missing)}; expected one for each")
-    parts = [_read(files[name]) for name in names]
+    parts = [_read(files[name], part) for name in names]
     shared = set.intersection(*(set(part.point_data) for part in parts))
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return RegionSurface(

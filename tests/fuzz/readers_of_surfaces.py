@@ -19,6 +19,7 @@ from mvest.valve.io.leaflet_surfaces import (
 )
 from tests.cases.folders import plain_folder
 from tests.fuzz.trial import Reader
+from tests.valve.io.glb import Glb
 
 __all__ = ["READERS"]
 
@@ -56,6 +57,16 @@ def obj(folder: Path) -> Path:
     groups = ["g anterior", faces[0], "g posterior", *faces[1:]]
     (folder / "a.obj").write_text("\n".join(["# made up", "o valve", *lines, *groups]) + "\n")
     return folder / "a.obj"
+
+
+def glb(folder: Path) -> Path:
+    file = Glb()
+    below = file.node(
+        "anterior", top=False, mesh=file.mesh(POINTS, TRIANGLES[:1], "<u2"), scale=[1, 1, 2]
+    )
+    file.node("valve", children=[below], rotation=[0, 0, 0.6, 0.8], translation=[1, 2, 3])
+    file.node("posterior", mesh=file.mesh(POINTS, TRIANGLES[1:], "<u1", 16))
+    return file.write(folder / "a.glb")
 
 
 PLY = """ply
@@ -216,6 +227,7 @@ READERS = (
     Reader("surface.stl", read_surface, (text_stl, binary_stl)),
     Reader("surface.stl-merged", lambda path: read_regions(path, {1: "both"}), (text_stl,)),
     Reader("surface.obj", regions, (obj,)),
+    Reader("surface.glb", regions, (glb,)),
     Reader("surface.ply", regions, (text_ply, binary_ply)),
     *(
         Reader(

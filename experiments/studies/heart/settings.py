@@ -27,7 +27,7 @@ def _parts(value: str, _beside: Mapping[str, Any]) -> Any:
 class HeartSettings:
     """What a study of the reference heart adds."""
 
-    # Folder with the parts; null: where the environment variable MVEST_HRA says.
+    # The heart (GLB) or a folder with its parts; null: what the variable MVEST_HRA names.
     source: Annotated[str | None, Reads(_parts)] = None
     options: ReferenceHeartOptions = field(default_factory=ReferenceHeartOptions)
     # Further closures: what the annulus and chordae do (annulus_contraction, closed_depth).

@@ -34,6 +34,7 @@ from mvest.cases.importing.reference_heart import (
     CITATION,
     SHAPE_ALONE,
     heart_files,
+    heart_parts,
     import_reference_heart,
 )
 from mvest.cases.plausibility import free_orifice
@@ -51,7 +52,7 @@ from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.io.leaflet_surfaces import read_surface
+from mvest.valve.io.leaflet_surfaces import SurfaceFile
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
@@ -73,8 +74,9 @@ def run_heart(job: Job[Settings]) -> Outcome[Findings]:
     """
     heart = job.settings.heart
     asked = _asked(heart)
-    files = heart_files(heart.source)
-    case = import_reference_heart(files[0].parent, heart.options)
+    source = None if heart.source is None else Path(heart.source)
+    files = heart_files(source)
+    case = import_reference_heart(source, heart.options)
     values = _on_case(job.values, case, job.folder / CASE)
     truth = np.array(values["truth"]["values"], dtype=float)
     meshes = _meshes(values)
@@ -88,7 +90,7 @@ def run_heart(job: Job[Settings]) -> Outcome[Findings]:
     for number, (name, changes) in enumerate(heart.closures.items()):
         asked_for = usual | changes
         options = replace(heart.options, closed_depth=asked_for["closed_depth"])
-        other = import_reference_heart(files[0].parent, options)
+        other = import_reference_heart(source, options)
         there = _on_case(job.values, other, job.folder / f"{CASE}_{number}")
         there["valve"]["annulus_contraction"] = asked_for["annulus_contraction"]
         closures.append(_closed(name, asked_for, there, *_close(there, truth, name)))
@@ -106,7 +108,7 @@ def run_heart(job: Job[Settings]) -> Outcome[Findings]:
         passed=gate.passed,
         claim=SHAPE_ALONE,
         derived=case.derived,
-        measures=(*measures_of(case), _volume(files[0])),
+        measures=(*measures_of(case), _volume(heart_parts(source)[0])),
         meshes=tuple(_mesh_row(name, mesh) for name, mesh in meshes.items()),
         closures=tuple(closures),
         gate=_answers(gate),
@@ -185,8 +187,7 @@ def measures_of(case: ValveCase) -> tuple[Measure, ...]:
     return tuple(Measure(*each) for each in found)
 
 
-def _volume(file: Path) -> Measure:
-    surface = read_surface(file)
+def _volume(surface: SurfaceFile) -> Measure:
     volume = abs(enclosed_volume(surface.vertices, surface.triangles))
     return Measure("tissue enclosed by the surface of the source", float(volume), "mm³")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from mvest.cases.case import Frame, Role, Uncertainty, ValveCase
 from mvest.cases.chord_layout import LeafletBand, assumed_closure, lay_out_chordae
+from mvest.cases.frames import MM_PER
 from mvest.cases.importing.papillary import HEAD_MM, papillary_tip
+from mvest.cases.surface_files import part_of
 from mvest.errors import InputError
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
-from mvest.valve.io.leaflet_surfaces import read_surface
+from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
 
 __all__ = [
     "CITATION",
@@ -27,16 +29,23 @@ __all__ = [
     "SHAPE_ALONE",
     "ReferenceHeartOptions",
     "heart_files",
+    "heart_parts",
     "import_reference_heart",
 ]
 
 DATA_VARIABLE = "MVEST_HRA"
-"""Environment variable that names the folder with the parts of the heart."""
+"""Environment variable that names the file of the heart, or a folder with its parts."""
 PARTS = (
     "mitral_valve.ply",
     "papillary_muscle_anterolateral.ply",
     "papillary_muscle_posteromedial.ply",
 )
+OBJECTS = (
+    "VH_M_mitral_valve",
+    "VH_M_papillary_muscle_of_heart_anterolateral",
+    "VH_M_papillary_muscle_of_heart_posteromedial",
+)
+"""What the parts are called in the heart's own file, whose lengths are metres."""
 CITATION = (
     "Browne K., Schlehlein H., Herr B. W., Quardokus E., Bueckle A., Börner K. 2022, 3D Reference "
     "Organ for Heart, Male v1.2, doi 10.48539/HBM373.VSTV.568, licence CC BY 4.0; midsurface, "
@@ -84,41 +93,48 @@ class ReferenceHeartOptions:
             raise InputError(f"closed_depth = {self.closed_depth}, expected 0 to 1")
 
 
-def heart_files(folder: Path | str | None = None) -> tuple[Path, ...]:
-    """The files of the parts in a folder, or where ``MVEST_HRA`` says.
+def heart_files(place: Path | str | None = None) -> tuple[Path, ...]:
+    """The heart's own file (GLB), or those of its parts in a folder; or where ``MVEST_HRA`` says.
 
     Raises
     ------
     InputError
         They are not there; the message says where to get them.
     """
-    place = folder or os.environ.get(DATA_VARIABLE)
+    place = place or os.environ.get(DATA_VARIABLE)
+    if place is not None and Path(place).suffix.lower() == ".glb" and Path(place).is_file():
+        return (Path(place),)
     files = tuple(Path(place or ".") / name for name in PARTS)
     missing = [file.name for file in files if not file.is_file()]
     if place is None or missing:
         where = "no folder is named" if place is None else f"{place}: no {', '.join(missing)}"
         raise InputError(
-            f"{where}. The reference heart is not part of this package: take the parts "
-            "VH_M_mitral_valve and VH_M_papillary_muscle_of_heart_anterolateral and "
-            "..._posteromedial of v1.2/models/VH_M_Heart.glb from "
-            "https://github.com/hubmapconsortium/ccf-releases, save them in mm as "
-            f"{', '.join(PARTS)}, and name their folder here or in {DATA_VARIABLE}"
+            f"{where}. The reference heart is not part of this package: take "
+            "v1.2/models/VH_M_Heart.glb from https://github.com/hubmapconsortium/ccf-releases and "
+            f"name it here or in {DATA_VARIABLE}, or a folder with its parts in mm, "
+            f"{', '.join(PARTS)}"
         )
     return files
 
 
-def import_reference_heart(source: Path, options: ReferenceHeartOptions) -> ValveCase:
-    """A case of an open frame alone from a folder with the thick valve and its papillary muscles.
+def import_reference_heart(source: Path | None, options: ReferenceHeartOptions) -> ValveCase:
+    """A case of an open frame alone from the thick valve and its papillary muscles.
 
     Midsurface, thickness, commissures and leaflets follow from the closed surface, the tips from
     the muscles; fibres run round the valve, and the chordae are laid out as in the template.
+
+    Parameters
+    ----------
+    source : Path or None
+        See `heart_parts`.
+    options : ReferenceHeartOptions
 
     Raises
     ------
     InputError, GeometryError
         A part is missing or is none of a thick valve with two muscles.
     """
-    valve, *muscles = (read_surface(file) for file in heart_files(source))
+    valve, *muscles = heart_parts(source)
     tips = np.stack([papillary_tip(muscle.vertices, valve.vertices) for muscle in muscles])
     middle = midsurface(valve.vertices, valve.triangles, tips=tips)
     vertices, moved = _smoothed(middle, options.smoothing_mm)
@@ -159,6 +175,28 @@ def import_reference_heart(source: Path, options: ReferenceHeartOptions) -> Valv
         derived=tuple(_derived(middle, moved, options, len(chordae))),
         chordae_follow=True,
     )
+
+
+def heart_parts(source: Path | None) -> list[SurfaceFile]:
+    """The closed surfaces of the thick valve and of its two muscles, mm.
+
+    Parameters
+    ----------
+    source : Path or None
+        The heart as its origin has it (``VH_M_Heart.glb``), or a folder with its parts in mm; None:
+        what ``MVEST_HRA`` names.
+
+    Raises
+    ------
+    InputError, GeometryError
+        A part is missing or damaged.
+    """
+    files = heart_files(source)
+    if len(files) > 1:
+        return [read_surface(file) for file in files]
+    heart = read_surface(files[0])
+    parts = [part_of(heart, name) for name in OBJECTS]
+    return [replace(part, vertices=MM_PER["m"] * part.vertices) for part in parts]
 
 
 def _smoothed(middle: Midsurface, width_mm: float) -> tuple[FloatArray, float]:

@@ -1,4 +1,4 @@
-"""Closed surfaces of thick leaflets (STL, PLY, OBJ, VTK): one for all or one for each."""
+"""Closed surfaces of thick leaflets (STL, PLY, OBJ, GLB, VTK): one for all or one for each."""
 
 from __future__ import annotations
 
@@ -44,12 +44,15 @@ class SolidOptions:
     Attributes
     ----------
     units : str or None
-        Of lengths in the files: mm, cm or m.
+        Of lengths in the files: mm, cm or m, which it is by the standard of GLB.
     posterior : str or None
         File with the posterior leaflet; the source is then the anterior one alone. Without it the
         source holds both, closed round one orifice.
     closed, closed_posterior : str or None
         The same of the closed frame.
+    part, posterior_part : str or None
+        Names of the objects that are the source and the posterior leaflet, where files hold
+        several (OBJ, GLB); both leaflets may be of one file.
     tips, tips_closed : tuple of float or None
         Papillary tips, antero-lateral and postero-medial: six numbers, in `units`.
     commissures : tuple of float or None
@@ -76,6 +79,8 @@ class SolidOptions:
     posterior: str | None = None
     closed: str | None = None
     closed_posterior: str | None = None
+    part: str | None = None
+    posterior_part: str | None = None
     tips: tuple[float, ...] | None = None
     tips_closed: tuple[float, ...] | None = None
     commissures: tuple[float, ...] | None = None
@@ -163,9 +168,9 @@ def import_solid(source: Path, options: SolidOptions) -> ValveCase:
     return segmented_case(source, frames, std, options.observer_mm, derived)
 
 
-def _read(path: Path, scale: float) -> tuple[FloatArray, IntArray]:
+def _read(path: Path, scale: float, part: str | None) -> tuple[FloatArray, IntArray]:
     """One closed surface in mm, its normals outwards and coincident vertices one."""
-    surface = read_regions({"leaflets": path}, {0: "leaflets"})
+    surface = read_regions({"leaflets": path}, {0: "leaflets"}, part)
     vertices, triangles = scale * surface.vertices, surface.triangles
     size = float(np.ptp(vertices, axis=0).max())
     if not 10 <= size <= 120:
@@ -179,7 +184,7 @@ def _read(path: Path, scale: float) -> tuple[FloatArray, IntArray]:
 
 
 def _whole(path: Path, tips: FloatArray, options: SolidOptions, scale: float) -> Midsurface:
-    vertices, triangles = _read(path, scale)
+    vertices, triangles = _read(path, scale, options.part)
     where = options.commissures
     point = options.anterior_point
     return midsurface(
@@ -199,7 +204,9 @@ def _joined(
     options: SolidOptions,
     scale: float,
 ) -> tuple[Midsurface, FloatArray]:
-    masks, origin = inside_surfaces([_read(path, scale) for path in paths], STEP_MM)
+    parts = options.part, options.posterior_part
+    read = [_read(path, scale, part) for path, part in zip(paths, parts, strict=True)]
+    masks, origin = inside_surfaces(read, STEP_MM)
     step = STEP_MM if seams is None else CLOSED_STEP_MM
     spacing = np.full(3, STEP_MM)
     fields, first = fields_of_masks((masks[0], masks[1]), spacing, BLUR_VOXELS, step)

@@ -1,4 +1,4 @@
-"""Reading and writing surfaces: VTK, STL, OBJ, PLY, time series for ParaView.
+"""Reading and writing surfaces: VTK, STL, OBJ, PLY, GLB, time series for ParaView.
 
 Coordinates are mm. A file appears under its name only once it is complete.
 """
@@ -19,6 +19,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.io.gltf_binary import read_glb
 from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
 from mvest.valve.io.vtk_legacy import read_vtk
 from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
@@ -34,7 +35,7 @@ Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 
 WRITTEN_SUFFIXES = (".vtu", ".vtp", ".stl", ".obj", ".ply")
-SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk")
+SURFACE_SUFFIXES = (*WRITTEN_SUFFIXES, ".vtk", ".glb")
 """That are read."""
 
 
@@ -45,6 +46,7 @@ _READERS = {
     ".stl": read_stl,
     ".obj": read_obj,
     ".ply": read_ply,
+    ".glb": read_glb,
 }
 _WRITERS = {".stl": meshio.stl.write, ".obj": meshio.obj.write, ".ply": meshio.ply.write}
 """Formats that are written without data."""
@@ -73,7 +75,7 @@ def read_surface(path: Path | str) -> SurfaceFile:
     ------
     InputError
         Missing or damaged file, or an extension other than ``.vtu``, ``.vtp``, ``.vtk`` (legacy),
-        ``.stl``, ``.obj``, ``.ply``.
+        ``.stl``, ``.obj``, ``.ply``, ``.glb``.
     GeometryError
         No triangles, other cells, or points that are not finite.
     """

@@ -10,6 +10,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.importing.reference_heart import (
     CITATION,
     DATA_VARIABLE,
+    OBJECTS,
     PARTS,
     ReferenceHeartOptions,
     heart_files,
@@ -19,8 +20,9 @@ from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
 from mvest.valve.geometry.proximity import closest_points
-from tests.cases.importing.made_up_heart import SHIFT, TEMPLATE, heart
+from tests.cases.importing.made_up_heart import SHIFT, TEMPLATE, heart, parts
 from tests.places import ROOT
+from tests.valve.io.glb import write_parts
 
 
 @pytest.fixture(scope="module")
@@ -73,11 +75,27 @@ def test_chordae_are_shorter_for_edges_that_stay_deeper(folder, case):
 def test_what_is_missing_is_asked_for_in_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     for place in (None, tmp_path):
-        with pytest.raises(InputError, match="not part of this package: take the parts") as raised:
+        with pytest.raises(InputError, match="not part of this package: take ") as raised:
             heart_files(place)
         assert "\n" not in str(raised.value)
     monkeypatch.setenv(DATA_VARIABLE, str(folder))
     assert [file.name for file in heart_files()] == list(PARTS)
+
+
+def test_the_file_as_it_is_distributed_is_the_same_heart(case, tmp_path):
+    # In metres, all parts of the heart in one file.
+    objects = {"VH_M_aortic_valve": (np.eye(3), np.array([[0, 1, 2]]))}
+    for name, (points, triangles) in zip(OBJECTS, parts(), strict=True):
+        objects[name] = (1e-3 * points, triangles)
+    path = write_parts(tmp_path / "heart.glb", objects)
+    found = import_reference_heart(path, ReferenceHeartOptions())
+    # Single precision at half a metre.
+    assert found.surface.vertices == pytest.approx(case.surface.vertices, abs=2e-3)
+    assert found.frames[0].papillary_tips == pytest.approx(case.frames[0].papillary_tips, abs=1e-3)
+    del objects[OBJECTS[2]]
+    write_parts(path, objects)
+    with pytest.raises(InputError, match=f"no part is called {OBJECTS[2]}"):
+        import_reference_heart(path, ReferenceHeartOptions())
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.thickening import thicken
 from mvest.valve.io.leaflet_surfaces import read_surface
+from tests.valve.io.glb import write_parts
 
 HRA = Path(os.environ.get(DATA_VARIABLE, "../shared/data/hra_mitral"))
 """Folder with the mitral valve of the HRA reference heart, three PLY files in mm."""
@@ -70,8 +71,11 @@ def test_lengths_in_metres(whole: Path, options: SolidOptions, tmp_path: Path) -
         import_solid(path, options)
 
 
-def test_one_surface_for_each_leaflet(valve: Valve, options: SolidOptions, tmp_path: Path) -> None:
-    surface = valve.surface
+@pytest.mark.parametrize("together", [False, True])
+def test_one_surface_for_each_leaflet(
+    valve: Valve, options: SolidOptions, tmp_path: Path, together: bool
+) -> None:
+    surface, parts = valve.surface, {}
     for number, name in enumerate(("a", "p")):
         used, inverse = np.unique(surface.triangles[surface.region == number], return_inverse=True)
         faces = inverse.reshape(-1, 3)
@@ -85,7 +89,13 @@ def test_one_surface_for_each_leaflet(valve: Valve, options: SolidOptions, tmp_p
         )
         solid = thicken(part)
         meshio.Mesh(solid.vertices, [("triangle", solid.triangles)]).write(tmp_path / f"{name}.stl")
-    case = import_solid(tmp_path / "a.stl", replace(options, posterior=str(tmp_path / "p.stl")))
+        parts[name] = solid.vertices, solid.triangles
+    if together:
+        path = write_parts(tmp_path / "valve.glb", parts)
+        given = replace(options, part="a", posterior=str(path), posterior_part="p")
+    else:
+        path, given = tmp_path / "a.stl", replace(options, posterior=str(tmp_path / "p.stl"))
+    case = import_solid(path, given)
     nearest = closest_points(case.surface.vertices, surface.vertices, surface.triangles)
     assert np.sqrt(np.mean(nearest.distance**2)) < 0.15
     centres = case.surface.vertices[case.surface.triangles].mean(axis=1)
