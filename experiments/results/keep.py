@@ -6,6 +6,7 @@ figures need of the run's arrays, if anything.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,36 +33,37 @@ def arrays_of(folder: Path, name: str) -> dict[str, Path]:
 
 
 def publish(
-    study: Study[Any, Any], results: Path, name: str, record: Record[Any], folder: Path
+    study: Study[Any, Any], results: Path, runs: Mapping[str, tuple[Record[Any], Path]]
 ) -> list[Path]:
-    """Keep a record, and renew the table it belongs to.
+    """Keep records of one table, and renew it.
 
     Parameters
     ----------
     study : Study
     results : Path
         The folder of all results; made if need be.
-    name : str
-        Of the record.
-    record : Record
-    folder : Path
-        Output folder of the run.
+    runs : mapping
+        Name -> record and output folder of each run, at least one.
 
     Raises
     ------
     InputError
         If a file cannot be written.
     """
-    place = results / RECORDS / record.table
-    arrays = arrays_of(folder, name)
+    (table,) = {record.table for record, _ in runs.values()}
+    place = results / RECORDS / table
+    arrays: dict[str, Path] = {}
     try:
         place.mkdir(parents=True, exist_ok=True)
         # Jobs of one experiment end in several processes at once.
-        with FileLock(results / f".{record.table}.lock"):
-            kept = study.keep_arrays(record, arrays[name]) if arrays else {}
-            if kept:
-                write_atomically(place / f"{name}.npz", partial(np.savez_compressed, **kept))
-            write_record(place / f"{name}.json", study.keep(record))
+        with FileLock(results / f".{table}.lock"):
+            for name, (record, folder) in runs.items():
+                own = arrays_of(folder, name)
+                kept = study.keep_arrays(record, own[name]) if own else {}
+                if kept:
+                    write_atomically(place / f"{name}.npz", partial(np.savez_compressed, **kept))
+                write_record(place / f"{name}.json", study.keep(record))
+                arrays |= own
             records = _read(place, study.findings)
             return study.write(results, records, _arrays(place) | arrays)
     except OSError as error:

@@ -17,6 +17,7 @@ from experiments.common.ranges import require_in_range
 from experiments.common.study import load_study
 from experiments.results.page import write_report
 from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
+from experiments.runner.collecting.restore import restore
 from experiments.runner.execution import slurm
 from experiments.runner.execution.check import require_admissible
 from experiments.runner.execution.drain import drain_here, drain_inline
@@ -167,6 +168,9 @@ def _collect(plan: Plan, to_come: int, store: Store | None = None) -> int:
     found = _write(plan)
     if plan.common["tracking"]["enabled"]:
         log_sweep(plan.common, plan, store)
+    restored = restore(plan)
+    if restored:
+        print(f"{plan.name}: results take over {restored} runs of earlier attempts")
     missing = any(job.reason == NOT_RUN for job in found.jobs)
     if not missing and not to_come:
         _publish(plan, found)

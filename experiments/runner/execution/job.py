@@ -204,7 +204,7 @@ def _publish(study: Study[Any, Any], request: Request, record: Record[Any]) -> N
     if request.publish_as is None:
         print(f"{results} left as it is: this run has overrides")
         return
-    publish(study, results, request.publish_as, record, request.folder)
+    publish(study, results, {request.publish_as: (record, request.folder)})
     print(f"Results in {results}")
 
 

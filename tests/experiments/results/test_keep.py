@@ -16,7 +16,7 @@ from tests.reporting.records import failed_record, record, twin
 
 def kept(results, name: str, data: dict[str, Any]) -> None:
     """Publish a made-up run that left no arrays."""
-    publish(STUDY, results, name, twin(data), results / "no such folder")
+    publish(STUDY, results, {name: (twin(data), results / "no such folder")})
 
 
 def test_tables_grow_with_the_records_and_need_nothing_else(tmp_path) -> None:

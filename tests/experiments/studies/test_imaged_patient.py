@@ -63,7 +63,7 @@ def test_the_table_is_that_of_all_patients(tmp_path):
     def kept(name: str, rows) -> None:
         findings = Findings(rows=rows, unknowns=(), known_geometry=KnownGeometry(False, "lost"))
         record = made_up(findings, study="imaged_patient", table="volume")
-        publish(STUDY, tmp_path, f"volumes-{name}", record, tmp_path / "no such folder")
+        publish(STUDY, tmp_path, {f"volumes-{name}": (record, tmp_path / "no such folder")})
 
     for name, found in (("a", an_outcome(5.0, 2.5)), ("b", "lost")):
         kept(name, volume_rows(name, found, an_outcome(5.8, 2.1), "lost", TRUTH))

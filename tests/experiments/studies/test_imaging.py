@@ -157,7 +157,7 @@ def test_tables_and_figures_are_made_and_made_again(
     assert not (done / "results").exists()
     results = tmp_path / "results"
     record = read_record(done / "run" / "result.json", imaging.STUDY.findings)
-    publish(imaging.STUDY, results, "imaging", record, done / "run")
+    publish(imaging.STUDY, results, {"imaging": (record, done / "run")})
     assert (results / "imaging.md").read_text(encoding="utf-8") == text
     kept = json.loads((results / "records" / "imaging" / "imaging.json").read_text("utf-8"))
     assert record.findings.tested.volumes

@@ -55,7 +55,7 @@ def published(results, name, record, fields):
     folder = results / "run"
     folder.mkdir(exist_ok=True)
     shutil.copy(fields, folder / "fields.npz")
-    return publish(STUDY, results, name, record, folder)
+    return publish(STUDY, results, {name: (record, folder)})
 
 
 @pytest.fixture(scope="module")
