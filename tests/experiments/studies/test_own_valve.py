@@ -224,8 +224,7 @@ def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
     found = []
     for k, place in enumerate((Scanner(5), Scanner(6, 1e-3))):
         folder = write(tmp_path / f"mine {k}", seen, FORMATS["vtp"], place, corresponds=True)
-        # Of so few cells the closed valve jumps where less is held by the frame.
-        status, _, err = run(f"'{folder}'", "personal=nuisances", "figures=false")
+        status, _, err = run(f"'{folder}'", "figures=false")
         assert status == 0, err
         records = (tmp_path / "outputs" / "own_valve").glob("*/result.json")
         record = json.loads(max(records, key=lambda path: path.stat().st_mtime).read_text())
@@ -235,7 +234,10 @@ def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
         for region, true in zip(REGIONS, TRUE, strict=True):
             row = unknowns[f"E_f.{region}"]
             assert row["low"] < true < row["high"]
-    # Axes of shift and turn are the scanner's; nothing else may depend on them. Filter and Newton's
-    # method stop at 2e-3 and 1e-6 of a parameter, with the same steps in both.
+    # Axes of shift and turn are the scanner's; nothing else may depend on them, but for where the
+    # estimation stops: it is linearised anew until it moves by less than a quarter of a standard
+    # deviation (conf/personal/renewed.yaml).
     for name in ("E_f.anterior", "E_f.posterior", "pressure_scale", "chord_rest_length"):
-        assert found[0][name]["estimate"] == pytest.approx(found[1][name]["estimate"], rel=2e-3)
+        one, other = (unknowns[name] for unknowns in found)
+        std = np.log(one["high"] / one["low"]) / (2 * 1.96)
+        assert abs(np.log(one["estimate"] / other["estimate"])) < 0.25 * std
