@@ -14,6 +14,14 @@ with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but t
 made from the same. Of K samples the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 %
 point of Student's distribution with K degrees of freedom, so that an interval of ± 1.96 standard
 deviations is one of 95 %.
+
+The mean square of few samples has directions in which it is zero, though errors have none; and far
+apart it takes for a correlation what is chance. A cure is to localise it: the covariance of the
+errors at places x and x' is multiplied with a correlation ρ(x, x') of some length (Houtekamer and
+Mitchell, A sequential ensemble Kalman filter for atmospheric data assimilation, Monthly Weather
+Review 129, 2001). With modes ρ = Σ φⱼ φⱼᵀ the product is that of columns φⱼ dₖ, so that samples
+of what an observation is made from are localised there, and what they do to it is given beside the
+samples. They are weighed with; the covariance is still that of the samples as they are.
 """
 
 from __future__ import annotations
@@ -25,7 +33,7 @@ import scipy
 
 from mvest.errors import InputError
 from mvest.estimation.gaussian import Gaussian
-from mvest.estimation.noise import ObservationNoise, low_rank_noise, observation_noise
+from mvest.estimation.noise import ObservationNoise, low_rank_noise
 from mvest.estimation.prediction import require_finite
 from mvest.typing import BoolArray, FloatArray, IntArray
 
@@ -33,6 +41,12 @@ __all__ = ["SampledErrors", "SampledPosterior"]
 
 LEVEL = 0.95
 """Of the intervals that are to be right."""
+
+SEEN = 1e-5
+"""Standard deviations of the base noise below which a direction of the samples is left out.
+
+Without one of them it is not independent of the others any more, and counts with their size.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,12 +73,16 @@ class SampledErrors:
         each source. None: all are independent.
     beside : (n, q) or None
         C of the base: errors that no sample has, one standard deviation of each.
+    localised : (n, K, J) or None
+        What the filter weighs with for each sample: its J parts, of which the mean squares add up.
+        None: itself.
     """
 
     base: ObservationNoise
     samples: FloatArray
     source: IntArray | None = None
     beside: FloatArray | None = None
+    localised: FloatArray | None = None
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
@@ -79,6 +97,13 @@ class SampledErrors:
                 f"sources of shape {np.shape(self.source)}, expected one for each of "
                 f"{samples.shape[1]} samples"
             )
+        if self.localised is not None:
+            if np.ndim(self.localised) != 3 or self.localised.shape[:2] != samples.shape:
+                raise InputError(
+                    f"localised samples have shape {np.shape(self.localised)}, expected "
+                    f"{(*samples.shape, 'J')}"
+                )
+            require_finite(self.localised, "localised samples of errors")
         samples.setflags(write=False)
         object.__setattr__(self, "samples", samples)
 
@@ -88,9 +113,19 @@ class SampledErrors:
         return self.samples.shape[1]
 
     @property
+    def columns(self) -> FloatArray:
+        """C ``(n, q)``: what the filter adds to its noise is C Cᵀ."""
+        return self._parts.reshape(self.base.size, -1) / np.sqrt(self.count)
+
+    @property
+    def _parts(self) -> FloatArray:
+        """What is weighed with for each sample, ``(n, K, J)``."""
+        return self.samples[:, :, None] if self.localised is None else self.localised
+
+    @property
     def noise(self) -> ObservationNoise:
-        """R + 1/K Σ d dᵀ."""
-        return low_rank_noise(self.base, self.samples / np.sqrt(self.count))
+        """R + C Cᵀ, without localisation R + 1/K Σ d dᵀ."""
+        return low_rank_noise(self.base, self.columns)
 
     def posterior(
         self, jacobian: FloatArray, prior: FloatArray, estimated: BoolArray | None = None
@@ -111,27 +146,22 @@ class SampledErrors:
         D = self.base.whiten(self.samples)
         P = Gaussian(np.zeros(len(prior)), prior).covariance
         kept = np.ones(len(P), dtype=np.bool_) if estimated is None else estimated
-        white = observation_noise(1.0, len(H))
+        U, parts = self._seen()
 
-        def gain(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-            """Whitening of the errors and the gain for what is whitened so, ``(p, n)``."""
-            noise = low_rank_noise(white, columns / np.sqrt(max(columns.shape[1], 1)))
-            A = noise.whiten(H)
-            K = np.linalg.solve(np.eye(len(P)) + P @ (A.T @ A), P @ A.T)
-            K[~kept] = 0.0
-            return noise.whiten(D), np.asarray(K, dtype=np.float64)
+        def gain(used: BoolArray) -> FloatArray:
+            """Of some samples."""
+            own = parts[:, used]
+            B = np.tensordot(own, own, ([1, 2], [1, 2])) / max(int(used.sum()), 1)
+            return _gain(H, P, U, B, kept)
 
-        _, K = gain(D)
-        # W Wᵀ-whitened H is met by the same gain.
-        noise = low_rank_noise(white, D / np.sqrt(self.count))
-        rest = np.eye(len(P)) - K @ noise.whiten(H)
+        K = gain(np.ones(self.count, dtype=np.bool_))
+        rest = np.eye(len(P)) - K @ H
         moved = np.empty((len(P), self.count))
         source = np.arange(self.count) if self.source is None else self.source
         sources = np.unique(source)
         for one in sources:
             own = source == one
-            whitened, without = gain(D[:, ~own])
-            moved[:, own] = without @ whitened[:, own]
+            moved[:, own] = gain(~own) @ D[:, own]
         widened = (
             scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(sources))
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
@@ -139,6 +169,32 @@ class SampledErrors:
         part = widened / self.count * moved @ moved.T
         covariance = rest @ P @ rest.T + part
         if self.beside is not None:
-            moved = K @ noise.whiten(self.base.whiten(self.beside))
+            moved = K @ self.base.whiten(self.beside)
             covariance = covariance + moved @ moved.T
         return SampledPosterior(covariance, part)
+
+    def _seen(self) -> tuple[FloatArray, FloatArray]:
+        """Orthonormal directions ``(n, r)`` of whitened columns, and their parts in them.
+
+        Those are ``(r, K, J)``. Directions in which they are far below the noise are left out.
+        """
+        parts = self._parts
+        columns = self.base.whiten(self.columns)
+        U, s, Vt = np.linalg.svd(columns, full_matrices=False)
+        kept = s > SEEN
+        own = np.sqrt(self.count) * s[kept, None] * Vt[kept]
+        return np.ascontiguousarray(U[:, kept]), own.reshape(len(own), *parts.shape[1:])
+
+
+def _gain(
+    H: FloatArray, P: FloatArray, U: FloatArray, B: FloatArray, kept: BoolArray
+) -> FloatArray:
+    """Gain ``(p, n)`` for whitened observations with noise R = I + U B Uᵀ, U orthonormal.
+
+    It is (I + P Hᵀ R⁻¹ H)⁻¹ P Hᵀ R⁻¹ with R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ; zero where not kept.
+    """
+    UH = U.T @ H
+    weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
+    K = np.linalg.solve(np.eye(len(P)) + P @ (weighed.T @ H), P @ weighed.T)
+    K[~kept] = 0.0
+    return np.asarray(K, dtype=np.float64)

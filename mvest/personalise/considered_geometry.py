@@ -42,6 +42,8 @@ __all__ = [
     "geometry_columns",
     "geometry_modes",
     "observed_change",
+    "of_low_rank",
+    "smooth_modes",
 ]
 
 SEEN = 0.3
@@ -55,6 +57,7 @@ _SCALES = (
     "rest_lengths",
     "thickness",
     "fibre_degrees",
+    "samples_mm",
 )
 
 TOLERANCE = 1e-4
@@ -91,6 +94,9 @@ class ConsideredGeometry:
     factor : float
         How well the scale of the open shape's and the annulus' errors is known itself, where errors
         are learned: one standard deviation of its logarithm, as a factor.
+    samples_mm : float
+        Of a case with error samples of its frames: over which distance errors are taken for alike
+        that few samples may show alike by chance. 0: over all of the valve, as the samples say.
     share : float
         Of the variance of smooth modes that is represented; finer ones are left out.
     renewals : int
@@ -109,6 +115,7 @@ class ConsideredGeometry:
     thickness: float = 0.1
     fibre_degrees: float = 10.0
     factor: float = 2.0
+    samples_mm: float = 0.0
     share: float = 0.9
     renewals: int = 0
 
@@ -222,7 +229,7 @@ def geometry_columns(
     ends = np.cumsum([len(own) for own in modes])[:-1]
     split = tuple(np.split(rows, ends, axis=1))
     columns = tuple(
-        ErrorColumns(own.name, _of_low_rank(members, noise), own.factor)
+        ErrorColumns(own.name, of_low_rank(members, noise), own.factor)
         for own, members in zip(modes, split, strict=True)
     )
     return GeometryColumns(tuple(modes), split, columns)
@@ -365,7 +372,7 @@ def rest_lengths_by_ends(
     return np.asarray(np.einsum("qci,ci->qc", moves, away) / np.sum(away**2, axis=1))
 
 
-def _of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
+def of_low_rank(columns: FloatArray, noise: ObservationNoise) -> FloatArray:
     """Fewer columns with nearly the same C Cᵀ, as far as that can be told from noise."""
     _, s, Vt = np.linalg.svd(noise.whiten(columns), full_matrices=False)
     return np.asarray(columns @ Vt[s > SEEN].T)

@@ -86,7 +86,7 @@ def law_share(estimation: CaseEstimation, result: StudyResult) -> float | None:
         return None
     assert result.observation is not None
     way, samples = columns[0].sum(axis=1), errors.samples
-    beside = None if samples is None else samples.samples / np.sqrt(samples.count)
+    beside = None if samples is None else samples.columns
     noise = errors.noise(filtered.learned, without=(LAW,), beside=beside)
     prior, z = to_filter(filtered.transform, filtered.prior), filtered.transformed.mean
     H = filtered.prediction.jacobian * filtered.transform.derivative(z)

@@ -26,6 +26,7 @@ from mvest.personalise.considered_geometry import (
     closure_at,
     geometry_columns,
     geometry_modes,
+    of_low_rank,
 )
 from mvest.personalise.considered_law import law_columns
 from mvest.personalise.fitted_frames import BLURRED_MM, SURFACE_MM, FittedFrames
@@ -33,6 +34,7 @@ from mvest.personalise.geometry_errors import (
     GeometryErrors,
     WeighedObservation,
     errors_of,
+    localised_samples,
     sample_geometry,
 )
 from mvest.problem.problem import Observed
@@ -165,8 +167,26 @@ class ObservationErrors:
             raise GeometryError(f"case {case.name}: what its error samples do: {sampled}")
         self.geometry, errors = sampled
         assert case.error_samples is not None
-        plain = SampledErrors(self.noise(), errors, case.error_samples.source)
+        plain = SampledErrors(
+            self.noise(),
+            errors,
+            case.error_samples.source,
+            localised=self._localised(m, predicted),
+        )
         self.samples = self.weighing(plain)
+
+    def _localised(self, m: FloatArray, predicted: FloatArray) -> FloatArray | None:
+        """What the localised samples do to the innovation ``(n, K, J)``, if they are to be."""
+        case, considered = self.fitted.case, self.fitted.settings.considered_geometry
+        if considered is None or not considered.samples_mm:
+            return None
+        vertices, tips = localised_samples(case, considered.samples_mm)
+        K, J = vertices.shape[:2]
+        joined = [part.reshape(K * J, *part.shape[2:]) for part in (vertices, tips)]
+        sampled = self.sampled(m, predicted, *joined)
+        if isinstance(sampled, str):
+            raise GeometryError(f"case {case.name}: what its localised samples do: {sampled}")
+        return sampled[1].reshape(-1, K, J)
 
     def sampled(
         self,
@@ -307,7 +327,7 @@ class ObservationErrors:
             return WeighedObservation(plain, noise, self.known.offset(self.displaced_by))
         if single is not None:
             if self.samples is not None:
-                columns = self.samples.samples / np.sqrt(self.samples.count)
+                columns = of_low_rank(self.samples.columns, self.samples.base)
                 single = single.plus(ErrorColumns("geometry", columns))
             return WeighedObservation(plain, single)
         if self.samples is not None:
