@@ -143,6 +143,9 @@ class Estimate:
         What was learned of the noise, if it was not given.
     check : ApproximationCheck or None
         Whether the posterior is what the filter took it for; None where nothing was compared.
+    curvature : (p, p), filter coordinates, or None
+        Second derivatives of the objective that its linearisation leaves out,
+        ``−Σ (R⁻¹ (y − h))ᵢ ∂²hᵢ/∂z²``, where the filter has found them.
     """
 
     names: tuple[str, ...]
@@ -160,6 +163,7 @@ class Estimate:
     transformed_samples: FloatArray | None = None
     learned: LearnedNoise | None = None
     check: ApproximationCheck | None = None
+    curvature: FloatArray | None = None
 
     def __str__(self) -> str:
         return self.summary()

@@ -11,9 +11,15 @@ of its estimate is taken from the samples themselves, through a gain K that has 
 
 the form of Joseph, which holds for any gain (Bucy and Joseph, Filtering for Stochastic Processes
 with Applications to Guidance, 1968), with K₋ₖ the gain of all samples but the k-th and what was
-made from the same. Of K samples the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 %
-point of Student's distribution with K degrees of freedom, so that an interval of ± 1.96 standard
-deviations is one of 95 %.
+made from the same. Where the model is bent, its second derivatives S are part of the Hessian of the
+objective, and so of the gain, by the implicit function theorem (Nocedal and Wright, Numerical
+Optimization, 2006, appendix A.2)::
+
+    K = (P⁻¹ + Hᵀ R⁻¹ H + S)⁻¹ Hᵀ R⁻¹,    (P⁻¹ + Hᵀ R⁻¹ H + S)⁻¹ P⁻¹ in the place of I − K H
+
+Of K samples the variance is uncertain itself; c = (t / 1.96)² with t the 97.5 % point of Student's
+distribution with K degrees of freedom, so that an interval of ± 1.96 standard deviations is one of
+95 %.
 
 The mean square of few samples has directions in which it is zero, though errors have none; and far
 apart it takes for a correlation what is chance. A cure is to localise it: the covariance of the
@@ -128,7 +134,11 @@ class SampledErrors:
         return low_rank_noise(self.base, self.columns)
 
     def posterior(
-        self, jacobian: FloatArray, prior: FloatArray, estimated: BoolArray | None = None
+        self,
+        jacobian: FloatArray,
+        prior: FloatArray,
+        estimated: BoolArray | None = None,
+        curvature: FloatArray | None = None,
     ) -> SampledPosterior:
         """Covariance of the estimate of a linear model.
 
@@ -141,27 +151,29 @@ class SampledErrors:
         estimated : (p,), optional
             Which parameters are estimated; the others keep their prior and are considered. They
             must be independent of those in the prior. Default: all.
+        curvature : (p, p), optional
+            S, see `Estimate.curvature`. Default: none, as of a model that is linear.
         """
         H = self.base.whiten(np.asarray(jacobian, dtype=np.float64))
         D = self.base.whiten(self.samples)
         P = Gaussian(np.zeros(len(prior)), prior).covariance
+        S = np.zeros_like(P) if curvature is None else curvature
         kept = np.ones(len(P), dtype=np.bool_) if estimated is None else estimated
         U, parts = self._seen()
 
-        def gain(used: BoolArray) -> FloatArray:
-            """Of some samples."""
+        def gain(used: BoolArray) -> tuple[FloatArray, FloatArray]:
+            """Of some samples, and what it leaves of an error of the prior."""
             own = parts[:, used]
             B = np.tensordot(own, own, ([1, 2], [1, 2])) / max(int(used.sum()), 1)
-            return _gain(H, P, U, B, kept)
+            return _gain(H, P, S, U, B, kept)
 
-        K = gain(np.ones(self.count, dtype=np.bool_))
-        rest = np.eye(len(P)) - K @ H
+        K, rest = gain(np.ones(self.count, dtype=np.bool_))
         moved = np.empty((len(P), self.count))
         source = np.arange(self.count) if self.source is None else self.source
         sources = np.unique(source)
         for one in sources:
             own = source == one
-            moved[:, own] = gain(~own) @ D[:, own]
+            moved[:, own] = gain(~own)[0] @ D[:, own]
         widened = (
             scipy.stats.t.ppf(0.5 + 0.5 * LEVEL, len(sources))
             / scipy.special.ndtri(0.5 + 0.5 * LEVEL)
@@ -187,14 +199,16 @@ class SampledErrors:
 
 
 def _gain(
-    H: FloatArray, P: FloatArray, U: FloatArray, B: FloatArray, kept: BoolArray
-) -> FloatArray:
+    H: FloatArray, P: FloatArray, S: FloatArray, U: FloatArray, B: FloatArray, kept: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Gain ``(p, n)`` for whitened observations with noise R = I + U B Uᵀ, U orthonormal.
 
-    It is (I + P Hᵀ R⁻¹ H)⁻¹ P Hᵀ R⁻¹ with R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ; zero where not kept.
+    It is M P Hᵀ R⁻¹ with M = (I + P (Hᵀ R⁻¹ H + S))⁻¹ and R⁻¹ = I − U (I − (I + B)⁻¹) Uᵀ; M
+    ``(p, p)`` is what is left of an error of the prior. What is not kept does not move.
     """
     UH = U.T @ H
     weighed = H - U @ (UH - scipy.linalg.solve(np.eye(len(B)) + B, UH, assume_a="pos"))
-    K = np.linalg.solve(np.eye(len(P)) + P @ (weighed.T @ H), P @ weighed.T)
-    K[~kept] = 0.0
-    return np.asarray(K, dtype=np.float64)
+    M = np.linalg.inv(np.eye(len(P)) + P @ (weighed.T @ H + S))
+    K = M @ P @ weighed.T
+    K[~kept], M[~kept] = 0.0, np.eye(len(P))[~kept]
+    return np.asarray(K, dtype=np.float64), np.asarray(M, dtype=np.float64)

@@ -116,9 +116,7 @@ class CaseEstimation:
             return SchmidtFilter(inner, self._held)
         if start is None:
             return inner
-        # Of error samples the covariance is found otherwise.
-        second_order = final and self.errors.samples is None
-        return replace(inner, start=start, max_learned=LEARNED, second_order=second_order)
+        return replace(inner, start=start, max_learned=LEARNED, second_order=final)
 
     def knowledge(self) -> dict[str, float]:
         """Prior standard deviations, relative of what is positive, but of pressures' errors."""
@@ -385,9 +383,9 @@ class CaseEstimation:
         estimated = np.isin(filtered.names, np.array(self.names)[self.estimated])
         learned = filtered.learned
         if learned is None:
-            return samples.posterior(H, prior.covariance, estimated)
+            return samples.posterior(H, prior.covariance, estimated, filtered.curvature)
         errors = self.errors.weighing(samples, learned)
-        posterior = errors.posterior(H, prior.covariance, estimated)
+        posterior = errors.posterior(H, prior.covariance, estimated, filtered.curvature)
         covariance = np.array(posterior.covariance)
         covariance[np.ix_(estimated, estimated)] += learned.covariance
         return replace(posterior, covariance=covariance)

@@ -185,6 +185,7 @@ class IteratedFilter:
                 else:
                     reason = Reason.NO_DECREASE
             if reason is not None:
+                curvature: FloatArray | None = None
                 learned = None if learner is None else learner.learned(L)
                 if self.second_order and reason is not Reason.MODEL_FAILED:
                     check = run.check(point.prediction)
@@ -196,11 +197,13 @@ class IteratedFilter:
                             update = kalman_update(unit, innovation, point.H, run.noise)
                             P = L @ covariance @ L.T
                             run.record(point.z, P, point.objective, update.log_likelihood)
+                            curvature = _left_out(run, L, point, covariance)
                             reason = Reason.CONVERGED
                             detail = f"{iterations} iterations, then with second derivatives"
-                return run.finish(
+                estimate = run.finish(
                     reason, detail, point.prediction, innovation, update, learned=learned
                 )
+                return replace(estimate, curvature=curvature)
 
     def _first(self, run: FilterRun, L: FloatArray) -> FloatArray:
         """Coordinates x of the first iterate."""
@@ -299,6 +302,13 @@ def _with_second_derivatives(
             return point, inverse
         covariance = inverse
     return None
+
+
+def _left_out(run: FilterRun, L: FloatArray, point: "_Point", covariance: FloatArray) -> FloatArray:
+    """What Gauss-Newton leaves out of the Hessian, in filter coordinates (p, p)."""
+    A, back = run.noise.whiten(point.H), np.linalg.pinv(L)
+    left = np.linalg.inv(covariance) - np.eye(len(point.x)) - A.T @ A
+    return np.asarray(back.T @ left @ back)
 
 
 def _lower(
