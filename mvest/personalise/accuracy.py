@@ -41,22 +41,22 @@ def error_budget(estimation: CaseEstimation, result: StudyResult) -> tuple[Budge
     predicted = estimation.shared(m)
     if not predicted.converged:
         return ()
-    parts, frames = sample_parts(estimation.case)
+    parts, motion = sample_parts(estimation.case)
     # One factorisation for all of them.
-    vertices, tips = (np.concatenate(each) for each in zip(*parts.values(), *frames, strict=True))
+    vertices, tips = (np.concatenate(each) for each in zip(*parts.values(), motion, strict=True))
     sampled = errors.sampled(m, predicted.y, vertices, tips)
     if isinstance(sampled, str):
         return ()
-    columns = sampled[1] / np.sqrt(errors.samples.count)
-    each = np.split(columns, len(parts) + len(frames), axis=1)
+    *each, differ = np.split(sampled[1], len(parts) + 1, axis=1)
     z = filtered.transformed_iterates[-1]
     return budget_rows(
         filtered.names,
         filtered.prediction.jacobian * filtered.transform.derivative(z),
         to_filter(filtered.transform, filtered.prior).covariance,
         errors.noise(filtered.learned, without=errors.kinds),
-        dict(zip(parts, each, strict=False)),
-        each[len(parts) :],
+        dict(zip(parts, each, strict=True)),
+        differ,
+        errors.samples.source,
         {own.name: own.columns for own in errors.considered},
     )
 

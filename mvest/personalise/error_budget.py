@@ -3,8 +3,11 @@
 Error samples of the frames are taken apart: into a rigid motion of both frames together, one of
 the closed against the open frame (displaced, tilted), and what is left near the annulus, in the
 belly and near the free edge of each frame, and of the papillary tips. The parts of a sample add up
-to it. With their derivatives, those of all else that is in doubt and those of the unknowns, the
-covariance of the moduli is known with any part left out, or with it alone.
+to it. Beside them stands how the frames differ: half of the difference of their errors, with its
+sign in each. With their derivatives, those of all else that is in doubt and those of the unknowns,
+the covariance of the moduli is known with any part left out, or with it alone: through gains that
+have not seen the sample (`mvest.estimation.sampled`), since one that has takes nearly all of it for
+known.
 """
 
 from __future__ import annotations
@@ -16,15 +19,16 @@ import numpy as np
 
 from mvest.cases.case import Role, ValveCase
 from mvest.estimation.noise import ObservationNoise, low_rank_noise
-from mvest.typing import FloatArray
+from mvest.estimation.sampled import SampledErrors
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 
-__all__ = ["APART", "EVERYTHING", "IMAGES", "BudgetRow", "budget_rows", "sample_parts"]
+__all__ = ["EVERYTHING", "IMAGES", "MOTION", "BudgetRow", "budget_rows", "sample_parts"]
 
 EVERYTHING = "everything"
 """Row of what is not known, all of it; alone, it is nothing but the noise of the frame."""
 
-IMAGES, APART = "errors of the images", "errors of open and closed frame unlike each other"
+IMAGES, MOTION = "errors of the images", "motion between the frames"
 
 BANDS = ("{} frame near the annulus", "belly of the {} frame", "{} frame near the free edge")
 
@@ -53,15 +57,15 @@ Moves = tuple[FloatArray, FloatArray]
 """Samples of displacements of vertices ``(K, f, n, 3)`` and tips ``(K, f, t, 3)`` in mm."""
 
 
-def sample_parts(case: ValveCase) -> tuple[dict[str, Moves], tuple[Moves, Moves]]:
-    """The error samples of a case in parts that add up to them, and those of each frame alone.
+def sample_parts(case: ValveCase) -> tuple[dict[str, Moves], Moves]:
+    """The error samples of a case in parts that add up to them, and how its frames differ.
 
     Returns
     -------
     parts : dict
         Words -> displacements.
-    frames : (Moves, Moves)
-        With the errors of the open, and of the closed frame.
+    motion : Moves
+        Without it both frames have the same error, the mean of theirs.
     """
     samples = case.error_samples
     assert samples is not None
@@ -113,13 +117,10 @@ def sample_parts(case: ValveCase) -> tuple[dict[str, Moves], tuple[Moves, Moves]
     def moves_of(whole: FloatArray) -> Moves:
         return whole[:, :, :n], whole[:, :, n:]
 
-    def of_frame(k: int) -> Moves:
-        return moves_of(np.where(np.arange(len(roles))[:, None, None] == k, moves, 0.0))
-
-    return {words: moves_of(whole) for words, whole in parts.items()}, (
-        of_frame(open_),
-        of_frame(closed),
-    )
+    differ = np.zeros_like(moves)
+    differ[:, open_] = 0.5 * (moves[:, open_] - moves[:, closed])
+    differ[:, closed] = -differ[:, open_]
+    return {words: moves_of(whole) for words, whole in parts.items()}, moves_of(differ)
 
 
 def _rigid_fields(x: FloatArray) -> FloatArray:
@@ -135,7 +136,8 @@ def budget_rows(
     prior: FloatArray,
     base: ObservationNoise,
     images: Mapping[str, FloatArray],
-    frames: Sequence[FloatArray],
+    motion: FloatArray,
+    source: IntArray | None,
     considered: Mapping[str, FloatArray],
 ) -> tuple[BudgetRow, ...]:
     """What is left of each modulus with every part left out, and with it alone.
@@ -151,38 +153,45 @@ def budget_rows(
     base : ObservationNoise
         Of single observations.
     images : mapping
-        Words -> columns ``(n, K)`` of each part of the error samples.
-    frames : sequence
-        The columns of each frame's errors, to be taken for independent of the other's.
+        Words -> each part ``(n, K)`` of the error samples.
+    motion : (n, K)
+        How the frames differ in these samples.
+    source : (K,) or None
+        See `SampledErrors`.
     considered : mapping
         Words -> columns of whatever else is in doubt.
     """
     moduli = [k for k, name in enumerate(names) if name.startswith("E_f.")]
     nuisances = [k for k in range(len(names)) if k not in moduli]
-    whole = sum(images.values(), np.zeros((len(H), 1)))
-    everything = [whole, *considered.values()]
+    whole = np.sum(list(images.values()), axis=0)
     free = [*moduli, *nuisances]
 
-    def std(columns: Sequence[FloatArray], unknown: Sequence[int]) -> FloatArray:
-        joined = [one for one in columns if one.shape[1]]
-        noise = low_rank_noise(base, np.concatenate(joined, axis=1)) if joined else base
-        A = noise.whiten(H[:, unknown])
-        P = np.linalg.inv(np.linalg.inv(prior[np.ix_(unknown, unknown)]) + A.T @ A)
-        return np.sqrt(np.diag(P))[: len(moduli)]
+    def std(
+        samples: FloatArray | None, beside: Sequence[FloatArray], unknown: Sequence[int]
+    ) -> FloatArray:
+        joined = np.concatenate([np.zeros((len(H), 0)), *beside], axis=1)
+        noise = low_rank_noise(base, joined) if joined.shape[1] else base
+        own, P = H[:, unknown], prior[np.ix_(unknown, unknown)]
+        if samples is None:
+            A = noise.whiten(own)
+            covariance = np.linalg.inv(np.linalg.inv(P) + A.T @ A)
+        else:
+            covariance = SampledErrors(noise, samples, source, joined).posterior(own, P).covariance
+        return np.sqrt(np.diag(covariance))[: len(moduli)]
+
+    every = list(considered.values())
 
     def rows() -> Iterator[tuple[str, FloatArray, FloatArray]]:
-        yield EVERYTHING, std(everything, free), std([], moduli)
-        yield IMAGES, std(everything[1:], free), std([whole], moduli)
-        yield APART, std([*frames, *everything[1:]], free), std(frames, moduli)
-        for words, own in images.items():
-            rest = [whole - own, *everything[1:]]
-            yield words, std(rest, free), std([own], moduli)
+        yield EVERYTHING, std(whole, every, free), std(None, [], moduli)
+        yield IMAGES, std(None, every, free), std(whole, [], moduli)
+        for words, own in {MOTION: motion, **images}.items():
+            yield words, std(whole - own, every, free), std(own, [], moduli)
         for words, own in considered.items():
-            rest = [whole, *(one for name, one in considered.items() if name != words)]
-            yield words, std(rest, free), std([own], moduli)
+            rest = [one for name, one in considered.items() if name != words]
+            yield words, std(whole, rest, free), std(None, [own], moduli)
         for k in nuisances:
             known = [*moduli, *(other for other in nuisances if other != k)]
-            yield names[k], std(everything, known), std([], [*moduli, k])
+            yield names[k], std(whole, every, known), std(None, [], [*moduli, k])
 
     return tuple(
         BudgetRow(words, names[k], float(without), float(alone))

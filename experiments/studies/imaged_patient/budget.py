@@ -5,43 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.common.cases.skill import HALF, log_width
 from experiments.common.records.tables import write_table
-from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
-from mvest.reporting.case.findings import Cost, UnknownRow
+from mvest.personalise.error_budget import EVERYTHING, IMAGES, MOTION
+from mvest.reporting.case.findings import Cost
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.style import SMALL, headline, panels
 
-__all__ = ["budget_figure", "budget_table", "with_unseen", "write_budget"]
+__all__ = ["budget_figure", "budget_table", "write_budget"]
 
 NOTE = (
     "Standard deviation of a modulus' logarithm at the estimate, to first order, median over {n} "
     "simulated volumes. *Without*: the part known exactly and all else as it is; *alone*: all else "
-    "known exactly ({everything} alone: nothing but the noise of single points). Parts of the "
-    "errors of the images come from held-out volumes and add up to them; {apart}: as if the frames "
-    "had nothing in common; {unseen}: by how much the reported interval, with a gain that has not "
-    "seen a sample, is wider than that of all samples together. Prior of the moduli: {prior:.2f}."
+    "known exactly ({everything} alone: nothing but the noise of single points). Errors of the "
+    "images are of held-out volumes, each met with a gain that has not seen it, and not localised; "
+    "their parts add up to them, but for {motion}: by how much they differ between open and closed "
+    "frame. Prior of the moduli: {prior:.2f}."
 )
-
-UNSEEN = "directions that no sample shows"
-"""Of errors of the images: what is lost because few samples tell of them."""
-
-
-def with_unseen(rows: Sequence[Cost], moduli: Sequence[UnknownRow]) -> list[Cost]:
-    """The rows, and what the reported intervals have beyond them."""
-    out = list(rows)
-    for modulus in moduli:
-        whole = [r.without for r in rows if (r.part, r.modulus) == (EVERYTHING, modulus.name)]
-        width = log_width(modulus)
-        if whole and width is not None:
-            reported = width / (2 * HALF)
-            beyond = max(reported**2 - whole[0] ** 2, 0.0)
-            out.append(Cost(UNSEEN, modulus.name, whole[0], float(np.sqrt(beyond))))
-    return out
 
 
 def budget_table(budgets: Mapping[str, Sequence[Cost]]) -> pd.DataFrame:
@@ -95,7 +77,7 @@ def budget_figure(budgets: Mapping[str, Sequence[Cost]]) -> Figure:
     headline(
         figure,
         "Where the information dies between a volume and a modulus",
-        "Each part of what is not known, alone and taken away; dashed: all but the last.",
+        "Each part of what is not known, alone and taken away; dashed: with all of it.",
     )
     return figure
 
@@ -128,9 +110,8 @@ def write_budget(
     note = NOTE.format(
         n=len(budgets),
         everything=f"*{EVERYTHING}*",
-        apart=f"*{APART}*",
+        motion=f"*{MOTION}*",
         prior=prior,
-        unseen=f"*{UNSEEN}*",
     )
     return [
         *write_table(base, table, readable, line, [note, budget_words(medians)]),
@@ -143,12 +124,12 @@ def budget_words(medians: pd.DataFrame) -> str:
     said = []
     for leaflet in medians["alone"].columns:
         without, alone = medians["without"][leaflet], medians["alone"][leaflet]
-        parts = [part for part in medians.index if part not in (EVERYTHING, IMAGES, APART)]
+        parts = [part for part in medians.index if part not in (EVERYTHING, IMAGES, MOTION)]
         worst = alone[parts].sort_values(ascending=False).index[:3]
         listed = ", ".join(f"{part} ({alone[part]:.2f})" for part in worst)
         said.append(
             f"{leaflet.capitalize()}: {without[EVERYTHING]:.2f} with everything, "
-            f"{without[IMAGES]:.2f} without errors of the images; {without[APART]:.2f} if those of "
-            f"the frames were unlike each other. Alone cost most: {listed}."
+            f"{without[IMAGES]:.2f} without errors of the images, {without[MOTION]:.2f} if these "
+            f"were the same in both frames. Alone cost most: {listed}."
         )
     return " ".join(said)

@@ -9,7 +9,7 @@ from experiments.common.cases.blind import ESTIMATE, read_estimate
 from experiments.common.cases.report import estimation_text, write_case_run
 from experiments.common.cases.skill import skill_words
 from experiments.common.records.record import Record
-from experiments.studies.imaged_patient.budget import with_unseen, write_budget
+from experiments.studies.imaged_patient.budget import write_budget
 from experiments.studies.imaged_patient.findings import KNOWN, SEGMENTED, Findings
 from experiments.studies.imaged_patient.tables import write_volume_tables
 from mvest.reporting.case.findings import UnknownRow
@@ -52,10 +52,7 @@ def write_volumes(
     last = list(records.values())[-1]
     rows = [row for record in records.values() for row in record.findings.rows]
     first = rows[0].modulus
-    budgets = {
-        record.row: with_unseen(record.findings.budget, record.findings.unknowns)
-        for record in records.values()
-    }
+    budgets = {record.row: record.findings.budget for record in records.values()}
     return [
         *write_volume_tables(folder / last.table, rows, last.line),
         *write_budget(
