@@ -15,7 +15,7 @@ import numpy as np
 
 from mvest.closure.anchors import NOT_FOUND, Anchors, Kept, content_digest
 from mvest.closure.coordinates import Coordinates
-from mvest.errors import InputError, MaterialError
+from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.integrate import simulate
@@ -518,13 +518,17 @@ class ClosureModel:
         return run([*rests, Step(end + sum(REST) + 1.0, static=True)])
 
     def _guided(self, guide: ClosureModel, m: FloatArray) -> FloatArray | None:
-        """The guide's closed state at this mesh's nodes ``(n, 3)``; None if it does not close."""
-        simulation = guide.close(m, sensitivities=False).simulation
-        if not simulation.converged:
-            return None
+        """The guide's closed state at this mesh's nodes ``(n, 3)``.
+
+        None if it does not close, or if its cells are so coarse that they do not hold this mesh.
+        """
         if self._in_guide is None:
-            self._in_guide = embed(guide.mesh, self.mesh.nodes)
-        return self._in_guide(simulation.frames[-1])
+            try:
+                self._in_guide = embed(guide.mesh, self.mesh.nodes)
+            except GeometryError:
+                return None
+        simulation = guide.close(m, sensitivities=False).simulation
+        return self._in_guide(simulation.frames[-1]) if simulation.converged else None
 
     @cached_property
     def observed(self) -> Embedding:
