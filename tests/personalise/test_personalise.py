@@ -23,7 +23,7 @@ from mvest.personalise import (
     build_model,
     personalise_case,
 )
-from mvest.personalise.error_budget import APART, EVERYTHING, IMAGES
+from mvest.personalise.error_budget import EVERYTHING, IMAGES, MOTION
 from mvest.personalise.estimation import CaseEstimation
 from mvest.personalise.fitted_frames import _thinned
 from mvest.personalise.geometry_errors import GeometryErrors
@@ -664,8 +664,9 @@ def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
         everything, images = of[EVERYTHING, modulus], of[IMAGES, modulus]
         assert everything.alone < images.alone
         assert images.without < everything.without
-        # Errors that are the same in both frames cancel in part; unlike each other they do not.
-        assert of[APART, modulus].without > everything.without
+        # They are the same in both frames, so that nothing is wrong with the motion between these.
+        assert of[MOTION, modulus].without == pytest.approx(everything.without, rel=1e-9)
+        assert of[MOTION, modulus].alone < 0.01 * images.alone
     plain = replace(case, error_samples=None)
     assert personalise_case(plain, settings(*right_nuisances())).budget == ()
 
