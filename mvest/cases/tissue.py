@@ -11,6 +11,7 @@ from mvest.cases.case import Frame, Role
 from mvest.cases.checks import at, check_chordae, check_thickness
 from mvest.cases.chord_layout import (
     CLOSED_DEPTH,
+    SEEN_CLOSURE,
     LeafletBand,
     assumed_closure,
     lay_out_chordae,
@@ -22,6 +23,7 @@ from mvest.cases.schema import CaseFile, ChordaeEntry, PointData
 from mvest.errors import GeometryError, InputError
 from mvest.reading.table import indices, numbers, read_columns
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 
@@ -193,7 +195,8 @@ def _laid_out(
             closed_rims.free_edge,
             anterior,
         )
-    chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips)
+    layout = SEEN_CLOSURE if seen_closed else ChordLayout()
+    chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips, layout)
     derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "
         f"rest lengths from {how}"

@@ -94,3 +94,32 @@ class ValveLayout:
     def vertex(self, phi: float, row: int) -> int:
         """Number of the vertex at an angle and a row (negative: from the free edge)."""
         return (row % self.rows) * self.columns + self.column(phi)
+
+    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The triangles that hold places, between whose corners phi and s are linear.
+
+        Parameters
+        ----------
+        phi : (k,) degrees
+        s : (k,)
+            From 0 to 1.
+
+        Returns
+        -------
+        corners : (k, 3)
+        weights : (k, 3)
+        """
+        across, down = np.mod(phi, 360.0) / 360.0 * self.columns, s * (self.rows - 1)
+        column = np.floor(across).astype(np.int64)
+        row = np.minimum(np.floor(down).astype(np.int64), self.rows - 2)
+        u, v = across - column, down - row
+        begin, end = row * self.columns, (row + 1) * self.columns
+        here, beside = column % self.columns, (column + 1) % self.columns
+        # The diagonal of a cell runs from its first corner to the opposite one.
+        a, b, c, d = begin + here, begin + beside, end + beside, end + here
+        lower = v >= u
+        corners = np.stack([a, np.where(lower, d, c), np.where(lower, c, b)], axis=1)
+        weights = np.stack(
+            [1.0 - np.maximum(u, v), np.where(lower, v - u, v), np.where(lower, u, u - v)], axis=1
+        )
+        return corners, weights

@@ -7,12 +7,12 @@ import pytest
 
 from experiments.run import main
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import CLOSED_DEPTH, LeafletBand, assumed_closure
+from mvest.cases.chord_layout import CLOSED_DEPTH, LeafletBand, assumed_closure, lay_out_chordae
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
-from mvest.valve.anatomy.template import Template
+from mvest.valve.anatomy.template import ChordLayout, Template
 from tests.cases.folders import plain_folder, save, template_case
 from tests.cases.test_folder import assert_equal
 
@@ -63,6 +63,15 @@ def test_chordae_of_an_open_frame_alone_are_long_enough_to_close_it(tmp_path):
     ratio = case.chordae.rest_length[marginal] / own.rest_length[own.family == 0]
     assert abs(np.median(ratio) - 1) < 0.1
     assert ratio.min() > 0.75
+    # By the slack that the template gives them at a closure that is intended, as this one is.
+    surface, frame = case.surface, case.frames[0]
+    band = LeafletBand.of(
+        surface.vertices, surface.triangles, surface.region, case.annulus, case.free_edge, 0
+    )
+    goal = assumed_closure(band, frame.annulus, frame.papillary_tips)
+    tips = frame.papillary_tips
+    expected = lay_out_chordae(band, tips, goal, tips, ChordLayout()).rest_length
+    np.testing.assert_allclose(case.chordae.rest_length, expected, rtol=1e-9)
 
 
 def test_an_assumed_closure_brings_the_edges_together(anatomy):

@@ -69,3 +69,20 @@ def test_a_vertex_is_found_by_angle_and_row():
 def test_a_layout_without_middles_is_refused(columns, rows):
     with pytest.raises(InputError, match="multiple of 4"):
         ValveLayout(columns, rows)
+
+
+def test_places_are_found_where_phi_and_s_are_linear():
+    layout = ValveLayout(16, 7)
+    rng = np.random.default_rng(3)
+    phi = np.concatenate([rng.uniform(-400.0, 400.0, 200), [0.0, 360.0, 22.5, 359.999]])
+    s = np.concatenate([rng.uniform(size=200), [0.0, 1.0, 1.0, 0.5]])
+    corners, weights = layout.locate(phi, s)
+    assert weights.min() >= -1e-12
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    # Triangles of the layout, the same as are drawn and meshed.
+    known = {tuple(sorted(t)) for t in layout.triangles.tolist()}
+    assert all(tuple(sorted(t)) in known for t in corners.tolist())
+    np.testing.assert_allclose((weights * layout.s[corners]).sum(axis=1), s, atol=1e-12)
+    # Angles of the corners, unwrapped about the one asked for.
+    near = phi[:, None] + np.mod(layout.phi[corners] - phi[:, None] + 180.0, 360.0) - 180.0
+    np.testing.assert_allclose((weights * near).sum(axis=1), phi, atol=1e-9)

@@ -550,6 +550,22 @@ def test_an_imaged_patient_has_moving_tips_and_stated_chordae(made):
     assert made.stated.surface.vertices.shape == made.valve.vertices[0].shape
 
 
+def test_chord_ratios_are_true_lengths_over_what_they_span_in_the_closed_valve(made):
+    # A valve twice as large when it is closed, in which a chord spans twice as much.
+    twice, tips = made.valve.vertices.copy(), made.valve.tips.copy()
+    twice[made.closed], tips[made.closed] = 2 * twice[0], 2 * TEMPLATE.papillary_tips
+    patient = replace(made, valve=replace(made.valve, vertices=twice, tips=tips))
+    chordae = TEMPLATE.chordae()
+    spans = np.linalg.norm(chordae.insertion - TEMPLATE.papillary_tips[chordae.tip], axis=1)
+    ratios = patient.chord_ratios()
+    assert set(ratios) == {"marginal", "basal"}
+    for family, name in enumerate(chordae.family_names):
+        own = chordae.family == family
+        expected = 1.01 * chordae.rest_length[own] / (2 * spans[own])
+        # Insertions lie on the curved leaflet, ends on flat triangles.
+        np.testing.assert_allclose(ratios[name], expected, rtol=0.02)
+
+
 def test_an_imaged_patient_is_in_equilibrium():
     moving = replace(MECHANICS, protocol=replace(MECHANICS.protocol, equilibrium=False))
     with pytest.raises(InputError, match="equilibrium = False, expected True"):

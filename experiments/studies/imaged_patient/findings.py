@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from experiments.common.records.estimates import Data, SeedRun
 from mvest.problem.verdict import NONE
@@ -54,6 +55,8 @@ class Findings:
 
     What is of the volume is empty or None if its estimation left nothing. ``repeats`` are the
     moduli, by which runs are compared; anatomies were drawn until one closed as a valve does.
+    Of each family of chordae the true rest lengths over the distance of their ends in the closed
+    valve are revealed, too: estimators lay chordae out by a typical one.
     """
 
     rows: tuple[Row, ...]
@@ -66,3 +69,4 @@ class Findings:
     repeats: tuple[SeedRun, ...] = ()
     data: Data | None = None
     anatomies_drawn: int | None = None
+    chord_ratios: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

@@ -54,7 +54,12 @@ def write_volumes(
     first = rows[0].modulus
     budgets = {record.row: record.findings.budget for record in records.values()}
     return [
-        *write_volume_tables(folder / last.table, rows, last.line),
+        *write_volume_tables(
+            folder / last.table,
+            rows,
+            last.line,
+            [record.findings.chord_ratios for record in records.values()],
+        ),
         *write_budget(
             folder / f"{last.table}_budget", budgets, first.prior_std / first.prior_mean, last.line
         ),

@@ -132,6 +132,7 @@ def run_imaged_patient(job: Job[Settings]) -> Outcome[Findings]:
         repeats=(replace(left.repeats[0], seed=values["seed"]),) if left else (),
         data=left.data if left else None,
         anatomies_drawn=hidden["anatomies_drawn"],
+        chord_ratios=hidden["chord_ratios"],
     )
     return Outcome(
         findings=findings,
@@ -288,6 +289,7 @@ def _write(place: ImagedPlace, imaged: _Made, patient: PatientSettings, describe
             "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
             "made_from": dict(described),
             "anatomies_drawn": draws,
+            "chord_ratios": {name: each.tolist() for name, each in made.chord_ratios().items()},
         },
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -14,11 +14,12 @@ from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import baselines, skill_words
 from experiments.common.records.tables import write_table
 from experiments.studies.imaged_patient.findings import Row
+from mvest.cases.chord_layout import SEEN_CLOSURE
 from mvest.errors import InputError
 from mvest.problem.verdict import NONE
 from mvest.reporting.markup import MISSING, number
 
-__all__ = ["volume_table", "volume_words", "write_volume_tables"]
+__all__ = ["chord_words", "volume_table", "volume_words", "write_volume_tables"]
 
 TRUTH_OF_MODULI: Final = (
     "Moduli estimated from simulated transoesophageal echo (TEE) volumes of simulated valves. The "
@@ -132,8 +133,39 @@ def _medians(table: pd.DataFrame) -> str:
     return ", ".join(f"{words} {v:.1f} %" for words, v in sizes.items() if np.isfinite(v))
 
 
-def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path]:
+def chord_words(ratios: Sequence[Mapping[str, Sequence[float]]]) -> str:
+    """How long the chordae of all patients are, each family -> as `Findings.chord_ratios`.
+
+    Empty where no patient has them.
+    """
+    known = [one for one in ratios if one]
+    if not known:
+        return ""
+    said = []
+    for family in known[0]:
+        each = [np.asarray(one[family]) for one in known]
+        among = f", of a patient's mean {np.std([e.mean() for e in each], ddof=1):.3f}"
+        said.append(
+            f"{np.mean(np.concatenate(each)):.3f} ({family}; SD "
+            f"{np.std(np.concatenate(each), ddof=1):.3f}{among if len(known) > 1 else ''})"
+        )
+    slack = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
+    laid_out = " and ".join(f"{slack[family]:g}" for family in known[0])
+    return (
+        f"Chordae of {len(known)} patients, true rest length over the distance of their ends in "
+        f"the closed valve: {', '.join(said)}; laid out by {laid_out}."
+    )
+
+
+def write_volume_tables(
+    base: Path,
+    rows: Sequence[Row],
+    line: str,
+    chord_ratios: Sequence[Mapping[str, Sequence[float]]] = (),
+) -> list[Path]:
     """The table ``base`` of rows as for `volume_table`; ``line`` says where they came from.
+
+    Chord ratios are those of each patient, as for `chord_words`.
 
     Raises
     ------
@@ -167,4 +199,5 @@ def write_volume_tables(base: Path, rows: Sequence[Row], line: str) -> list[Path
     ]
     stated = [row.as_stated for row in rows]
     notes = [TRUTH_OF_MODULI, skill_words(stated), *volume_words(table)]
+    notes += filter(None, [chord_words(chord_ratios)])
     return write_table(base, table, readable, line, notes)

@@ -16,13 +16,13 @@ from mvest.cases.checks import (
     check_tips,
     ventricular_side,
 )
-from mvest.cases.chord_layout import LeafletBand, lay_out_chordae
+from mvest.cases.chord_layout import SEEN_CLOSURE, lay_out_chordae
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
-from mvest.typing import FloatArray
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import Template, TemplateParameters, vertex_region
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
@@ -32,6 +32,17 @@ __all__ = ["CaseTexts", "case_of_sequence"]
 
 UNSEEN_STD_MM = 10.0
 """Standard deviation of a vertex whose error was never measured: it is given no weight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """The valve of a frame, whose layout knows the template's coordinates."""
+
+    vertices: FloatArray
+    layout: ValveLayout
+
+    def locate(self, phi: FloatArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+        return self.layout.locate(phi, s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +120,12 @@ def case_of_sequence(
         _fibres(layout, reference, typical),
         thickness,
     )
-    band = LeafletBand.of(
-        reference,
-        layout.triangles,
-        layout.region,
-        layout.annulus,
-        layout.free_edge,
-        layout.region_names.index("anterior"),
-    )
     chordae = lay_out_chordae(
-        band,
+        _Placed(reference, layout),
         sequence.tips[frames.open],
         sequence.vertices[frames.closed],
         sequence.tips[frames.closed],
+        SEEN_CLOSURE,
     )
     derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "

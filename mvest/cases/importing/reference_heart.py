@@ -17,6 +17,7 @@ from mvest.cases.importing.papillary import HEAD_MM, papillary_tip
 from mvest.cases.surface_files import part_of
 from mvest.errors import InputError
 from mvest.typing import FloatArray
+from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
@@ -146,7 +147,7 @@ def import_reference_heart(source: Path | None, options: ReferenceHeartOptions) 
     )
     band = LeafletBand.of(vertices, middle.triangles, middle.region, *loops, anterior=0)
     closed = assumed_closure(band, vertices[middle.annulus], tips, options.closed_depth)
-    chordae = lay_out_chordae(band, tips, closed, tips)
+    chordae = lay_out_chordae(band, tips, closed, tips, ChordLayout())
     frame = Frame(
         "open",
         0.0,

@@ -38,6 +38,7 @@ from mvest.simulation.virtual_patient import (
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
+from mvest.valve.geometry.proximity import closest_points
 
 __all__ = ["IMAGED", "ImagedPatient", "simulate_imaged_patient"]
 
@@ -76,6 +77,21 @@ class ImagedPatient:
     closed: int
     stated: Valve
     hidden: Hidden
+
+    def chord_ratios(self) -> dict[str, FloatArray]:
+        """Family -> true rest lengths of its chordae over the distance of their ends, closed.
+
+        A layout by a closed frame that was seen needs it (`mvest.cases.chord_layout`).
+        """
+        surface, chordae = self.stated.surface, self.stated.chordae
+        place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+        ends = place.interpolate(self.valve.vertices[self.closed], surface.triangles)
+        away = np.linalg.norm(ends - self.valve.tips[self.closed][chordae.tip], axis=1)
+        ratio = self.hidden.values["chord_rest_length"] * chordae.rest_length / away
+        return {
+            name: ratio[chordae.family == family]
+            for family, name in enumerate(chordae.family_names)
+        }
 
 
 def simulate_imaged_patient(

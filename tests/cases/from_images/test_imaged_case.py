@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvest.cases.case import Role
+from mvest.cases.chord_layout import SEEN_CLOSURE
 from mvest.cases.folder import read_case
 from mvest.cases.from_images import (
     CaseFrames,
@@ -23,6 +24,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.valve.anatomy.template import Template
+from mvest.valve.geometry.proximity import closest_points
 from tests.cases.folders import closing
 from tests.cases.test_folder import assert_equal
 
@@ -62,6 +64,19 @@ def test_the_case_is_that_of_the_frames_and_passes_the_checks_of_a_folder(tmp_pa
     assert all(frame.corresponds for frame in case.frames)
     assert case.chordae_follow
     assert len(case.chordae) == 34
+    # Where the template has them: the layout's phi and s are its own. Flat triangles of 6 mm lie
+    # up to 0.3 mm off the curved leaflet.
+    gap = np.linalg.norm(case.chordae.insertion - Template().chordae().insertion, axis=1)
+    assert gap.max() < 0.3
+    # By the closed frame, as one that was seen.
+    here, there = (f.vertices for f in (case.frames[0], case.frames[1]))
+    place = closest_points(case.chordae.insertion, here, case.surface.triangles)
+    ends = place.interpolate(there, case.surface.triangles)
+    spans = np.linalg.norm(ends - case.frames[1].papillary_tips[case.chordae.tip], axis=1)
+    slack = np.array([SEEN_CLOSURE.marginal_slack, SEEN_CLOSURE.basal_slack])[case.chordae.family]
+    by_closed = case.chordae.rest_length / spans < 1.0001 * slack
+    assert by_closed.sum() >= 6
+    np.testing.assert_allclose((case.chordae.rest_length / spans)[by_closed], slack[by_closed])
     np.testing.assert_array_equal(case.uncertainty.std_mm, sequence().std_mm)
     assert_equal(read_case(write_case(tmp_path / "case", case)), case, "sha256", "derived")
 

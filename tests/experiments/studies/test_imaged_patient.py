@@ -16,6 +16,7 @@ from experiments.studies.imaged_patient.budget import write_budget
 from experiments.studies.imaged_patient.findings import Findings, KnownGeometry, Row
 from experiments.studies.imaged_patient.study import STUDY, ImagedPlace, volume_rows
 from experiments.studies.imaged_patient.tables import (
+    chord_words,
     volume_table,
     volume_words,
     write_volume_tables,
@@ -84,7 +85,13 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
 ):
     place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
     place.truth.mkdir(parents=True)
-    hidden = {"stated": {}, "values": TRUTH, "made_from": "x", "anatomies_drawn": 1}
+    hidden = {
+        "stated": {},
+        "values": TRUTH,
+        "made_from": "x",
+        "anatomies_drawn": 1,
+        "chord_ratios": {"marginal": [1.01, 0.99], "basal": [0.96]},
+    }
     (place.truth / "hidden.json").write_text(json.dumps(hidden))
 
     def blindly(values, folder, case, sealed):
@@ -105,12 +112,13 @@ def test_an_estimation_from_the_known_geometry_that_is_lost_loses_nothing_else(
     assert "MemoryError" in findings.known_geometry.reason
     assert findings.repeats[0].estimate == (5.0, 2.5)
     assert findings.repeats[0].seed == 1
+    assert findings.chord_ratios == {"marginal": [1.01, 0.99], "basal": [0.96]}
 
 
 def test_a_volume_that_is_lost_keeps_what_is_known_of_the_geometry(monkeypatch, tmp_path):
     place = ImagedPlace(tmp_path / "volume.seq.nrrd", tmp_path / "hidden")
     place.truth.mkdir(parents=True)
-    hidden = {"stated": {}, "values": TRUTH, "anatomies_drawn": 2}
+    hidden = {"stated": {}, "values": TRUTH, "anatomies_drawn": 2, "chord_ratios": {}}
     (place.truth / "hidden.json").write_text(json.dumps(hidden))
 
     def blindly(values, folder, case, sealed):
@@ -204,6 +212,19 @@ def test_the_table_of_moduli_is_readable(tmp_path):
     assert rows[2].count("–") == 5
     assert "Simulated" in text or "simulated" in text
     assert "\\" in written[2].read_text(encoding="utf-8")
+
+
+def test_how_long_chordae_are_is_said_of_all_patients_that_it_is_known_of(tmp_path):
+    ratios = [{"marginal": [1.0, 1.04], "basal": [0.95]}, {}, {"marginal": [0.98], "basal": [0.97]}]
+    # Of three chordae 1.0067 and 0.0306, of two means 1.02 and 0.98 (their SD 0.0283).
+    assert chord_words(ratios) == (
+        "Chordae of 2 patients, true rest length over the distance of their ends in the closed "
+        "valve: 1.007 (marginal; SD 0.031, of a patient's mean 0.028), 0.960 (basal; SD 0.014, of "
+        "a patient's mean 0.014); laid out by 1 and 0.966."
+    )
+    assert chord_words([{}]) == ""
+    write_volume_tables(tmp_path / "volume", MODULI, "line", ratios)
+    assert "0.960 (basal" in (tmp_path / "volume.md").read_text(encoding="utf-8")
 
 
 def test_what_errors_cost_is_a_median_over_patients(tmp_path):
