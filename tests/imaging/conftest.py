@@ -59,5 +59,6 @@ def trained(shape, seen_valve, settings):
     accuracy = DetectionAccuracy(
         rng.uniform(0.5, 2, n), 6.5, rng.standard_normal((3, 2, n, 3)),
         rng.standard_normal((3, 2, 2, 3)),
+        shapes=rng.standard_normal((3, 2, n, 3)), tip_shapes=rng.standard_normal((3, 2, 2, 3)),
     )  # fmt: skip
     return DetectionModel(shape, boosters, {"seed": 5, "valves": ["a", "b"]}, accuracy)

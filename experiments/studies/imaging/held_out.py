@@ -73,7 +73,7 @@ class HeldOut:
         )
 
     def stacked(self, kind: str, name: str) -> FloatArray:
-        """Arrays of all volumes over time: ``errors (S, 2, n, 3)``, ``tip_errors``, ``rest`` mm."""
+        """An array of all volumes over time `(S, ...)` mm, one of those of `try_sequence`."""
         return np.stack([arrays[name] for _, arrays in self.sequences[kind]])
 
 

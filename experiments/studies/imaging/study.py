@@ -122,6 +122,11 @@ def _calibrated(
         detected.stacked(kind, name) for name in ("errors", "tip_errors", "rest")
     )
     accuracy, correlogram = measure_accuracy(samples, tips, rest.mean(axis=0))
+    accuracy = replace(
+        accuracy,
+        shapes=detected.stacked(kind, "shapes"),
+        tip_shapes=detected.stacked(kind, "tip_shapes"),
+    )
     valves = [row["valve"] for row, _ in rows]
     wide = held_out.detected(WIDE, threshold, wrong)
     if wide.sequences[WIDE]:

@@ -182,7 +182,8 @@ def try_sequence(
     -------
     dict
         ``row`` (plain values, JSON text), and in mm, estimated minus true in the valve's own axes,
-        ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open and the closed frame, and
+        ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open and the closed frame;
+        ``shapes`` and ``tip_shapes``, where the valve was found, in the axes of what was found; and
         ``rest`` (n, 3), where the true open valve's vertices are.
     """
     draw, scan = asked.random.spawn(2)
@@ -220,10 +221,15 @@ def try_sequence(
     two = [0, closed]
     axes = [pose_of(true.vertices[k], true.tips[k], layout) for k in two]
     turn = np.concatenate([pose.rotation for pose in axes])
+    found = [pose_of(detected.vertices[k], detected.tips[k], layout) for k in two]
+    centre = np.stack([pose.centre for pose in found])
+    own = np.concatenate([pose.rotation for pose in found])
     return {
         "row": json.dumps(row),
         "errors": (detected.vertices[two] - true.vertices[two]) @ turn,
         "tip_errors": (detected.tips[two] - true.tips[two]) @ turn,
+        "shapes": (detected.vertices[two] - centre) @ own,
+        "tip_shapes": (detected.tips[two] - centre) @ own,
         "rest": (true.vertices[0] - axes[0].centre[0]) @ turn[0],
     }
 

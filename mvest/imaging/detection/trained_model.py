@@ -83,6 +83,10 @@ class DetectionAccuracy:
     like_from : float
         Confidence below which a volume is unlike those of training: of these, `UNLIKE_SHARE` are
         expected there.
+    shapes : (S, F, n, 3) mm or None
+        Where the valves of these sequences were found, each frame in its own axes (`pose_of`).
+        None: a model of before this was kept.
+    tip_shapes : (S, F, 2, 3) mm or None
     """
 
     std_mm: FloatArray
@@ -91,6 +95,8 @@ class DetectionAccuracy:
     tip_samples: FloatArray
     widening: tuple[float, float] = (1.0, 0.0)
     like_from: float = 0.0
+    shapes: FloatArray | None = None
+    tip_shapes: FloatArray | None = None
 
     def at(self, confidence: float) -> DetectionAccuracy:
         """Errors in a volume of some confidence: wider about their mean the less it is."""
@@ -196,6 +202,9 @@ def save_model(path: Path | str, model: DetectionModel) -> None:
         arrays["accuracy.tip_samples"] = accuracy.tip_samples.astype(np.float32)
         arrays["accuracy.widening"] = np.array(accuracy.widening)
         arrays["accuracy.like_from"] = np.array(accuracy.like_from)
+        if accuracy.shapes is not None and accuracy.tip_shapes is not None:
+            arrays["accuracy.shapes"] = accuracy.shapes.astype(np.float32)
+            arrays["accuracy.tip_shapes"] = accuracy.tip_shapes.astype(np.float32)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
@@ -278,6 +287,10 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
         known = {"widening": np.array([1.0, 0.0]), "like_from": np.array(0.0)}
         known |= {key: stored[name] for key in known if (name := f"accuracy.{key}") in stored}
         start, slope = _numbers(known, "widening", (2,))
+        shapes = tip_shapes = None
+        if "accuracy.shapes" in stored:
+            shapes = _numbers(stored, "accuracy.shapes", (*count, n, 3))
+            tip_shapes = _numbers(stored, "accuracy.tip_shapes", (*count, 2, 3))
         accuracy = DetectionAccuracy(
             _numbers(stored, "accuracy.std_mm", (n,)),
             float(_numbers(stored, "accuracy.correlation_length_mm", ())),
@@ -285,6 +298,8 @@ def _model(stored: Mapping[str, NDArray[Any]], source: Path, sha256: str) -> Det
             _numbers(stored, "accuracy.tip_samples", (*count, 2, 3)),
             (float(start), float(slope)),
             float(_numbers(known, "like_from", ())),
+            shapes,
+            tip_shapes,
         )
     return DetectionModel(shape, boosters, about["trained_on"], accuracy, sha256)
 

@@ -47,8 +47,9 @@ def test_shapes_and_accuracy_come_back(trained, loaded):
     np.testing.assert_array_equal(loaded.shape.tips, trained.shape.tips)
     np.testing.assert_array_equal(loaded.accuracy.std_mm, trained.accuracy.std_mm)
     assert loaded.accuracy.correlation_length_mm == 6.5
-    np.testing.assert_allclose(loaded.accuracy.samples, trained.accuracy.samples, atol=1e-6)
-    np.testing.assert_allclose(loaded.accuracy.tip_samples, trained.accuracy.tip_samples, atol=1e-6)
+    for name in ("samples", "tip_samples", "shapes", "tip_shapes"):
+        before, after = getattr(trained.accuracy, name), getattr(loaded.accuracy, name)
+        np.testing.assert_allclose(after, before, atol=1e-6)
     assert loaded.trained_on == {"seed": 5, "valves": ["a", "b"]}
 
 
