@@ -25,6 +25,7 @@ from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface
 __all__ = [
     "CLOSED_DEPTH",
     "SEEN_CLOSURE",
+    "SEEN_ON_BAND",
     "LeafletBand",
     "Places",
     "assumed_closure",
@@ -37,13 +38,16 @@ CLOSED_DEPTH = 0.75
 """Of the free edge below the annulus, closed over open, where no closed frame is known; the
 template's rises from 16.3 to 12.2 mm on average."""
 
-SEEN_CLOSURE = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
+SEEN_CLOSURE = replace(ChordLayout(), marginal_slack=1.007, basal_slack=0.985)
 """The template's layout by where a closed valve was seen, rather than by the closure it intends.
 
-Under pressure a valve does not close just as intended, and its chordae are stretched: in sixteen
-simulated virtual patients they are 1.002 (SD from chord to chord 0.03, marginal) and 0.966 (0.013,
-basal) times as long as their ends lie apart in the closed valve, where a `LeafletBand` puts them.
-Where the template has them itself, up to 1.7 mm away, basal ones are 0.985 times as long."""
+Under pressure a valve does not close just as intended, and its chordae are stretched: in thirty
+simulated virtual patients they are 1.007 (SD from chord to chord 0.028, marginal) and 0.985 (0.023,
+basal) times as long as their ends lie apart in the closed valve."""
+
+SEEN_ON_BAND = replace(ChordLayout(), marginal_slack=1.0, basal_slack=0.966)
+"""The same where a `LeafletBand` places them, basal ones up to 1.7 mm elsewhere: there chordae are
+1.002 (SD 0.03, marginal) and 0.966 (0.013, basal) times as long in sixteen simulated valves."""
 
 
 class Places(Protocol):
@@ -221,8 +225,8 @@ def lay_out_chordae(
         The closed frame: ``(n, 3)`` mm, where the vertices of the reference are in it, or a valve
         with coordinates of its own if its vertices do not correspond.
     layout
-        `SEEN_CLOSURE` for a closed frame that was seen, the template's for one that is intended
-        (`assumed_closure`).
+        The template's for a closed frame that is intended (`assumed_closure`), and for one that was
+        seen `SEEN_CLOSURE`, or `SEEN_ON_BAND` if the valves are of that kind.
 
     Raises
     ------

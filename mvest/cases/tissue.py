@@ -11,7 +11,7 @@ from mvest.cases.case import Frame, Role
 from mvest.cases.checks import at, check_chordae, check_thickness
 from mvest.cases.chord_layout import (
     CLOSED_DEPTH,
-    SEEN_CLOSURE,
+    SEEN_ON_BAND,
     LeafletBand,
     assumed_closure,
     lay_out_chordae,
@@ -195,7 +195,7 @@ def _laid_out(
             closed_rims.free_edge,
             anterior,
         )
-    layout = SEEN_CLOSURE if seen_closed else ChordLayout()
+    layout = SEEN_ON_BAND if seen_closed else ChordLayout()
     chordae = lay_out_chordae(band, seen.tips, goal, closed.papillary_tips, layout)
     derived.append(
         f"chordae: {len(chordae)} laid out as in the template, each to its nearer papillary tip, "

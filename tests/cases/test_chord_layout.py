@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_CLOSURE, LeafletBand, lay_out_chordae
+from mvest.cases.chord_layout import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
 from mvest.valve.anatomy.template import ChordLayout, Template
@@ -94,8 +94,8 @@ def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
     tips = np.array([[20.0, 1.0, -30.0], [-20.0, 0.0, -30.0]])
     shape = [0.9, 0.9, 1.4]
     other = LeafletBand.of(x * shape, t, r, annulus, free_edge, anterior=1)
-    same = lay_out_chordae(band, tips, band.vertices * shape, tips, SEEN_CLOSURE)
-    found = lay_out_chordae(band, tips, other, tips, SEEN_CLOSURE)
+    same = lay_out_chordae(band, tips, band.vertices * shape, tips, SEEN_ON_BAND)
+    found = lay_out_chordae(band, tips, other, tips, SEEN_ON_BAND)
     np.testing.assert_array_equal(found.insertion, same.insertion)
     # The finer polygon lies within R (1 - cos 5 deg) = 0.06 mm of the coarser.
     np.testing.assert_allclose(found.rest_length, same.rest_length, atol=0.06)
@@ -104,7 +104,7 @@ def test_a_closed_frame_of_another_mesh_gives_the_same_chordae():
 def test_three_tips_are_refused():
     band = LeafletBand.of(*cylinder(), anterior=1)
     with pytest.raises(InputError, match="3 papillary tips; the layout of chordae needs two"):
-        lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)), SEEN_CLOSURE)
+        lay_out_chordae(band, np.zeros((3, 3)), band.vertices, np.zeros((3, 3)), SEEN_ON_BAND)
 
 
 def test_on_the_template_it_comes_near_the_templates_own(tmp_path):
@@ -139,7 +139,7 @@ def test_where_a_closed_frame_was_seen_chordae_are_nearly_as_long_as_in_the_valv
         surface.vertices, surface.triangles, surface.region, valve.annulus, valve.free_edge, 0
     )
     closed = prediction.y.reshape(2, -1, 3)[1]
-    laid_out = lay_out_chordae(band, tips[0], closed, tips[-1], SEEN_CLOSURE)
+    laid_out = lay_out_chordae(band, tips[0], closed, tips[-1], SEEN_ON_BAND)
     own = valve.chordae
     for family in (0, 1):
         ratio = [np.mean(each.rest_length[each.family == family]) for each in (laid_out, own)]
@@ -158,7 +158,7 @@ def test_a_case_with_a_closed_frame_lays_chordae_out_by_what_was_seen(tmp_path):
         surface.vertices, surface.triangles, surface.region, case.annulus, case.free_edge, 0
     )
     closed = case.frame(Role.CLOSED)
-    seen = lay_out_chordae(band, tips, closed.vertices, closed.papillary_tips, SEEN_CLOSURE)
+    seen = lay_out_chordae(band, tips, closed.vertices, closed.papillary_tips, SEEN_ON_BAND)
     np.testing.assert_allclose(case.chordae.rest_length, seen.rest_length, rtol=1e-9)
 
 

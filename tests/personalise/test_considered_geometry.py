@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from mvest.cases.case import Role
-from mvest.cases.chord_layout import SEEN_CLOSURE, LeafletBand, lay_out_chordae
+from mvest.cases.chord_layout import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.closure.frames import FramesModel
 from mvest.closure.rest_geometry import RestGeometry
 from mvest.errors import GeometryError, InputError
@@ -149,7 +149,7 @@ def laid_out(case, tips=0.0, open_move=0.0, closed_move=0.0):
         np.asarray(case.frame(Role.REFERENCE).papillary_tips) + tips,
         closed.vertices + closed_move,
         closed.papillary_tips + tips,
-        SEEN_CLOSURE,
+        SEEN_ON_BAND,
     )
 
 

@@ -19,7 +19,7 @@ from experiments.common.records.record import Outcome
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.from_images.build import CaseTexts, case_of_sequence
-from mvest.cases.from_images.errors_in_world import samples_in_world, without_mean_error
+from mvest.cases.from_images.errors_in_world import samples_in_world, without_expected_error
 from mvest.cases.from_images.files import write_for_slicer, write_surfaces
 from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
 from mvest.cases.from_images.measure_bands import with_bands
@@ -171,9 +171,7 @@ def detect_in_volume(
     )
     accuracy = model.accuracy.at(valve.confidence)
     rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
-    corrected, errors, tip_errors = without_mean_error(
-        valve, frames, accuracy.samples, accuracy.tip_samples
-    )
+    corrected, errors, tip_errors = without_expected_error(valve, frames, model.accuracy)
     kept = _thinned(len(errors), settings.error_samples)
     case = case_of_sequence(
         corrected,
@@ -187,8 +185,8 @@ def detect_in_volume(
         case,
         derived=(
             *case.derived,
-            "leaflets and tips: less the mean error of the detectors in simulated volumes "
-            f"({off.mean():.2f} mm in the closed frame)",
+            "leaflets and tips: less the error that is expected of the detectors where they find "
+            f"such a valve, by simulated volumes ({off.mean():.2f} mm in the closed frame)",
         ),
     )
     about = {"sha256": model.sha256, "trained_on": model.trained_on}

@@ -2,7 +2,7 @@ from .build import CaseTexts as CaseTexts
 from .build import case_of_sequence as case_of_sequence
 from .errors_in_world import samples_in_world as samples_in_world
 from .errors_in_world import valve_axes as valve_axes
-from .errors_in_world import without_mean_error as without_mean_error
+from .errors_in_world import without_expected_error as without_expected_error
 from .files import write_for_slicer as write_for_slicer
 from .files import write_landmarks as write_landmarks
 from .files import write_surfaces as write_surfaces

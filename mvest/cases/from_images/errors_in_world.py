@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from mvest.cases.case import ErrorSamples
+from mvest.cases.from_images.expected_error import error_at_shape, in_mirror
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
-from mvest.imaging.layout import ValveLayout
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = ["samples_in_world", "valve_axes", "without_mean_error"]
+__all__ = ["samples_in_world", "valve_axes", "without_expected_error"]
 
 
 def valve_axes(sequence: ValveSequence, frame: int) -> FloatArray:
@@ -47,71 +48,71 @@ def samples_in_world(
     """
     _require_layout(sequence, errors, tip_errors)
     count = len(errors)
-    errors, tip_errors = _with_mirror_images(sequence.layout, errors, tip_errors)
+    moves = np.concatenate([errors, tip_errors], axis=2)
+    moves = np.concatenate([moves, in_mirror(sequence.layout, moves)])
     numbers, which = _frames_and_errors(frames)
     axes = np.stack([valve_axes(sequence, number) for number in numbers])
     # Where it may have been is where it was found less the error.
-    return ErrorSamples(
-        -np.einsum("fij,kfnj->kfni", axes, errors[:, which]),
-        -np.einsum("fij,kfnj->kfni", axes, tip_errors[:, which]),
-        np.tile(np.arange(count), 2),
-    )
+    moves = -np.einsum("fij,kfnj->kfni", axes, moves[:, which])
+    return ErrorSamples(moves[:, :, :-2], moves[:, :, -2:], np.tile(np.arange(count), 2))
 
 
-def without_mean_error(
-    sequence: ValveSequence, frames: CaseFrames, errors: FloatArray, tip_errors: FloatArray
+def without_expected_error(
+    sequence: ValveSequence, frames: CaseFrames, accuracy: DetectionAccuracy
 ) -> tuple[ValveSequence, FloatArray, FloatArray]:
-    """The valve less the mean error of other valves, and the errors that are left of these.
+    """The valve less the error that is expected of it, and errors of other valves about theirs.
 
-    What detectors are off by on average, closed free edges that lie where most do for instance, no
-    spread of errors can make up for. Only the frames of the case are changed: the open one by the
-    mean error of open frames, the others by that of closed ones.
+    What detectors are off by on average where they find such a valve (`error_at_shape`), no spread
+    of errors can make up for: closed free edges that lie where most do, for instance. Only the
+    frames of the case are changed: the open one by the error of open frames, the others by that of
+    closed ones.
 
     Parameters
     ----------
-    sequence, frames, errors, tip_errors
-        As of :func:`samples_in_world`.
+    sequence : ValveSequence
+    frames : CaseFrames
+    accuracy : DetectionAccuracy
+        Of the detectors; errors about what is expected are as wide as is stated of a volume of this
+        confidence.
 
     Returns
     -------
     sequence : ValveSequence
-    errors, tip_errors : as they were
-        About their mean, and larger by sqrt((K + 1) / (K - 1)): of a valve that is none of the K
-        the error varies so much about the mean of these.
+    errors : (K, 2, n, 3) mm
+    tip_errors : (K, 2, 2, 3) mm
 
     Raises
     ------
     InputError
         They are not of this layout, or of fewer than two valves.
     """
-    _require_layout(sequence, errors, tip_errors)
-    if len(errors) < 2:
-        raise InputError(f"errors of {len(errors)} valves, expected two or more")
-    mean, tip_mean = errors.mean(axis=0), tip_errors.mean(axis=0)
+    _require_layout(sequence, accuracy.samples, accuracy.tip_samples)
+    if len(accuracy.samples) < 2:
+        raise InputError(f"errors of {len(accuracy.samples)} valves, expected two or more")
+    errors = np.concatenate([accuracy.samples, accuracy.tip_samples], axis=2)
+    shapes = None
+    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
+        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
+    shape = np.stack([_in_own_axes(sequence, n) for n in (frames.open, frames.closed)])
+    expected, samples = error_at_shape(sequence.layout, errors, shapes, shape)
     vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
     for number, which in zip(*_frames_and_errors(frames), strict=True):
-        axes = valve_axes(sequence, number)
-        vertices[number] -= mean[which] @ axes.T
-        tips[number] -= tip_mean[which] @ axes.T
-    larger = np.sqrt((len(errors) + 1) / (len(errors) - 1))
+        off = expected[which] @ valve_axes(sequence, number).T
+        vertices[number] -= off[:-2]
+        tips[number] -= off[-2:]
+    samples *= accuracy.factor(sequence.confidence)
     return (
         replace(sequence, vertices=vertices, tips=tips),
-        larger * (errors - mean),
-        larger * (tip_errors - tip_mean),
+        samples[:, :, :-2],
+        samples[:, :, -2:],
     )
 
 
-def _with_mirror_images(
-    layout: ValveLayout, errors: FloatArray, tip_errors: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Errors as of :func:`samples_in_world` and, after them, what they are in a mirror."""
-    rows, columns = np.divmod(np.arange(layout.size), layout.columns)
-    other = rows * layout.columns + np.mod(layout.columns // 2 - columns, layout.columns)
-    across = np.array([-1.0, 1.0, 1.0])
-    return (
-        np.concatenate([errors, across * errors[:, :, other]]),
-        np.concatenate([tip_errors, across * tip_errors[:, :, ::-1]]),
-    )
+def _in_own_axes(sequence: ValveSequence, frame: int) -> FloatArray:
+    """Leaflets and, after them, tips ``(n + 2, 3)`` mm in the axes of the valve in a frame."""
+    vertices, tips = sequence.vertices[frame], sequence.tips[frame]
+    pose = pose_of(vertices, tips, sequence.layout)
+    return np.asarray((np.concatenate([vertices, tips]) - pose.centre) @ pose.rotation[0])
 
 
 def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:

@@ -17,10 +17,11 @@ from mvest.cases.from_images import (
     measure_sequence,
     samples_in_world,
     valve_axes,
-    without_mean_error,
+    without_expected_error,
 )
 from mvest.cases.writer import write_case
 from mvest.errors import GeometryError, InputError
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.valve.anatomy.template import Template
@@ -189,7 +190,8 @@ def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
     tip_spread = rng.normal(size=(6, 2, 2, 3))
     tip_spread -= tip_spread.mean(axis=0)
     seen = sequence(TURN)
-    found, errors, tips = without_mean_error(seen, FRAMES, bias + spread, tip_bias + tip_spread)
+    accuracy = DetectionAccuracy(np.ones(LAYOUT.size), 9.0, bias + spread, tip_bias + tip_spread)
+    found, errors, tips = without_expected_error(seen, FRAMES, accuracy)
     for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
         axes = valve_axes(seen, number)
         off = (seen.vertices[number] - found.vertices[number]) @ axes
@@ -201,8 +203,9 @@ def test_the_mean_error_is_taken_off_in_the_axes_of_the_valve():
     untouched = set(range(len(seen.times))) - set(FRAMES.in_order)
     for number in untouched:
         np.testing.assert_array_equal(found.vertices[number], seen.vertices[number])
+    alone = replace(accuracy, samples=bias[None], tip_samples=tip_bias[None])
     with pytest.raises(InputError, match="errors of 1 valves"):
-        without_mean_error(seen, FRAMES, bias[None], tip_bias[None])
+        without_expected_error(seen, FRAMES, alone)
 
 
 def test_vertices_that_were_never_measured_have_no_weight():

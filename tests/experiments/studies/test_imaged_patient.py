@@ -220,7 +220,7 @@ def test_how_long_chordae_are_is_said_of_all_patients_that_it_is_known_of(tmp_pa
     assert chord_words(ratios) == (
         "Chordae of 2 patients, true rest length over the distance of their ends in the closed "
         "valve: 1.007 (marginal; SD 0.031, of a patient's mean 0.028), 0.960 (basal; SD 0.014, of "
-        "a patient's mean 0.014); laid out by 1 and 0.966."
+        "a patient's mean 0.014); laid out by 1.007 and 0.985."
     )
     assert chord_words([{}]) == ""
     write_volume_tables(tmp_path / "volume", MODULI, "line", ratios)

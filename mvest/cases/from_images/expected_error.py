@@ -1,0 +1,96 @@
+"""What the detectors are off by where they find such a valve, learned on other valves.
+
+Detectors are drawn to what they were trained on: what they are off by depends on how far from it a
+valve is, and so on what they find. The errors of S valves are regressed on the shapes in which
+these were found, linearly, with a penalty on the square of the coefficients that is chosen by
+leaving each valve out (ridge regression: Hoerl and Kennard, Technometrics 12, 1970; what is left of
+a valve that is left out, r / (1 - h): Allen, Technometrics 16, 1974). As a Gaussian process with a
+linear kernel (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sec. 2.1) it
+also says how much wider the error of one more valve varies about what is expected of it.
+
+Valves and detectors are nearly alike in a mirror across the middle of the leaflets, so what is even
+in it and what is odd are regressed apart: neither tells of the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvest.imaging.layout import ValveLayout
+from mvest.typing import FloatArray
+
+__all__ = ["error_at_shape", "in_mirror"]
+
+PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
+"""Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
+
+
+def error_at_shape(
+    layout: ValveLayout, errors: FloatArray, shapes: FloatArray | None, shape: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The error that is expected where a valve is found so, and how it may vary about that.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    errors : (S, F, n + 2, 3) mm
+        Of leaflets and, after them, papillary tips, of S >= 2 other valves in F frames.
+    shapes : (S, F, n + 2, 3) mm, optional
+        Where these valves were found, in the axes of each. None: not known, and nothing is learned
+        of them.
+    shape : (F, n + 2, 3) mm
+        Where the valve was found, in its own axes.
+
+    Returns
+    -------
+    expected : (F, n + 2, 3) mm
+    samples : (S, F, n + 2, 3) mm
+        The other valves' errors about what is expected of each, as large as those of one more valve
+        of this shape: without shapes, sqrt((S + 1) / (S - 1)) times those about the mean.
+    """
+    if shapes is None:
+        shapes, shape = np.zeros_like(errors), np.zeros_like(shape)
+    expected, samples = np.zeros_like(shape), np.zeros_like(errors)
+    for sign in (1.0, -1.0):
+        e, z, own = (
+            0.5 * (part + sign * in_mirror(layout, part)) for part in (errors, shapes, shape)
+        )
+        mean, about = _ridge(z.reshape(len(z), -1), e.reshape(len(e), -1), own.ravel())
+        expected += mean.reshape(shape.shape)
+        samples += about.reshape(errors.shape)
+    return expected, samples
+
+
+def in_mirror(layout: ValveLayout, moves: FloatArray) -> FloatArray:
+    """Leaflets and tips ``(..., n + 2, 3)``, in a valve's axes, as they are in a mirror."""
+    rows, columns = np.divmod(np.arange(layout.size), layout.columns)
+    other = rows * layout.columns + np.mod(layout.columns // 2 - columns, layout.columns)
+    swapped = np.append(other, [layout.size + 1, layout.size])
+    return np.asarray(moves[..., swapped, :] * np.array([-1.0, 1.0, 1.0]))
+
+
+def _ridge(Z: FloatArray, E: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Expected error ``(m,)`` at features ``z (q,)``, and samples ``(S, m)`` about it.
+
+    ``Z (S, q)`` and ``E (S, m)`` are those of the other valves. With a constant that is not
+    penalised, the covariance of their residuals r is that of one error times 1 - h.
+    """
+    count = len(Z)
+    Z_mean, E_mean = Z.mean(axis=0), E.mean(axis=0)
+    Z, z = Z - Z_mean, z - Z_mean
+    eigenvalues, U = np.linalg.eigh(Z @ Z.T)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    scale = eigenvalues.mean() or 1.0
+    rotated = U.T @ (E - E_mean)
+    best = np.inf
+    for penalty in scale * PENALTIES:
+        left = 1.0 / (1.0 + eigenvalues / penalty)
+        free = U**2 @ left - 1.0 / count
+        residual = U @ (left[:, None] * rotated)
+        cost = float((residual**2 / free[:, None] ** 2).sum())
+        if cost <= best:
+            best, chosen = cost, (penalty, left, residual / np.sqrt(free)[:, None])
+    penalty, left, standard = chosen
+    weights = (U.T @ (Z @ z)) * left / penalty
+    spread = 1.0 + 1.0 / count + (z @ z - weights @ (U.T @ (Z @ z))) / penalty
+    return E_mean + weights @ rotated, np.sqrt(spread) * standard

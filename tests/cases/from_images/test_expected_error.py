@@ -1,0 +1,115 @@
+"""Errors regressed on the shapes in which valves were found: known laws, and what is left of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.cases.from_images import without_expected_error
+from mvest.cases.from_images.expected_error import error_at_shape, in_mirror
+from mvest.errors import InputError
+from mvest.imaging.detection.trained_model import DetectionAccuracy
+from mvest.imaging.layout import ValveLayout
+from tests.cases.from_images.test_imaged_case import FRAMES, LAYOUT, TURN, sequence, valve_axes
+
+SMALL = ValveLayout(8, 3)
+POINTS = SMALL.size + 2
+
+
+def world(seed, count, noise, law=0.0):
+    """Shapes of five modes and a large mean, and errors that follow them by a law, with noise."""
+    rng = np.random.default_rng(seed)
+    modes = rng.normal(size=(5, 2, POINTS, 3))
+    bias, follows = rng.normal(size=(2, 2, POINTS, 3)), rng.normal(size=(5, 2, POINTS, 3))
+    amplitude = rng.normal(size=(count, 5))
+    shapes = 20.0 + np.tensordot(amplitude, modes, 1)
+    errors = bias[0] + law * np.tensordot(amplitude, follows, 1)
+    return shapes, errors + noise * rng.normal(size=errors.shape), errors
+
+
+def test_a_mirror_swaps_sides_and_is_undone_by_itself():
+    # Tips that stay on their side; x that keeps its sign; a layout that is turned.
+    rng = np.random.default_rng(0)
+    moves = rng.normal(size=(3, 2, POINTS, 3))
+    np.testing.assert_array_equal(in_mirror(SMALL, in_mirror(SMALL, moves)), moves)
+    at = np.zeros((POINTS, 3))
+    at[SMALL.vertex(45.0, 1)] = 1.0, 2.0, 3.0
+    at[-2] = 4.0, 5.0, 6.0
+    there = in_mirror(SMALL, at)
+    np.testing.assert_array_equal(there[SMALL.vertex(135.0, 1)], [-1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(there[-1], [-4.0, 5.0, 6.0])
+
+
+def test_an_error_that_follows_the_shape_is_known_of_one_more_valve():
+    # Penalties that are all too large; even and odd mixed up; a mean that is left out or doubled.
+    shapes, errors, _ = world(1, 41, noise=1e-3, law=1.0)
+    expected, samples = error_at_shape(SMALL, errors[1:], shapes[1:], shapes[0])
+    assert errors[1:].std() > 1.0
+    assert np.abs(expected - errors[0]).max() < 0.05
+    assert samples.std() < 0.05
+
+
+def test_what_no_shape_tells_varies_about_the_mean_as_one_more_valve_does():
+    shapes, errors, _ = world(2, 7, noise=1.0)
+    for known in (None, np.zeros_like(shapes)):
+        expected, samples = error_at_shape(SMALL, errors, known, shapes[0])
+        np.testing.assert_allclose(expected, errors.mean(axis=0), atol=1e-12)
+        about = errors - errors.mean(axis=0)
+        np.testing.assert_allclose(samples, np.sqrt(8 / 6) * about, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", [0.0, 0.3, 2.0])
+def test_samples_are_as_wide_as_the_error_of_one_more_valve(law):
+    # Residuals that were fitted, taken for errors; a width that the shape does not widen.
+    square, stated, plain = [], [], []
+    for seed in range(40):
+        shapes, errors, _ = world(seed, 25, noise=1.0, law=law)
+        expected, samples = error_at_shape(SMALL, errors[1:], shapes[1:], shapes[0])
+        square.append(((errors[0] - expected) ** 2).mean())
+        stated.append((samples**2).mean())
+        plain.append(((errors[0] - errors[1:].mean(axis=0)) ** 2).mean())
+    assert np.mean(stated) == pytest.approx(np.mean(square), rel=0.1)
+    # And it is worth it where there is a law, and costs next to nothing where there is none.
+    assert np.mean(square) < (1.05, 0.9, 0.5)[(0.0, 0.3, 2.0).index(law)] * np.mean(plain)
+
+
+def test_a_valve_that_is_found_elsewhere_than_all_others_is_less_sure():
+    shapes, errors, _ = world(3, 30, noise=0.3, law=1.0)
+    near, far = shapes.mean(axis=0), shapes.mean(axis=0) + 5 * (shapes[0] - shapes.mean(axis=0))
+    width = [error_at_shape(SMALL, errors, shapes, at)[1].std() for at in (near, far)]
+    assert width[1] > 1.3 * width[0]
+
+
+def test_the_expected_error_is_taken_off_in_the_axes_of_the_valve():
+    # Taken off in the world's axes; shapes compared in axes that are not the valve's own.
+    rng = np.random.default_rng(4)
+    seen = sequence(TURN, (3.0, -8.0, 20.0))
+    n, factor = LAYOUT.size, 1.2 * np.exp(0.5 * (1.0 - seen.confidence))
+    at = np.stack(
+        [
+            (np.concatenate([seen.vertices[k], seen.tips[k]]) - seen.annulus[k].mean(axis=0))
+            @ valve_axes(seen, k)
+            for k in (FRAMES.open, FRAMES.closed)
+        ]
+    )
+    mode, amplitude = rng.normal(size=at.shape), rng.normal(size=20)
+    shapes = at + (amplitude - 1.5)[:, None, None, None] * mode
+    follows = rng.normal(size=at.shape)
+    errors = amplitude[:, None, None, None] * follows + 1e-3 * rng.normal(size=(20, *at.shape))
+    accuracy = DetectionAccuracy(
+        np.ones(n), 9.0, errors[:, :, :n], errors[:, :, n:], (1.2, 0.5),
+        shapes=shapes[:, :, :n], tip_shapes=shapes[:, :, n:],
+    )  # fmt: skip
+    found, about, tips_about = without_expected_error(seen, FRAMES, accuracy)
+    for number, which in ((FRAMES.open, 0), (FRAMES.closed, 1)):
+        axes = valve_axes(seen, number)
+        off = (seen.vertices[number] - found.vertices[number]) @ axes
+        np.testing.assert_allclose(off, 1.5 * follows[which, :n], atol=0.05)
+        off = (seen.tips[number] - found.tips[number]) @ axes
+        np.testing.assert_allclose(off, 1.5 * follows[which, n:], atol=0.05)
+    one = replace(accuracy, widening=(1.0, 0.0))
+    _, plain, tips_plain = without_expected_error(seen, FRAMES, one)
+    np.testing.assert_allclose(about, factor * plain)
+    np.testing.assert_allclose(tips_about, factor * tips_plain)
+    with pytest.raises(InputError, match="errors of shape"):
+        without_expected_error(seen, FRAMES, replace(accuracy, samples=errors[:, :, :5]))
