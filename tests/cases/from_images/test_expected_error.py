@@ -1,4 +1,4 @@
-"""Errors regressed on the shapes in which valves were found: known laws, and what is left of them."""
+"""Errors regressed on shapes in which valves were found: known laws, and what is left of them."""
 
 from dataclasses import replace
 
