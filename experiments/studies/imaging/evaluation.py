@@ -28,6 +28,7 @@ from experiments.studies.imaging.findings import (
 from experiments.studies.imaging.held_out import HeldOut
 from experiments.studies.imaging.store import ImagingStore
 from experiments.studies.imaging.trials import SEQUENCES, VOLUMES, WITHOUT_VALVE
+from mvest.cases.from_images.expected_error import expected_error
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.accuracy import Correlogram, share_within
@@ -57,7 +58,6 @@ def findings_of(
     """What a finished study cost, and what came of it."""
     settings, raw = store.settings, model_file.read_bytes()
     spent = _spent(store)
-    motion = settings.population.motion
     cpu_s = spent["training"].cpu_s
     trained = () if store.given else ("train",)
     which = trained if tested is None else (*trained, "calibration", "test")
@@ -65,7 +65,7 @@ def findings_of(
         seconds=cpu_s or 0.0,
         memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         detectors=store.model_key(store.training.volumes),
-        layout=ValveLayout(motion.columns, motion.rows),
+        layout=_layout(store),
         valves={
             name: record.Population(getattr(settings, name).count, dict(drawn.refused))
             for name in which
@@ -115,7 +115,9 @@ def tested_of(
             within_95=tuple(
                 row
                 for kind, setting in SETTING.items()
-                for row in _coverage(held_out.detected(kind, threshold), kind, setting, accuracy)
+                for row in _coverage(
+                    held_out.detected(kind, threshold), kind, setting, accuracy, _layout(store)
+                )
             ),
         ),
         volumes={str(size): tuple(rows) for size, rows in held_out.volumes.items()},
@@ -272,25 +274,48 @@ def _sequence(row: Row, threshold: float, wrong: float) -> record.Sequence:
     )
 
 
+def _layout(store: ImagingStore) -> ValveLayout:
+    motion = store.settings.population.motion
+    return ValveLayout(motion.columns, motion.rows)
+
+
 def _coverage(
-    held_out: HeldOut, kind: str, setting: str, accuracy: DetectionAccuracy
+    held_out: HeldOut, kind: str, setting: str, accuracy: DetectionAccuracy, layout: ValveLayout
 ) -> Iterator[Coverage]:
-    """How many coordinates lie within 1.96 of the stated deviations, wrong ones and all."""
+    """How many coordinates lie within 1.96 of the stated deviations, wrong ones and all.
+
+    As they are found, and as they are handed on with a case: less the error that is expected of
+    such a shape, and with the deviations of the samples about it.
+    """
     if not held_out.sequences[kind]:
         return
-    errors, mean = held_out.stacked(kind, "errors"), accuracy.samples.mean(axis=0)
-    factor = np.array([accuracy.factor(c) for c in held_out.confidence(kind)])[:, None, None, None]
+    errors, factors = held_out.stacked(kind, "errors"), held_out.confidence(kind)
+    factors = np.array([accuracy.factor(one) for one in factors])[:, None, None, None]
+    shapes = [held_out.stacked(kind, name) for name in ("shapes", "tip_shapes")]
+    expected, samples = zip(
+        *(expected_error(layout, accuracy, one) for one in np.concatenate(shapes, axis=2)),
+        strict=True,
+    )
+    n = layout.size
+    left = (errors - np.stack(expected)[:, :, :n]) / factors
+    spread = np.stack([np.sqrt((one[:, :, :n] ** 2).mean(axis=(0, 3))) for one in samples])
     for k, frame in enumerate(("open", "closed")):
-        own, about = errors[:, k : k + 1], mean[k : k + 1]
+        own = errors[:, k : k + 1]
         yield Coverage(
             setting=setting,
             frame=frame,
             sequences=len(errors),
-            share=share_within(own / factor, accuracy.std_mm),
-            share_about_mean=share_within((own - about) / factor, accuracy.std_mm),
-            rms_mm=float(np.sqrt((own**2).mean())),
-            stated_rms_mm=float(np.sqrt((accuracy.std_mm**2).mean() * (factor**2).mean())),
+            share=share_within(own / factors, accuracy.std_mm),
+            share_handed_on=share_within(left[:, k] / spread[:, k, :, None], np.ones(n)),
+            rms_mm=_rms(own),
+            stated_rms_mm=float(np.sqrt((accuracy.std_mm**2).mean() * (factors**2).mean())),
+            rms_handed_on_mm=_rms(factors[:, 0] * left[:, k]),
+            stated_handed_on_mm=_rms(factors[:, 0, 0] * spread[:, k]),
         )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _unlike(held_out: HeldOut, like_from: float) -> dict[str, int]:

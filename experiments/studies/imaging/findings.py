@@ -121,16 +121,20 @@ class Correlations:
 class Coverage:
     """Errors of one frame of volumes over time beside the standard deviations that are stated.
 
-    Shares are of coordinates within 1.96 of these, one with the mean error taken off.
+    Shares are of coordinates within 1.96 of these. What is handed on with a case is less the error
+    that is expected where a valve is found so (`mvest.cases.from_images.expected_error`), with the
+    deviations about it.
     """
 
     setting: str
     frame: str
     sequences: int
     share: float
-    share_about_mean: float
+    share_handed_on: float
     rms_mm: float
     stated_rms_mm: float
+    rms_handed_on_mm: float
+    stated_handed_on_mm: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mvest.cases.case import ErrorSamples
-from mvest.cases.from_images.expected_error import error_at_shape, in_mirror
+from mvest.cases.from_images.expected_error import expected_error, in_mirror
 from mvest.cases.from_images.frame_choice import CaseFrames
 from mvest.errors import InputError
 from mvest.imaging.detection.pose import pose_of
@@ -46,8 +46,12 @@ def samples_in_world(
     InputError
         They are not of this layout.
     """
-    _require_layout(sequence, errors, tip_errors)
-    count = len(errors)
+    n, count = sequence.layout.size, len(errors)
+    if errors.shape[1:] != (2, n, 3) or tip_errors.shape[1:] != (2, 2, 3):
+        raise InputError(
+            f"errors of shape {errors.shape} and of tips {tip_errors.shape}, expected (samples, 2, "
+            f"{n}, 3) and (samples, 2, 2, 3)"
+        )
     moves = np.concatenate([errors, tip_errors], axis=2)
     moves = np.concatenate([moves, in_mirror(sequence.layout, moves)])
     numbers, which = _frames_and_errors(frames)
@@ -62,7 +66,7 @@ def without_expected_error(
 ) -> tuple[ValveSequence, FloatArray, FloatArray]:
     """The valve less the error that is expected of it, and errors of other valves about theirs.
 
-    What detectors are off by on average where they find such a valve (`error_at_shape`), no spread
+    What detectors are off by on average where they find such a valve (`expected_error`), no spread
     of errors can make up for: closed free edges that lie where most do, for instance. Only the
     frames of the case are changed: the open one by the error of open frames, the others by that of
     closed ones.
@@ -86,15 +90,8 @@ def without_expected_error(
     InputError
         They are not of this layout, or of fewer than two valves.
     """
-    _require_layout(sequence, accuracy.samples, accuracy.tip_samples)
-    if len(accuracy.samples) < 2:
-        raise InputError(f"errors of {len(accuracy.samples)} valves, expected two or more")
-    errors = np.concatenate([accuracy.samples, accuracy.tip_samples], axis=2)
-    shapes = None
-    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
-        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
     shape = np.stack([_in_own_axes(sequence, n) for n in (frames.open, frames.closed)])
-    expected, samples = error_at_shape(sequence.layout, errors, shapes, shape)
+    expected, samples = expected_error(sequence.layout, accuracy, shape)
     vertices, tips = np.array(sequence.vertices), np.array(sequence.tips)
     for number, which in zip(*_frames_and_errors(frames), strict=True):
         off = expected[which] @ valve_axes(sequence, number).T
@@ -119,12 +116,3 @@ def _frames_and_errors(frames: CaseFrames) -> tuple[list[int], list[int]]:
     """Frames of the case, and for each whether it is open (0) or closed (1)."""
     numbers = list(frames.in_order)
     return numbers, [0 if number == frames.open else 1 for number in numbers]
-
-
-def _require_layout(sequence: ValveSequence, errors: FloatArray, tip_errors: FloatArray) -> None:
-    n = sequence.layout.size
-    if errors.shape[1:] != (2, n, 3) or tip_errors.shape[1:] != (2, 2, 3):
-        raise InputError(
-            f"errors of shape {errors.shape} and of tips {tip_errors.shape}, expected (samples, 2, "
-            f"{n}, 3) and (samples, 2, 2, 3)"
-        )

@@ -16,13 +16,55 @@ from __future__ import annotations
 
 import numpy as np
 
+from mvest.errors import InputError
+from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
-__all__ = ["error_at_shape", "in_mirror"]
+__all__ = ["error_at_shape", "expected_error", "in_mirror"]
 
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
 """Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
+
+
+def expected_error(
+    layout: ValveLayout, accuracy: DetectionAccuracy, shape: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The error that is expected of detectors, and how it may vary, in a volume of confidence 1.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    accuracy : DetectionAccuracy
+    shape : (2, n + 2, 3) mm
+        Leaflets and, after them, papillary tips of the open and the closed frame, each as it was
+        found and in its own axes.
+
+    Returns
+    -------
+    expected : (2, n + 2, 3) mm
+        Found less true, in the valve's axes.
+    samples : (S, 2, n + 2, 3) mm
+        See `error_at_shape`; what of their size is owed to confidence is `accuracy.factor`.
+
+    Raises
+    ------
+    InputError
+        Errors are of fewer than two valves, or not of this layout.
+    """
+    n, count = layout.size, len(accuracy.samples)
+    if accuracy.samples.shape[1:] != (2, n, 3) or accuracy.tip_samples.shape[1:] != (2, 2, 3):
+        raise InputError(
+            f"errors of shape {accuracy.samples.shape} and of tips {accuracy.tip_samples.shape}, "
+            f"expected (samples, 2, {n}, 3) and (samples, 2, 2, 3)"
+        )
+    if count < 2:
+        raise InputError(f"errors of {count} valves, expected two or more")
+    errors = np.concatenate([accuracy.samples, accuracy.tip_samples], axis=2)
+    shapes = None
+    if accuracy.shapes is not None and accuracy.tip_shapes is not None:
+        shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
+    return error_at_shape(layout, errors, shapes, shape)
 
 
 def error_at_shape(

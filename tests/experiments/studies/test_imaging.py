@@ -103,7 +103,16 @@ def test_the_study_tells_how_far_detectors_are_off(done: Path):
     assert {(row.setting, row.frame) for row in accuracy.within_95} == {
         (s, f) for s in settings for f in ("open", "closed")
     }
-    assert all(0 <= row.share <= 1 for row in accuracy.within_95)
+    for row in accuracy.within_95:
+        assert min(row.share, row.share_handed_on) >= 0
+        assert max(row.share, row.share_handed_on) <= 1
+        assert min(row.rms_handed_on_mm, row.stated_handed_on_mm) > 0
+    # Where valves were found goes with the detectors, in the axes of each.
+    shapes = load_model(done / "run" / "tee.npz").accuracy.shapes
+    annulus = shapes[:, :, :16]
+    assert shapes.shape == (2, 2, 16 * 5, 3)
+    np.testing.assert_allclose(annulus.mean(axis=2), 0.0, atol=1e-4)
+    assert np.ptp(annulus[..., :2]) > 3 * np.ptp(annulus[..., 2])
     parts = ("valves", "volumes", "draft", "trees")
     for part in (*parts, "training"):
         assert findings.spent[part].cpu_s > 0

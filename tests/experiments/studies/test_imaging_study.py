@@ -49,8 +49,8 @@ ACCURACY = Accuracy(
     correlogram=Correlations((1.0, 8.0), (0.97, 0.48), (3, 4)),
     within_95=(
         Coverage(
-            setting="shifted", frame="open", sequences=4, share=0.62, share_about_mean=0.7,
-            rms_mm=1.0, stated_rms_mm=0.5,
+            setting="shifted", frame="open", sequences=4, share=0.62, share_handed_on=0.7,
+            rms_mm=1.0, stated_rms_mm=0.5, rms_handed_on_mm=0.8, stated_handed_on_mm=0.45,
         ),
     ),
 )  # fmt: skip
@@ -135,7 +135,8 @@ def test_words_say_whether_the_stated_errors_are_true():
     assert "from 18 volumes over time" in words
     assert "taken for it: 2." in words
     assert "Shifted, open frame: 62 % of coordinates" in words
-    assert "(70 % with the mean error taken off)" in words
+    assert "root mean square 1.00 mm, 0.50 mm stated" in words
+    assert "expected of such a shape: 70 %, 0.80 mm, 0.45 mm stated" in words
     assert "without a valve: at most 0.20" in words
     assert "0.75 would part these" in words
 
