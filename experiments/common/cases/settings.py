@@ -84,7 +84,7 @@ class ImagedSettings:
     thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
     # Of the best frame, below which there is no valve, and of the frames that are chosen.
     min_confidence: float = MIN_CONFIDENCE
-    error_samples: int = 60  # at most, of held-out volumes, each also as seen in a mirror
+    error_samples: int = 200  # at most, of held-out volumes, each also as seen in a mirror
     name: str | None = None  # null: the name of the file
     description: str = ""
     source: str = ""
