@@ -244,7 +244,7 @@ VOXELS_ALIKE = 10.0
 """Over how many voxels errors of a segmentation are alike: surfaces of label maps are smoothed, and
 rougher ones cannot be meshed."""
 
-SAMPLES = 200
+SAMPLES = 100
 """Of the errors of a segmentation, that go with its case."""
 
 
