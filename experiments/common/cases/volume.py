@@ -29,8 +29,9 @@ from mvest.cases.tissue import GENERIC_THICKNESS
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection.tracking import NoValveError, TrackingSettings, detect_valve
-from mvest.imaging.detection.trained_model import UNLIKE_SHARE, default_model, load_model
+from mvest.imaging.detection.trained_model import DetectionAccuracy, default_model, load_model
 from mvest.imaging.landmarks import ANNULUS_LABELS, LANDMARKS
+from mvest.imaging.learning.accuracy import unlike_share
 from mvest.imaging.markups import read_markups
 from mvest.imaging.models import MODEL_FILE
 from mvest.imaging.reading.reader import read_volume
@@ -200,18 +201,19 @@ def detect_in_volume(
         about,
         stated,
         settings.min_confidence,
-        _unlike(valve.confidence, accuracy.like_from),
+        _unlike(valve.confidence, accuracy),
     )
 
 
-def _unlike(confidence: float, like_from: float) -> str:
+def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
     """How a volume is unlike those of training; empty if it is not."""
-    if confidence >= like_from:
+    if confidence >= accuracy.like_from:
         return ""
+    share = unlike_share(len(accuracy.samples))
     return (
         f"the volume is unlike those that the detectors were trained on: confidence "
-        f"{confidence:.2f} in the median frame, expected at least {like_from:.2f}, below which "
-        f"{100 * UNLIKE_SHARE:g} % of volumes like those are expected"
+        f"{confidence:.2f} in the median frame, expected at least {accuracy.like_from:.2f}, below "
+        f"which {100 * share:.2g} % of volumes like those are expected"
     )
 
 

@@ -318,12 +318,13 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def _unlike(held_out: HeldOut, like_from: float) -> dict[str, int]:
-    """How many volumes over time count as unlike those of training, by what tables call them."""
+def _unlike(held_out: HeldOut, like_from: float) -> dict[str, tuple[int, int]]:
+    """How many volumes over time count as unlike those of training, of how many; by setting."""
     return {
-        setting: int((held_out.confidence(kind) < like_from).sum())
-        for kind, setting in SETTING.items()
+        setting: (int((confidence < like_from).sum()), len(confidence))
+        for kind, setting in (SETTING | {"calibration": "in distribution, other valves"}).items()
         if held_out.sequences[kind]
+        for confidence in (held_out.confidence(kind),)
     }
 
 

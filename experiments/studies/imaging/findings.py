@@ -158,7 +158,7 @@ class Accuracy:
     within_95: tuple[Coverage, ...]
     widening: Vector = (1.0, 0.0)
     like_from: float = 0.0
-    unlike: Mapping[str, int] = field(default_factory=dict)
+    unlike: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,8 @@ from experiments.common.records.record import Record
 from experiments.common.records.tables import write_table
 from experiments.studies.imaging.findings import Accuracy, Confidences, Evaluation, Findings
 from experiments.studies.imaging.tables import imaging_table, imaging_words, write_imaging_table
-from mvest.imaging.detection.trained_model import UNLIKE_SHARE
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.accuracy import unlike_share
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.images.figures import (
     LIMITS_MM,
@@ -108,13 +108,13 @@ def study_words(findings: Findings) -> list[str]:
     said.append(
         f"In a volume they are stated {start:.2f} exp({slope:.2f} (1 - c)) times as large, c being "
         f"its confidence. Below a confidence of {accuracy.like_from:.2f} a volume is said to be "
-        f"unlike those of training, and no moduli are stated; {100 * UNLIKE_SHARE:g} % of those "
-        "drawn like them are expected there."
+        f"unlike those of training, and no moduli are stated; "
+        f"{100 * unlike_share(accuracy.sequences):.2g} % of those drawn like them are expected "
+        "there."
     )
     said += [
-        f"Over time, {setting}: {count} of "
-        f"{sum(row.setting == setting for row in tested.sequences)} volumes are unlike."
-        for setting, count in accuracy.unlike.items()
+        f"Over time, {setting}: {count} of {among} volumes are unlike."
+        for setting, (count, among) in accuracy.unlike.items()
     ]
     said += [*_trusted(tested, accuracy.like_from), *_lost(confidence)]
     said += [

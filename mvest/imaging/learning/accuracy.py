@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.distance import cdist
-from scipy.stats import t as student_t
 
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import UNLIKE_SHARE, DetectionAccuracy
@@ -20,6 +19,7 @@ __all__ = [
     "matern",
     "measure_accuracy",
     "share_within",
+    "unlike_share",
     "widened",
 ]
 
@@ -163,8 +163,9 @@ def widened(
     The factor on errors is exponential in the confidence that is lacking. Its growth is that of the
     errors' size (least squares over volumes); its start is such that of all coordinates of all
     volumes 95 % lie within 1.96 of what is stated. A volume is unlike those of the sequences where
-    its confidence is below what one more of these has but for `UNLIKE_SHARE` (Student's bound for
-    one further normal number).
+    its confidence is below the k-th smallest of theirs: one more of S is there in k of S + 1 cases,
+    however confidence is distributed (David and Nagaraja, Order Statistics, 2003, sec. 7.3), and
+    that is at most `UNLIKE_SHARE`, if S allows (`unlike_share`).
 
     Parameters
     ----------
@@ -203,12 +204,17 @@ def widened(
     spread = float((from_mean**2).sum())
     slope = max(0.0, float(from_mean @ size) / spread) if spread > 0 else 0.0
     z = np.stack(off) / np.exp(slope * lacking)[:, None, None, None]
-    bound = student_t.ppf(UNLIKE_SHARE, count - 1) * np.sqrt(1.0 + 1.0 / count)
+    rank = round(unlike_share(count) * (count + 1))
     return replace(
         accuracy,
         widening=(float(np.quantile(z, 0.95)) / NORMAL_95, slope),
-        like_from=float(confidence.mean() + bound * confidence.std(ddof=1)),
+        like_from=float(np.sort(confidence)[rank - 1]),
     )
+
+
+def unlike_share(count: int) -> float:
+    """Share of volumes like ``count`` sequences that counts as unlike them: see `widened`."""
+    return max(1, int(UNLIKE_SHARE * (count + 1))) / (count + 1)
 
 
 def share_within(errors: FloatArray, std_mm: FloatArray, mean: FloatArray | None = None) -> float:

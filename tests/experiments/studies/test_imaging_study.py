@@ -110,7 +110,7 @@ def test_words_say_what_is_wrong_and_yet_believed():
         values={"sequence": (0.9, 0.2, 0.9)},
         off_mm={"sequence": (1.0, 1.0, 9.0)},
     )
-    accuracy = replace(ACCURACY, widening=(1.1, 5.0), like_from=0.8, unlike={"shifted": 3})
+    accuracy = replace(ACCURACY, widening=(1.1, 5.0), like_from=0.8, unlike={"shifted": (3, 7)})
     tested = Evaluation(
         rows=rows, training=(), confidence=confidence, sequences=(), accuracy=accuracy
     )
@@ -118,7 +118,7 @@ def test_words_say_what_is_wrong_and_yet_believed():
     assert "Shifted, one frame: of 4 volumes 50 % lie below 1.5 mm or are called none" in words
     assert "2 are unlike those of training, and of the wrong ones 1 (25.0 %)" in words
     assert "1.10 exp(5.00 (1 - c))" in words
-    assert "Over time, shifted: 3 of 0 volumes are unlike." in words
+    assert "Over time, shifted: 3 of 7 volumes are unlike." in words
     assert "Lost over time, in distribution: 2 of 3." in words
 
 
