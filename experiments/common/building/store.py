@@ -19,7 +19,7 @@ from mvest.reading.npz import read_npz
 from mvest.source import source_key
 from mvest.typing import FloatArray
 
-__all__ = ["Store", "StoredModel", "key_of"]
+__all__ = ["DIGITS", "Store", "StoredModel", "key_of"]
 
 T = TypeVar("T")
 

@@ -29,7 +29,13 @@ from experiments.studies.imaging.store import ImagingStore, StoredSamples
 from experiments.studies.imaging.trials import KINDS, Trial
 from mvest.errors import ConfigurationError, InputError
 from mvest.imaging.detection import trained_model as detection_model
-from mvest.imaging.detection.trained_model import STAGES, default_model, load_model
+from mvest.imaging.detection.trained_model import (
+    STAGES,
+    DetectionModel,
+    default_model,
+    load_model,
+    save_model,
+)
 from mvest.imaging.simulator import SMALL
 from tests.experiments.configured import composed, plain
 
@@ -236,6 +242,17 @@ def test_given_detectors_are_tested_and_calibrated_and_none_is_trained(
     for name in STAGES:
         assert first.boosters[name].texts == again.boosters[name].texts
     assert again.accuracy.widening == first.accuracy.widening
+    # What was measured of detectors changes nothing of what they find, other trees do.
+    made, own = changed(tmp_path), tmp_path / "run" / "tee.npz"
+    save_model(own, DetectionModel(again.shape, again.boosters, {**again.trained_on, "by": 2}))
+    assert call(tmp_path, f"imaging.model={own}", "hydra.run.dir=again") == 0
+    assert changed(tmp_path) == made
+    boosters = again.boosters | {"annulus": again.boosters["free_edge"]}
+    save_model(tmp_path / "other.npz", DetectionModel(again.shape, boosters, again.trained_on))
+    keys = [
+        store_of(f"imaging.model={file}").model_key(6) for file in (own, tmp_path / "other.npz")
+    ]
+    assert keys[0] == record.findings.detectors != keys[1]
     capsys.readouterr()
     assert call(tmp_path, given, "imaging.train.seed=9", "imaging.calibration.seed=1") == 2
     assert "was trained on, expected other valves" in capsys.readouterr().err
