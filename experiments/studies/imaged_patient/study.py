@@ -307,14 +307,6 @@ def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSet
     return case_of_sequence(stated, frames, texts)
 
 
-def _costs(table: str, of: str) -> Section:
-    """What `write_budget` leaves of a table."""
-    name = f"{table}_budget"
-    caption = f"Where the information dies between a volume and a modulus.{of} Simulated."
-    title = f"What is not known costs the moduli.{of}"
-    return Section(name, {name: caption}, title=title, table=table)
-
-
 def _segmented_case(
     true: ValveSequence, frames: CaseFrames, patient: PatientSettings, voxel_mm: float, seed: int
 ) -> ValveCase:
@@ -360,11 +352,14 @@ STUDY = Study(
         Section(
             "volume", title="Moduli from simulated volumes", answer=volumes_answer, headline=True
         ),
-        _costs("volume", ""),
         Section(
-            "volume_development",
-            title="Moduli from simulated volumes of the patients that choices were made on",
+            "volume_budget",
+            {
+                "volume_budget": "Where the information dies between a volume and a modulus. "
+                "Simulated."
+            },
+            title="What is not known costs the moduli.",
+            table="volume",
         ),
-        _costs("volume_development", " Patients that choices were made on."),
     ),
 )
