@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import pandas as pd
+from scipy.stats import linregress, sem
 
 from experiments.common.cases.report import interval_words
 from experiments.common.cases.skill import baselines, skill_words
@@ -114,6 +115,7 @@ def volume_words(table: pd.DataFrame) -> list[str]:
             f"{guess:.1f} % for the same patients; {int(stated['inside'].eq(True).sum())} of "
             f"{len(stated)} inside."
         )
+    out += _followed(table)
     judged = table[table["verdict"] != ""]
     if len(judged):
         trusts = ", ".join(
@@ -125,6 +127,34 @@ def volume_words(table: pd.DataFrame) -> list[str]:
     if len(known):
         out.append(f"Width of the interval over the estimate: median {width.median():.2f}.")
     return out
+
+
+def _followed(table: pd.DataFrame) -> Iterator[str]:
+    """Mean error of each modulus' logarithm, and how far estimates follow the truth.
+
+    Of all that converged, also of those that the verdict denies: it does not see the truth.
+    """
+    for leaflet, own in table.groupby("modulus", sort=False):
+        known = own[own["error [%]"].notna()]
+        truth, found = (np.log(known[name]) for name in ("truth [MPa]", "estimate [MPa]"))
+        if len(known) < 3 or truth.nunique() < 2:
+            continue
+        logs = {
+            words: np.log1p(own[column].dropna().to_numpy() / 100.0)
+            for words, column in ERRORS.items()
+            if column != ERRORS["part from the images"]
+        }
+        biases = ", ".join(
+            f"{words} {each.mean():+.2f} ({sem(each):.2f})"
+            for words, each in logs.items()
+            if len(each) > 1
+        )
+        line = linregress(truth, found)
+        yield (
+            f"{str(leaflet).capitalize()}, all estimates, mean error of the logarithm (standard "
+            f"error): {biases}. From the volume the logarithm follows {line.slope:.2f} "
+            f"({line.stderr:.2f}) of the truth's."
+        )
 
 
 def _medians(table: pd.DataFrame) -> str:

@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -181,6 +182,24 @@ def test_errors_of_moduli_add_up():
     assert words[4].startswith("Posterior: from the volume 25.0 %, from the known geometry 5.0 %")
     assert "0.50 of the generic guess's 50.0 %" in words[4]
     assert words[5] == "Verdicts: doubtful 2 (1 inside)."
+
+
+def test_words_say_how_far_estimates_follow_the_truth_and_are_biased():
+    # Half of the truth's logarithm, and 0.1 too much of each: ratios in the place of logarithms,
+    # a slope of the error, or estimates left out that the verdict denies.
+    truth = np.array([1.0, 2.0, 4.0, 8.0])
+    log = 0.5 * (np.log(truth) + np.log(truth).mean()) + 0.1
+    rows = [
+        Row("one", modulus("anterior", t, e, 0.5, 20.0), 1.2 * t, None, verdict)
+        for t, e, verdict in zip(truth, np.exp(log), ("none", "", "doubtful", ""), strict=True)
+    ]
+    words = [one for one in volume_words(volume_table(rows)) if "logarithm" in one]
+    error = np.std(log - np.log(truth), ddof=1) / 2
+    assert words == [
+        "Anterior, all estimates, mean error of the logarithm (standard error): from the volume "
+        f"+0.10 ({error:.2f}), from the known geometry +0.18 (0.00). From the volume the logarithm "
+        "follows 0.50 (0.00) of the truth's."
+    ]
 
 
 def test_what_the_verdict_denies_is_neither_stated_nor_counted(tmp_path):
