@@ -27,9 +27,9 @@ from .mechanics.law.moduli import TransverselyIsotropic as TransverselyIsotropic
 from .mechanics.settings import ClosureProtocol as ClosureProtocol
 from .mechanics.settings import MechanicsSettings as MechanicsSettings
 from .mechanics.settings import TissueSettings as TissueSettings
-from .personalise.chain import personalise_case as personalise_case
-from .personalise.settings import PersonaliseSettings as PersonaliseSettings
-from .personalise.settings import Unknown as Unknown
+from .personalisation.chain import personalise_case as personalise_case
+from .personalisation.settings import PersonaliseSettings as PersonaliseSettings
+from .personalisation.settings import Unknown as Unknown
 from .problem.estimate import estimate as estimate
 from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation

@@ -17,7 +17,7 @@ from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalise import CaseMesh, PersonaliseSettings, Treatment, Unknown
+from mvest.personalisation import CaseMesh, PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION, displace
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
@@ -246,8 +246,8 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
         built.append(MadeUpClosure(free, fixed, **changes))
         return built[-1]
 
-    monkeypatch.setattr("mvest.personalise.estimation.build_model", build)
-    monkeypatch.setattr("mvest.personalise.expectation.build_model", build)
-    monkeypatch.setattr("mvest.personalise.observation_errors.geometry_modes", lambda *_: ())
-    monkeypatch.setattr("mvest.personalise.observation_errors.law_columns", lambda *_: ())
+    monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
+    monkeypatch.setattr("mvest.personalisation.expectation.build_model", build)
+    monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_modes", lambda *_: ())
+    monkeypatch.setattr("mvest.personalisation.observation_errors.law_columns", lambda *_: ())
     return built

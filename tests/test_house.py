@@ -82,7 +82,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.reporting",
         "mvest.febio",
     ),
-    "mvest.personalise": (
+    "mvest.personalisation": (
         *LEAVES,
         "mvest.valve",
         "mvest.mechanics",

@@ -262,7 +262,7 @@ def test_what_is_kept_knows_what_makes_it():
     assert not [name for name in truth if name.startswith("mvest.estimation.filters")]
     one = reached(patient_store._simulate, patient_store._write)
     assert one >= FORWARD | {"mvest.simulation.virtual_patient", "mvest.cases.writer"}
-    assert not [name for name in one if name.startswith(("mvest.personalise", "mvest.imaging"))]
+    assert not [name for name in one if name.startswith(("mvest.personalisation", "mvest.imaging"))]
     assert reached(draw_population) >= FORWARD | {"mvest.imaging.layout"}
 
 

@@ -18,8 +18,8 @@ from experiments.common.schema import build
 from mvest.closure.cycle.protocol import CycleProtocol
 from mvest.estimation.prediction import Prediction
 from mvest.estimation.wrappers import SharedStart
-from mvest.personalise.design import design_text
-from mvest.personalise.expectation import foresee_case
+from mvest.personalisation.design import design_text
+from mvest.personalisation.expectation import foresee_case
 from mvest.problem.expectation import Expectation, expect, expect_of_model
 from mvest.provenance import config_hash
 from mvest.reporting.expectation import expectation_text

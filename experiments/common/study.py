@@ -1,7 +1,7 @@
-"""A study: what its room offers to the runner, and how rooms are found.
+"""A study: what it computes, and what the runner and the writer of results need of it.
 
-A room is a folder ``experiments/studies/NAME`` whose module ``study`` holds the object ``STUDY``.
-It is found by being there.
+A study is a module ``experiments/studies/NAME.py`` (or a package of that name) with the object
+``STUDY``. It is found by being there.
 """
 
 from __future__ import annotations
@@ -10,16 +10,30 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import experiments.studies
-from experiments.common.records.record import Outcome, Record
+from experiments.common.records.record import Mesh, Model, Number, Record, Status
 from mvest.errors import ConfigurationError
+from mvest.problem.record import EstimateRecord
+from mvest.reporting.tables import Table, joined
 
-__all__ = ["Check", "Job", "Section", "Study", "load_settings", "load_study", "study_names"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+__all__ = [
+    "Check",
+    "Job",
+    "Result",
+    "Results",
+    "Study",
+    "load_settings",
+    "load_study",
+    "study_names",
+]
 
 S = TypeVar("S")
-F = TypeVar("F")
 
 Check = Callable[[Mapping[str, Any], Path], str]
 
@@ -28,7 +42,7 @@ ROOMS = Path(experiments.studies.__file__).parent
 
 @dataclass(frozen=True, slots=True)
 class Job(Generic[S]):
-    """What a study is asked to compute.
+    """What a study is given.
 
     Attributes
     ----------
@@ -48,38 +62,100 @@ class Job(Generic[S]):
     config_hash: str = "none"
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
-    """A section of the page of all results.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """What a study returns. Everything that tables and figures show is in it.
 
     Attributes
     ----------
-    name : str
-        Of ``results/NAME.md``, which is its text.
-    pictures : mapping
-        Picture in ``results/`` without its ending -> caption.
-    title : str
-        Where the text brings no heading.
-    validation : bool
-        Whether it shows that the model and its numerics are right, rather than what a study found.
-    table : str
-        Of the kept records; empty: of this name.
-    answer : callable or None
-        Name -> kept record of the table -> what follows, in one line.
-    headline : bool
-        Whether the page begins with its answer.
-    opens : str
-        The picture of it that stands there too, above its answer; empty for most.
+    tables : mapping of str to Table
+        Tidy tables by name; the one called ``""`` is the study's main table.
+    numbers : mapping
+        Single values by name, with the unit at the end of the name; MLflow gets those that are
+        numbers.
+    estimates : tuple of EstimateRecord
+    arrays : mapping
+        Written beside the record, for figures.
+    status : {"converged", "failed"}
+    reason, detail : str
+        Why the run ended.
+    mesh : Mesh or None
+    forward_solves : int
+    row : str
+        What tables call this run, where the data say it and not the configuration.
+    parameters : tuple of str
+        Likewise.
+    model : Model or None
+        Likewise.
+    gate : str or None
+        What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
+        study uses none of the configured anatomies.
     """
 
-    name: str
-    pictures: Mapping[str, str] = field(default_factory=dict)
-    title: str = ""
-    validation: bool = False
-    table: str = ""
-    answer: Callable[[Mapping[str, Record[Any]]], str] | None = None
-    headline: bool = False
-    opens: str = ""
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    numbers: Mapping[str, Number] = field(default_factory=dict)
+    estimates: tuple[EstimateRecord, ...] = ()
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    status: Status = "converged"
+    reason: str = "completed"
+    detail: str = ""
+    mesh: Mesh | None = None
+    forward_solves: int = 0
+    row: str = ""
+    parameters: tuple[str, ...] = ()
+    model: Model | None = None
+    gate: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """The records of all runs of one published table, or of a single run.
+
+    Attributes
+    ----------
+    records : mapping of str to Record
+        By name; at least one. The record that the table is named after comes first.
+    arrays : mapping of str to Path
+        File of arrays of those records that have one.
+    """
+
+    records: Mapping[str, Record]
+    arrays: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def first(self) -> Record:
+        """The main record."""
+        return next(iter(self.records.values()))
+
+    @property
+    def table_names(self) -> tuple[str, ...]:
+        """Names of the tables of any record."""
+        return tuple(dict.fromkeys(name for one in self.records.values() for name in one.tables))
+
+    def table(self, name: str = "") -> Table:
+        """One table of all records; of several records a first column ``run`` names each.
+
+        Raises
+        ------
+        KeyError
+            If no record has it.
+        """
+        parts = {one.row: one.table_of(name) for one in self.records.values() if name in one.tables}
+        if not parts:
+            raise KeyError(name)
+        return joined(parts) if len(self.records) > 1 else next(iter(parts.values()))
+
+    def estimates(self) -> list[dict[str, Any]]:
+        """A row for each unknown of each estimate, with its run and the factors of the run.
+
+        See `EstimateRecord.rows`.
+        """
+        return [
+            {"run": one.row, "experiment": one.experiment, **one.factors, **row}
+            for one in self.records.values()
+            for estimate in one.estimates
+            for row in estimate.rows()
+        ]
 
 
 def _nothing(*_: Any) -> None:
@@ -87,79 +163,84 @@ def _nothing(*_: Any) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Study(Generic[S, F]):
-    """How a kind of study is run, put into words, tabulated and published.
+class Study(Generic[S]):
+    """How a kind of study is run and shown.
 
     Attributes
     ----------
     settings : type
-        Frozen dataclass of the room's ``settings.py``: what the study adds to the configuration.
-    findings : type
-        Dataclass of what it computes.
+        Frozen dataclass: what the study adds to the configuration.
     run : callable
-        Job -> outcome.
-    words : callable
-        Record -> text for the terminal.
-    write : callable
-        (folder, name -> record, name -> file of arrays) -> files written there. The records are all
-        those of one table, the main one first; a run by itself hands over its own record. Arrays
-        are those that a run left as ``fields.npz``, for the records that still have them.
-    write_run : callable or None
-        (folder, record) -> files written into a run's own folder; None: those of `write`.
+        Job -> result.
+    summary : callable or None
+        Results -> tables for readers, by name. Without it readers see the results' own tables; with
+        it those are files for programs only.
+    figure : callable or None
+        Results -> figure, or figures by name (``""`` is the main one), or None without anything to
+        draw.
+    captions : mapping
+        Name of a figure -> its caption.
+    latex : bool
+        Whether tables are written as LaTeX and figures as PDF, too: those of the paper.
+    words : callable or None
+        Record -> text for the terminal; by default its tables.
+    files : callable or None
+        (folder, record) -> files written into the folder of a run besides, a report for example.
     keep : callable
         Record -> what of it the results keep.
     keep_arrays : callable
-        File of arrays of a run -> those that the results keep beside its record; none by default.
+        (record, file of arrays) -> arrays that the results keep beside the record; none by default.
     keeps_failures : bool
-        Whether the results also take over a run that found no estimate: where a share of runs is
-        counted, those must count that failed.
+        Whether the results also take over a run without an estimate: where a share of runs is
+        counted, failed ones count.
     finish : callable
-        (job, record): what is done with a run that is on disk, also with one that was done before.
+        (job, record): done with a run that is on disk, also with one that was done before.
     checks : callable
-        () -> what ``check=true`` says, one after another, without estimating anything, each
-        (configuration, output folder) -> text. Made once for all jobs of a sweep.
+        () -> what ``check=true`` says without estimating anything, each (configuration, output
+        folder) -> text. Made once for all jobs of a sweep.
     require : callable
         Configuration -> None; raises `ConfigurationError` for settings that no job could run with.
-    sections : tuple of Section
     """
 
     settings: type[S]
-    findings: type[F]
-    run: Callable[[Job[S]], Outcome[F]]
-    words: Callable[[Record[F]], str]
-    write: Callable[[Path, Mapping[str, Record[F]], Mapping[str, Path]], list[Path]]
-    write_run: Callable[[Path, Record[F]], list[Path]] | None = None
-    keep: Callable[[Record[F]], Record[F]] = lambda record: record
-    keep_arrays: Callable[[Record[F], Path], Mapping[str, Any]] = lambda record, path: {}
+    run: Callable[[Job[S]], Result]
+    summary: Callable[[Results], Mapping[str, Table]] | None = None
+    figure: Callable[[Results], Figure | Mapping[str, Figure] | None] | None = None
+    captions: Mapping[str, str] = field(default_factory=dict)
+    latex: bool = False
+    words: Callable[[Record], str] | None = None
+    files: Callable[[Path, Record], list[Path]] | None = None
+    keep: Callable[[Record], Record] = lambda record: record
+    keep_arrays: Callable[[Record, Path], Mapping[str, Any]] = lambda record, path: {}
     keeps_failures: bool = False
-    finish: Callable[[Job[S], Record[F]], None] = _nothing
+    finish: Callable[[Job[S], Record], None] = _nothing
     checks: Callable[[], tuple[Check, ...]] = tuple
     require: Callable[[Mapping[str, Any]], None] = _nothing
-    sections: tuple[Section, ...] = ()
 
 
 def study_names() -> tuple[str, ...]:
-    """Names of all rooms, in alphabetical order."""
-    return tuple(sorted(path.parent.name for path in ROOMS.glob("*/study.py")))
+    """Names of all studies, in alphabetical order."""
+    modules = [p.stem for p in ROOMS.glob("*.py") if p.stem != "__init__"]
+    packages = [p.parent.name for p in ROOMS.glob("*/study.py")]
+    return tuple(sorted([*modules, *packages]))
 
 
 def load_settings(name: str) -> type:
-    """The settings of a room, without what computes with them."""
-    settings = import_module(f"{experiments.studies.__name__}.{name}.settings").Settings
-    assert isinstance(settings, type)
-    return settings
+    """The settings of a study."""
+    return load_study(name).settings
 
 
-def load_study(name: str) -> Study[Any, Any]:
-    """The study of a room; no other room is imported.
+def load_study(name: str) -> Study[Any]:
+    """The study of that name; no other study is imported.
 
     Raises
     ------
     ConfigurationError
-        If there is no such room.
+        If there is none.
     """
     if name not in study_names():
         raise ConfigurationError(f"study = {name!r}, expected one of {', '.join(study_names())}")
-    study = import_module(f"{experiments.studies.__name__}.{name}.study").STUDY
+    module = f"{experiments.studies.__name__}.{name}"
+    study = import_module(module if (ROOMS / f"{name}.py").is_file() else f"{module}.study").STUDY
     assert isinstance(study, Study)
     return study

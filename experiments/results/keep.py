@@ -1,11 +1,12 @@
 """``results/records``: kept records, and the tables and figures that follow from them.
 
-``results/records/TABLE/NAME.json`` is the record ``NAME`` of the table ``TABLE``, beside it what
-figures need of the run's arrays, if anything.
+``results/records/TABLE.jsonl`` holds the records of a table, one a line; what figures need of a
+run's arrays lies in ``results/records/TABLE/NAME.npz``.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
-from experiments.common.records.record import FIELDS, Record, read_record, write_record
-from experiments.common.study import Study, load_study
+from experiments.common.records.record import FIELDS, Record, record_from, sealed_record
+from experiments.common.records.writer import write_results
+from experiments.common.study import Results, Study, load_study
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
-from mvest.reading.json_file import read_mapping
+from mvest.reading.json_file import parse_json
 
-__all__ = ["RECORDS", "arrays_of", "publish", "records_of", "regenerate"]
+__all__ = ["RECORDS", "arrays_of", "publish", "records_of", "regenerate", "write_records"]
 
 RECORDS = "records"
 """Folder of the kept records within the results."""
@@ -33,9 +35,9 @@ def arrays_of(folder: Path, name: str) -> dict[str, Path]:
 
 
 def publish(
-    study: Study[Any, Any], results: Path, runs: Mapping[str, tuple[Record[Any], Path]]
+    study: Study[Any], results: Path, runs: Mapping[str, tuple[Record, Path]]
 ) -> list[Path]:
-    """Keep records of one table, and renew it.
+    """Keep records of one table, and renew what follows from them.
 
     Parameters
     ----------
@@ -51,21 +53,29 @@ def publish(
         If a file cannot be written.
     """
     (table,) = {record.table for record, _ in runs.values()}
-    place = results / RECORDS / table
+    place = results / RECORDS
     arrays: dict[str, Path] = {}
     try:
         place.mkdir(parents=True, exist_ok=True)
         # Jobs of one experiment end in several processes at once.
         with FileLock(results / f".{table}.lock"):
+            known = records_of(results, table)
+            records = {} if known is None else dict(known.records)
             for name, (record, folder) in runs.items():
                 own = arrays_of(folder, name)
                 kept = study.keep_arrays(record, own[name]) if own else {}
                 if kept:
-                    write_atomically(place / f"{name}.npz", partial(np.savez_compressed, **kept))
-                write_record(place / f"{name}.json", study.keep(record))
+                    (place / table).mkdir(exist_ok=True)
+                    path = _arrays(results, table, name)
+                    write_atomically(path, partial(np.savez_compressed, **kept))
+                records[name] = study.keep(record)
                 arrays |= own
-            records = _read(place, study.findings)
-            return study.write(results, records, _arrays(place) | arrays)
+            write_records(results, table, records)
+            kept_now = records_of(results, table)
+            assert kept_now is not None
+            return write_results(
+                results, study, Results(kept_now.records, {**kept_now.arrays, **arrays})
+            )
     except OSError as error:
         raise cannot_write(place, error) from error
 
@@ -78,36 +88,57 @@ def regenerate(results: Path) -> list[Path]:
     InputError
         If there is no record, or one is damaged or not as it was written.
     """
-    places = sorted({path.parent for path in (results / RECORDS).glob("*/*.json")})
-    if not places:
+    paths = sorted((results / RECORDS).glob("*.jsonl"))
+    if not paths:
         raise InputError(
             f"{results / RECORDS} holds no record; run an experiment first, for example "
-            "python -m experiments.run experiment=table1"
+            "mvest run experiment=table1"
         )
     written: list[Path] = []
-    for place in places:
-        first = next(iter(sorted(place.glob("*.json"))))
-        study = load_study(str(read_mapping(first).get("study")))
-        written += study.write(results, _read(place, study.findings), _arrays(place))
+    for path in paths:
+        found = records_of(results, path.stem)
+        assert found is not None
+        written += write_results(results, load_study(found.first.study), found)
     return written
 
 
-def records_of(results: Path, table: str, findings: type) -> dict[str, Record[Any]]:
-    """Name -> kept record of a table, the one of its name first; empty if there is none.
+def records_of(results: Path, table: str) -> Results | None:
+    """The kept records of a table, the one of its name first; None if there is none.
 
     Raises
     ------
     InputError
         If one is damaged.
     """
-    return _read(results / RECORDS / table, findings)
+    path = results / RECORDS / f"{table}.jsonl"
+    if not path.is_file():
+        return None
+    records = {}
+    for k, line in enumerate(path.read_bytes().splitlines()):
+        data = parse_json(line, f"{path}, line {k + 1}")
+        name = str(data.get("name"))
+        where = f"{path}, record {name}"
+        records[name] = record_from(data.get("record") or {}, where, _arrays(results, table, name))
+    order = sorted(records, key=lambda name: (name != table, name))
+    arrays = {name: _arrays(results, table, name) for name in order}
+    return Results(
+        {name: records[name] for name in order},
+        {name: place for name, place in arrays.items() if place.is_file()},
+    )
 
 
-def _read(place: Path, findings: type) -> dict[str, Record[Any]]:
-    """The records of a table by name; the one that has the table's name comes first."""
-    paths = sorted(place.glob("*.json"), key=lambda path: (path.stem != place.name, path.stem))
-    return {path.stem: read_record(path, findings) for path in paths}
+def write_records(results: Path, table: str, records: Mapping[str, Record]) -> Path:
+    """Write the records of a table, with digests of them and of their arrays, sorted by name."""
+    lines = [
+        json.dumps(
+            {"name": name, "record": sealed_record(record, _arrays(results, table, name))},
+            ensure_ascii=False,
+            separators=(",", ":"),
+        )
+        for name, record in sorted(records.items())
+    ]
+    return write_atomically(results / RECORDS / f"{table}.jsonl", "\n".join([*lines, ""]))
 
 
-def _arrays(place: Path) -> dict[str, Path]:
-    return {path.stem: path for path in sorted(place.glob("*.npz"))}
+def _arrays(results: Path, table: str, name: str) -> Path:
+    return results / RECORDS / table / f"{name}.npz"

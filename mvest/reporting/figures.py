@@ -127,8 +127,8 @@ def iterates_figure(
     return figure
 
 
-def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
-    """Write ``base.png`` and ``base.pdf`` with one line in print and in their metadata.
+def save_figure_with(base: Path, figure: Figure, line: str, *, pdf: bool = False) -> list[Path]:
+    """Write ``base.png``, and ``base.pdf`` for print, with one line in it and in its metadata.
 
     Raises
     ------
@@ -141,8 +141,9 @@ def save_figure_with(base: Path, figure: Figure, line: str) -> list[Path]:
     # Without dates, so that the same result gives the same file.
     formats: dict[str, dict[str, object]] = {
         ".png": {"metadata": {"Description": line}, "pil_kwargs": {"compress_level": PNG_LEVEL}},
-        ".pdf": {"metadata": {"Subject": line, "CreationDate": None}},
     }
+    if pdf:
+        formats[".pdf"] = {"metadata": {"Subject": line, "CreationDate": None}}
     written, layout = [], figure.get_layout_engine()
     for suffix, options in formats.items():
         path = base.with_name(base.name + suffix)

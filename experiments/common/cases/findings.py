@@ -18,8 +18,8 @@ from mvest.cases.case import Role, ValveCase
 from mvest.cases.plausibility import doubts
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation.information.consistency import moran, zero_mean
-from mvest.personalise.indications import indications_of
-from mvest.personalise.result import Personalised
+from mvest.personalisation.indications import indications_of
+from mvest.personalisation.result import Personalised
 from mvest.problem.estimate import StudyResult
 from mvest.problem.registration import unit_of
 from mvest.problem.verdict import judge

@@ -20,9 +20,9 @@ from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
-from mvest.personalise.chain import personalise_case
-from mvest.personalise.model import with_pressures
-from mvest.personalise.settings import PersonaliseSettings, Treatment, Unknown
+from mvest.personalisation.chain import personalise_case
+from mvest.personalisation.model import with_pressures
+from mvest.personalisation.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import ImageStep
 

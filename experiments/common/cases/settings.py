@@ -11,8 +11,8 @@ from experiments.common.schema import InputFile, Reads, contents
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalise.considered_geometry import ConsideredGeometry
-from mvest.personalise.settings import CaseMesh, PaperSettings, PressureErrors
+from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
 
 __all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
 
@@ -48,7 +48,7 @@ class UnknownSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersonalSettings:
-    """How a case is personalised (see mvest.personalise.PersonaliseSettings)."""
+    """How a case is personalised (see mvest.personalisation.PersonaliseSettings)."""
 
     unknowns: dict[str, UnknownSettings] = field(default_factory=dict)
     mesh: CaseMesh = field(default_factory=CaseMesh)

@@ -1,35 +1,39 @@
 """The record of a run: what ``result.json`` and the kept records in ``results/`` hold.
 
-A study computes its findings; everything else that a record says is stamped once, by the runner.
+A study returns a `Result`; everything else that a record says is stamped once, by the runner.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Hashable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from types import GenericAlias
-from typing import Any, Generic, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mvest.errors import InputError
 from mvest.files import sha256_of
+from mvest.problem.record import EstimateRecord
 from mvest.provenance import provenance, require_sealed, sealed, write_json
 from mvest.reading.json_file import read_mapping
+from mvest.reporting.tables import Table
+
+if TYPE_CHECKING:
+    from experiments.common.study import Result
+    from mvest.valve.mesh.solid_mesh import SolidMesh
 
 __all__ = [
     "FAILED_GATE",
     "FIELDS",
     "NOT_GATED",
     "PASSED_GATE",
-    "SCHEMA",
+    "VERSION",
     "GitState",
     "Mesh",
     "Model",
-    "Outcome",
+    "Number",
     "Provenance",
     "Record",
     "Status",
@@ -38,13 +42,13 @@ __all__ = [
     "model_of_values",
     "read_record",
     "record_from",
-    "require_written",
+    "sealed_record",
     "stamp",
     "write_record",
 ]
 
-SCHEMA = 2
-"""Version of the layout of a record."""
+VERSION = 3
+"""Of the layout of a record."""
 
 FIELDS = "fields.npz"
 """What a run leaves of arrays beside its record."""
@@ -56,11 +60,16 @@ NOT_GATED, PASSED_GATE, FAILED_GATE = "not gated", "passed", "NOT passed"
 """What the gate has said of an anatomy begins with one of these."""
 
 Status = Literal["converged", "failed"]
-F = TypeVar("F")
+Number: TypeAlias = float | int | str | bool | None
 
 
-@dataclass(frozen=True, slots=True)
-class GitState:
+class Frozen(BaseModel):
+    """A part of a record: immutable, and without fields that it does not name."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class GitState(Frozen):
     """The commit that computed a record; None outside a checkout.
 
     Attributes
@@ -74,8 +83,7 @@ class GitState:
     dirty: bool | None
 
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
+class Provenance(Frozen):
     """Where a record came from.
 
     Attributes
@@ -107,8 +115,7 @@ class Provenance:
     finished: str
 
 
-@dataclass(frozen=True, slots=True)
-class Mesh:
+class Mesh(Frozen):
     """The estimator's mesh, and the truth's where there is another.
 
     Attributes
@@ -124,9 +131,18 @@ class Mesh:
     elements: int | None = None
     truth_sha256: str | None = None
 
+    @classmethod
+    def of(cls, mesh: SolidMesh, truth: SolidMesh | None = None) -> Mesh:
+        """What a record says of a mesh, and of that of the truth."""
+        return cls(
+            sha256=mesh.sha256,
+            nodes=len(mesh.nodes),
+            elements=len(mesh.elements),
+            truth_sha256=None if truth is None else truth.sha256,
+        )
 
-@dataclass(frozen=True, slots=True)
-class Model:
+
+class Model(Frozen):
     """What the estimator computed with, as far as its cost depends on it.
 
     Attributes
@@ -148,51 +164,18 @@ class Model:
     noise_mm: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome(Generic[F]):
-    """What a study gives back.
+class Record(Frozen):
+    """A finished run: what ``result.json`` and the kept records in ``results/`` hold.
 
     Attributes
     ----------
-    findings : F
-        Everything that its tables and figures need, as plain data in dataclasses.
+    version : int
+        Of this layout.
+    study, experiment, title, row, table : str
+        Its study, its configuration, and what tables call it.
     status : {"converged", "failed"}
     reason, detail : str
-        Why it ended.
-    mesh : Mesh or None
-    forward_solves : int
-    row : str
-    parameters : tuple of str
-    model : Model or None
-        As in `Record`, where the data say them and not the configuration.
-    gate : str or None
-        As in `Record`.
-    """
-
-    findings: F
-    status: Status = "converged"
-    reason: str = "completed"
-    detail: str = ""
-    mesh: Mesh | None = None
-    forward_solves: int = 0
-    row: str = ""
-    parameters: tuple[str, ...] = ()
-    model: Model | None = None
-    gate: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Record(Generic[F]):
-    """A finished run.
-
-    Attributes
-    ----------
-    schema : int
-        Version of this layout.
-    study, experiment, title, row, table : str
-        Its room, its configuration, and what tables call it.
-    status, reason, detail : str
-        As in `Outcome`.
+        Why the run ended.
     parameters : tuple of str
     factors : mapping
         What is varied in this job of a sweep, by name.
@@ -202,14 +185,17 @@ class Record(Generic[F]):
     model : Model or None
     mesh : Mesh or None
     provenance : Provenance
-    findings : F
-        None where the job died before it had any.
+    estimates : tuple of EstimateRecord
+    numbers : mapping
+        Single values by name, with the unit at the end of the name.
+    tables : mapping
+        Name -> plain data of a `mvest.reporting.tables.Table`.
     gate : str or None
         What the gate said of the anatomy (see `experiments.common.building.gate`); None where the
-        study has none of the configured anatomies.
+        study uses none of the configured anatomies.
     """
 
-    schema: int
+    version: int
     study: str
     experiment: str
     title: str
@@ -225,8 +211,20 @@ class Record(Generic[F]):
     model: Model | None
     mesh: Mesh | None
     provenance: Provenance
-    findings: F
+    estimates: tuple[EstimateRecord, ...] = ()
+    numbers: Mapping[str, Number] = {}
+    tables: Mapping[str, Mapping[str, Any]] = {}
     gate: str | None = None
+
+    def table_of(self, name: str = "") -> Table:
+        """One of its tables.
+
+        Raises
+        ------
+        KeyError
+            If it has none of this name.
+        """
+        return Table.of_plain(self.tables[name], f"table {name!r} of {self.experiment}")
 
     @property
     def converged(self) -> bool:
@@ -269,50 +267,50 @@ def has_passed(gate: str) -> bool | None:
 def model_of_values(values: Mapping[str, Any]) -> Model:
     """What a configuration says of the estimator's model."""
     return Model(
-        values["mechanics"]["element"],
-        tuple(values["mesh"][key] for key in ("columns", "rows", "layers")),
-        values["mesh"]["source"],
-        values["filter"]["mode"],
-        values["observation"]["noise_mm"],
+        element=values["mechanics"]["element"],
+        cells=tuple(values["mesh"][key] for key in ("columns", "rows", "layers")),
+        source=values["mesh"]["source"],
+        filter=values["filter"]["mode"],
+        noise_mm=values["observation"]["noise_mm"],
     )
 
 
-def stamp(
-    values: Mapping[str, Any], config_hash: str, outcome: Outcome[F], started: float
-) -> Record[F]:
-    """The record of an outcome.
+def stamp(values: Mapping[str, Any], config_hash: str, result: Result, started: float) -> Record:
+    """The record of what a study returned.
 
     Parameters
     ----------
     values : mapping
         The resolved configuration.
     config_hash : str
-    outcome : Outcome
-        Its findings are None where a job died.
+    result : Result
     started : float
         Seconds since the epoch.
     """
+    mesh = result.mesh
     return Record(
-        schema=SCHEMA,
+        version=VERSION,
         study=values["study"],
         experiment=values["name"],
         title=values["title"],
-        row=outcome.row or values["row"],
+        row=result.row or values["row"],
         table=values["table"],
-        status=outcome.status,
-        reason=outcome.reason,
-        detail=outcome.detail,
-        parameters=outcome.parameters or tuple(values["parameters"]),
+        status=result.status,
+        reason=result.reason,
+        detail=result.detail,
+        parameters=result.parameters or tuple(values["parameters"]),
         factors=dict(values["factors"]),
         seconds_total=time.time() - started,
-        forward_solves=outcome.forward_solves,
-        model=outcome.model or model_of_values(values),
-        mesh=outcome.mesh,
+        forward_solves=result.forward_solves,
+        model=result.model or model_of_values(values),
+        mesh=mesh,
         provenance=here_and_now(
-            config_hash, "none" if outcome.mesh is None else outcome.mesh.sha256, values["seed"]
+            config_hash, "none" if mesh is None else mesh.sha256, values["seed"]
         ),
-        findings=outcome.findings,
-        gate=outcome.gate,
+        estimates=result.estimates,
+        numbers=result.numbers,
+        tables={name: table.plain() for name, table in result.tables.items()},
+        gate=result.gate,
     )
 
 
@@ -320,7 +318,7 @@ def here_and_now(config_hash: str, mesh_hash: str, seed: int) -> Provenance:
     """The provenance of what is written by this process."""
     source = _source()
     return Provenance(
-        **{**source, "git": GitState(**source["git"])},
+        **source,
         config_hash=config_hash,
         mesh_hash=mesh_hash,
         seed=seed,
@@ -334,70 +332,63 @@ def _source() -> dict[str, Any]:
     return provenance()
 
 
-def write_record(path: Path, record: Record[Any]) -> None:
+def write_record(path: Path, record: Record) -> None:
     """Write a record as JSON, whole or not at all, with digests of itself and of its arrays.
 
     Raises
     ------
     InputError
-        If it holds something without a JSON form, or cannot be written.
+        If it cannot be written.
     """
-    write_json(path, sealed({ARRAYS: _arrays_digest(path), **asdict(record)}))
+    write_json(path, sealed_record(record, path.with_name(FIELDS)))
 
 
 ARRAYS = "arrays_sha256"
 
 
-def _arrays_digest(path: Path) -> str | None:
-    """Of the arrays beside a record: those of a run, or those that the results keep."""
-    run = path.name == "result.json"
-    arrays = path.with_name(FIELDS) if run else path.with_suffix(".npz")
-    return sha256_of(arrays) if arrays.is_file() else None
+def sealed_record(record: Record, arrays: Path) -> dict[str, Any]:
+    """Plain data of a record with digests of itself and of its file of arrays, if it has one."""
+    digest = sha256_of(arrays) if arrays.is_file() else None
+    return sealed({ARRAYS: digest, **record.model_dump(mode="json")})
 
 
-def require_written(data: Mapping[str, Any], path: Path) -> None:
-    """Check that the record in a file and the arrays beside it are those that were written.
+def record_from(data: Mapping[str, Any], where: str, arrays: Path | None = None) -> Record:
+    """A record from plain data, which must be as they were written.
 
-    Raises
-    ------
-    InputError
-        If they are not, or carry no digest.
-    """
-    require_sealed(data, str(path))
-    if data.get(ARRAYS) != _arrays_digest(path):
-        raise InputError(f"{path}: the arrays beside it are not those that it was written with")
-
-
-@cache
-def _adapter(findings: Hashable) -> TypeAdapter[Record[Any]]:
-    return TypeAdapter(cast(type[Record[Any]], GenericAlias(Record, (findings,))))
-
-
-def record_from(data: Any, findings: type[F], where: str) -> Record[F]:
-    """A record from plain data; ``where`` names it in an error.
+    Parameters
+    ----------
+    data : mapping
+    where : str
+        Names the data in an error.
+    arrays : Path, optional
+        Where the file of its arrays lies, if it has one; not checked if not given.
 
     Raises
     ------
     InputError
-        If the data are no record with findings of this type; the message names the first field.
+        If the data are no record of this version, or they or the arrays were changed since.
     """
+    known = {key: value for key, value in data.items() if key not in ("sha256", ARRAYS)}
+    if known.get("version") != VERSION:
+        raise InputError(f"{where} is no record of this version ({VERSION})")
     try:
-        return _adapter(cast(Hashable, findings)).validate_python(data)
+        record = Record.model_validate(known)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"])) or "it"
         raise InputError(f"{where} is no record of a run: {field}: {first['msg']}") from error
+    require_sealed(data, where)
+    if arrays is not None and data.get(ARRAYS) != (sha256_of(arrays) if arrays.is_file() else None):
+        raise InputError(f"{where}: the arrays beside it are not those that it was written with")
+    return record
 
 
-def read_record(path: Path, findings: type[F]) -> Record[F]:
-    """The record in a file.
+def read_record(path: Path) -> Record:
+    """The record in a file of a run's folder.
 
     Raises
     ------
     InputError
         If it cannot be read, is no such record, or is not as it was written.
     """
-    data = read_mapping(path)
-    record = record_from(data, findings, str(path))
-    require_written(data, path)
-    return record
+    return record_from(read_mapping(path), str(path), path.with_name(FIELDS))

@@ -5,18 +5,14 @@ Everything here reads a job's record and resolved configuration; MLflow itself i
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from statistics import stdev
 from typing import Any
 
-from experiments.common.records.findings import Vector
 from experiments.common.records.record import Record
-from experiments.runner.jobs.compared import Compared
-from mvest.provenance import config_hash
 
-__all__ = ["inputs", "metrics", "parameters", "short_names"]
+__all__ = ["metrics", "parameters", "short_names"]
 
 Values = Mapping[str, Any]
 
@@ -36,9 +32,6 @@ BY_PARAMETER = {
 }  # fmt: skip
 """Names of settings that hold one value for each estimated parameter, or one for all."""
 
-DIGEST_LENGTH = 36
-"""Most characters of a digest that MLflow takes."""
-
 
 def parameters(config: Values, names: Sequence[str]) -> dict[str, str]:
     """Settings of a run by short dotted names; numbers are texts that read as numbers.
@@ -55,10 +48,8 @@ def parameters(config: Values, names: Sequence[str]) -> dict[str, str]:
         Of the parameters.
     """
     names = short_names(names)
-    others = {"donor", "imaging"} - {config["study"]}
-    left_out = {*NOT_COMPARED, *others}
     found: dict[str, Any] = {}
-    for name, value in _leaves({k: v for k, v in config.items() if k not in left_out}):
+    for name, value in _leaves({k: v for k, v in config.items() if k not in NOT_COMPARED}):
         if name in BY_PARAMETER:
             found |= _by_parameter(BY_PARAMETER[name], value, names)
         elif isinstance(value, list):
@@ -80,122 +71,64 @@ def short_names(names: Sequence[str]) -> list[str]:
     return [name.split(".", 1)[1] if together else name for name in names]
 
 
-def metrics(record: Record[Compared]) -> list[tuple[str, float, int]]:
+def metrics(record: Record) -> list[tuple[str, float, int]]:
     """Name, value and step of every number worth comparing between runs.
 
-    A job that repeats over seeds is one run: its numbers are means over the seeds that converged
-    (``error`` in percent of the truth, without sign), ``spread`` is the standard deviation of the
-    estimates over the seeds, and ``repeat.*`` holds the seeds one by one, with the seed as the
-    step. So there is one line for each setting in a comparison, whatever the number of seeds, and
-    the seeds cost nothing but a few values in the same call.
+    A job that repeats over seeds is one run: its numbers are means over the estimates that
+    converged (``error`` in percent of the truth, without sign), ``spread`` is their standard
+    deviation, and ``repeat.*`` holds them one by one, with the seed as the step.
     """
-    runs = record.findings.repeats
+    runs = record.estimates
     done = [run for run in runs if run.converged]
     found: list[tuple[str, float | None, int]] = []
     errors: list[float] = []
-    for k, name in enumerate(short_names(record.parameters)):
-        estimates = _column([run.estimate for run in done], k)
-        error = [100.0 * abs(value) for value in _column([run.relative_error for run in done], k)]
+    for name, short in zip(record.parameters, short_names(record.parameters), strict=True):
+        own = [(run.seed, one) for run in done for one in run.unknowns if one.name == name]
+        estimates = [one.estimate for _, one in own]
+        error = [
+            100.0 * abs(one.relative_error) for _, one in own if one.relative_error is not None
+        ]
         errors += error
         found += [
-            (f"error.{name}", _mean(error), 0),
-            (f"estimate.{name}", _mean(estimates), 0),
-            (f"std.{name}", _mean(_column([run.std for run in done], k)), 0),
+            (f"error.{short}", _mean(error), 0),
+            (f"estimate.{short}", _mean(estimates), 0),
+            (f"std.{short}", _mean([one.std for _, one in own]), 0),
         ]
         if len(runs) > 1:
-            found.append((f"spread.{name}", _deviation(estimates), 0))
+            found.append((f"spread.{short}", _deviation(estimates), 0))
+            for seed, one in own:
+                found.append((f"repeat.estimate.{short}", one.estimate, seed or 0))
+                found.append((f"repeat.relative_error.{short}", one.relative_error, seed or 0))
+        if runs:
+            position = [one.name for one in runs[0].unknowns].index(name) if own else 0
             found += [
-                (f"repeat.{what}.{name}", values[k], run.seed or 0)
-                for run in done
-                for what, values in (
-                    ("estimate", run.estimate),
-                    ("relative_error", run.relative_error),
-                )
-                if values is not None
+                (f"iterate.{short}", iterate[position], step)
+                for step, iterate in enumerate(runs[0].iterates)
+                if position < len(iterate)
             ]
-        found += [
-            (f"iterate.{name}", iterate[k], step)
-            for step, iterate in enumerate(runs[0].iterates or ())
-        ]
     # MLflow's own comparison begins with the metric that was logged first.
     found.insert(0, ("error.mean", _mean(errors), 0))
-    for name, distances in (
+    for key, distances in (
         ("distance", [run.distance_mm for run in done]),
         ("distance_truth", [run.distance_to_truth_mm for run in done]),
     ):
         known = [distance for distance in distances if distance is not None]
-        found.append((f"{name}.mean", _mean([distance.mean for distance in known]), 0))
-        found.append((f"{name}.max", _mean([distance.max for distance in known]), 0))
+        found.append((f"{key}.mean", _mean([distance.mean for distance in known]), 0))
+        found.append((f"{key}.max", _mean([distance.max for distance in known]), 0))
+    if runs:
+        found += [
+            ("nis", _mean([run.innovation and run.innovation.nis for run in done]), 0),
+            ("failed", len(runs) - len(done), 0),
+            ("iterations", _mean([run.iterations or 0 for run in runs]), 0),
+            ("seconds", math.fsum(run.seconds or 0.0 for run in runs), 0),
+        ]
+    found.append(("forward_solves", record.forward_solves, 0))
     found += [
-        ("nis", _mean([run.nis for run in done if run.nis is not None]), 0),
-        ("failed", len(runs) - len(done), 0),
-        ("iterations", _mean([run.iterations or 0 for run in runs]), 0),
-        ("forward_solves", math.fsum(run.forward_solves or 0 for run in runs), 0),
-        ("seconds", math.fsum(run.seconds or 0.0 for run in runs), 0),
-    ]
-    found += [
-        (name, value, 0)
-        for name, value in record.findings.measures.items()
-        if not isinstance(value, str)  # what a measure means
+        (name, float(value), 0)
+        for name, value in record.numbers.items()
+        if isinstance(value, int | float)
     ]
     return [(name, float(value), step) for name, value, step in found if value is not None]
-
-
-def inputs(config: Values, record: Record[Compared]) -> list[dict[str, str]]:
-    """What a run was computed from, as MLflow's data sets: the observation and the mesh.
-
-    Returns
-    -------
-    list of dict
-        ``context``, ``name``, ``digest``, ``source_type``, ``source`` and ``profile`` (JSON). An
-        observation's digest is that of the recording where there is one, and otherwise of the
-        settings that it is simulated from: valve, mechanics, truth, frames, noise and seed.
-    """
-    mesh, model, recording = record.mesh, record.model, record.findings.data
-    found = []
-    if mesh is not None and model is not None:
-        sizes = {k: v for k, v in asdict(mesh).items() if not k.endswith("sha256")}
-        found.append(
-            {
-                "context": "mesh",
-                "name": f"mesh {model.element} {' x '.join(map(str, model.cells))}",
-                "digest": mesh.sha256[:DIGEST_LENGTH],
-                "source_type": "mesh",
-                "source": json.dumps({**config["mesh"], "element": model.element}),
-                "profile": json.dumps(sizes),
-            }
-        )
-    frames = config["observation"]["frames"]
-    if recording is not None:
-        found.append(
-            {
-                "context": "observation",
-                "name": "recording",
-                "digest": recording.sha256[:DIGEST_LENGTH],
-                "source_type": "file",
-                "source": json.dumps({"citation": recording.citation}),
-                "profile": json.dumps({"frames": frames}),
-            }
-        )
-    elif config["study"] == "twin":
-        repeats = int(config.get("repeats") or 1)
-        source = {
-            key: config[key] for key in ("valve", "mechanics", "truth", "observation", "seed")
-        } | {"repeats": repeats, "mesh": mesh and (mesh.truth_sha256 or mesh.sha256)}
-        noise = config["observation"]["noise_mm"]
-        found.append(
-            {
-                "context": "observation",
-                "name": "simulated observation",
-                "digest": config_hash(source)[:DIGEST_LENGTH],
-                "source_type": "simulation",
-                "source": json.dumps(
-                    {"truth": config["truth"], "noise_mm": noise, "seed": config["seed"]}
-                ),
-                "profile": json.dumps({"frames": frames, "repeats": repeats}),
-            }
-        )
-    return found
 
 
 def _leaves(values: Values, prefix: str = "") -> list[tuple[str, Any]]:
@@ -226,16 +159,11 @@ def _text(value: Any) -> str:
     return repr(value) if isinstance(value, float) else str(value)
 
 
-def _column(rows: Sequence[Vector | None], k: int) -> list[float]:
-    return [row[k] for row in rows if row is not None]
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    return math.fsum(values) / len(values) if values else None
-
-
-def _deviation(values: Sequence[float]) -> float | None:
-    if len(values) < 2:
-        return None
-    mean = math.fsum(values) / len(values)
-    return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
+def _deviation(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return stdev(known) if len(known) > 1 else None

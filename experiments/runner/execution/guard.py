@@ -18,9 +18,9 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from subprocess import PIPE, TimeoutExpired
-from typing import Any
 
 import experiments
+from experiments.common.records.record import Record
 from experiments.runner.jobs.folder import (
     finished_record,
     is_done,
@@ -192,7 +192,7 @@ def run_apart(
     at_a_time: int = 1,
     *,
     aloud: bool = False,
-) -> dict[str, Any]:
+) -> Record:
     """Run a job in a process apart unless it is done already; its record, whatever happened.
 
     Parameters

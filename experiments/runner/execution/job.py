@@ -5,13 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.common.config import hash_of, without_places
-from experiments.common.records.record import Record, record_from, stamp, write_record
+from experiments.common.records.record import FIELDS, Record, stamp, write_record
+from experiments.common.records.writer import words_of, write_results
 from experiments.common.schema import build
-from experiments.common.study import Check, Job, Study, load_study, study_names
+from experiments.common.study import Check, Job, Results, Study, load_study, study_names
 from experiments.results.keep import arrays_of, publish
 from experiments.runner.execution.check import require_room
 from experiments.runner.execution.guard import run_apart
@@ -32,6 +36,7 @@ from experiments.runner.jobs.limits import MEMORY_LIMIT, default_memory_gb, held
 from experiments.runner.jobs.request import Request
 from experiments.runner.tracking.store import require_no_password
 from mvest.errors import ConfigurationError, InputError
+from mvest.files import write_atomically
 from mvest.provenance import write_json
 from mvest.reading.text import one_line
 
@@ -58,9 +63,9 @@ def run_job(request: Request) -> None:
         return
     if values["time_limit_s"] is not None:
         # Only another process can be stopped at any moment.
-        data = run_apart(request, aloud=True)
-        _raise_failure(data["status"], data["reason"], data["detail"], folder)
-        _say(study, record_from(data, study.findings, str(folder / RESULT)))
+        record = run_apart(request, aloud=True)
+        _raise_failure(record, folder)
+        print(words_of(study, record))
         print(f"Written to {folder}")
         return
     with lock(folder):
@@ -69,15 +74,14 @@ def run_job(request: Request) -> None:
             make_way(request)
             _compute_here(request)
             return
-    record = record_from(done, study.findings, str(folder / RESULT))
-    _say(study, record)
-    source = record.provenance
+    print(words_of(study, done))
+    source = done.provenance
     print(
         f"Done on {source.finished} by commit {(source.git.sha or 'unknown')[:12]}, in "
         f"{folder}; force=true runs it again"
     )
-    _publish(study, request, record)
-    study.finish(_job(study, request), record)
+    _publish(study, request, done)
+    study.finish(_job(study, request), done)
 
 
 def _compute_here(request: Request) -> None:
@@ -90,8 +94,7 @@ def _compute_here(request: Request) -> None:
             compute(request)
     except MemoryError as error:
         reason = ": ".join(filter(None, [str(held), str(error)]))
-        data = write_failure(request, reason, started)
-        _raise_failure(data["status"], reason, "", request.folder)
+        _raise_failure(write_failure(request, reason, started), request.folder)
 
 
 def compute(request: Request) -> None:
@@ -111,14 +114,16 @@ def compute(request: Request) -> None:
     values, folder = request.values, request.folder
     study = load_study(values["study"])
     job = _job(study, request)
-    record = _computed(study, request)
+    record = computed_record(folder, request.config_hash)
     if record is None:
-        outcome = study.run(job)
+        result = study.run(job)
         if hash_of(values) != request.config_hash:
             # Nobody can say of which content it is the result.
             reason = "a file or folder that the settings name was changed before the job ended"
-            outcome = replace(outcome, status="failed", reason=reason)
-        record = stamp(values, request.config_hash, outcome, started)
+            result = replace(result, status="failed", reason=reason)
+        if result.arrays:
+            write_atomically(folder / FIELDS, partial(np.savez_compressed, **result.arrays))
+        record = stamp(values, request.config_hash, result, started)
         write_json(folder / CONFIG, without_places(values))
         write_record(folder / RESULT, record)
     try:
@@ -130,44 +135,24 @@ def compute(request: Request) -> None:
         # Whatever a library for figures or texts raises: the numbers are not lost with it.
         why = one_line(error) or type(error).__name__
         raise InputError(f"{why}; {unwritten(folder)}") from error
-    _raise_failure(record.status, record.reason, record.detail, folder)
+    _raise_failure(record, folder)
 
 
-def _computed(study: Study[Any, Any], request: Request) -> Record[Any] | None:
-    """What an earlier attempt computed, of which not everything could be written."""
-    folder = request.folder
-    data = computed_record(folder, request.config_hash)
-    if data is None:
-        return None
-    try:
-        return record_from(data, study.findings, str(folder / RESULT))
-    except InputError:
-        return None
-
-
-def _say(study: Study[Any, Any], record: Record[Any]) -> None:
-    """What a finished run says on the terminal."""
-    if record.caution:
-        print(record.caution)
-    print(study.words(record))
-
-
-def _write_out(study: Study[Any, Any], request: Request, record: Record[Any]) -> None:
+def _write_out(study: Study[Any], request: Request, record: Record) -> None:
     """All that follows from a record on disk, and the marker that says so."""
-    folder = request.folder
+    folder, name = request.folder, record.experiment
     if request.values["figures"]:
-        if study.write_run is not None:
-            study.write_run(folder, record)
-        else:
-            study.write(folder, {record.table: record}, arrays_of(folder, record.table))
-    _say(study, record)
+        write_results(folder, study, Results({name: record}, arrays_of(folder, name)))
+        if study.files is not None:
+            study.files(folder, record)
+    print(words_of(study, record))
     print(f"Written to {folder}")
     _publish(study, request, record)
     if record.converged:
         mark_done(folder)
 
 
-def require_checks(study: Study[Any, Any], values: Mapping[str, Any]) -> tuple[Check, ...]:
+def require_checks(study: Study[Any], values: Mapping[str, Any]) -> tuple[Check, ...]:
     """What ``check=true`` says of a study.
 
     Raises
@@ -185,7 +170,7 @@ def require_checks(study: Study[Any, Any], values: Mapping[str, Any]) -> tuple[C
     return checks
 
 
-def _job(study: Study[Any, Any], request: Request) -> Job[Any]:
+def _job(study: Study[Any], request: Request) -> Job[Any]:
     return Job(
         request.values,
         build(study.settings, request.values),
@@ -194,7 +179,7 @@ def _job(study: Study[Any, Any], request: Request) -> Job[Any]:
     )
 
 
-def _publish(study: Study[Any, Any], request: Request, record: Record[Any]) -> None:
+def _publish(study: Study[Any], request: Request, record: Record) -> None:
     """Let the results take over a run of an experiment as it is configured."""
     values = request.values
     kept = record.converged or study.keeps_failures
@@ -208,6 +193,7 @@ def _publish(study: Study[Any, Any], request: Request, record: Record[Any]) -> N
     print(f"Results in {results}")
 
 
-def _raise_failure(status: str, reason: str, detail: str, folder: Path) -> None:
-    if status != "converged":
-        raise FailedRunError(reason + (f" ({detail})" if detail else ""), folder)
+def _raise_failure(record: Record, folder: Path) -> None:
+    if not record.converged:
+        detail = f" ({record.detail})" if record.detail else ""
+        raise FailedRunError(record.reason + detail, folder)

@@ -10,24 +10,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock
 
 from experiments.common.config import without_places
-from experiments.common.records.record import (
-    SCHEMA,
-    Outcome,
-    record_from,
-    require_written,
-    stamp,
-    write_record,
-)
+from experiments.common.records.record import Record, read_record, stamp, write_record
+from experiments.common.study import Result
 from experiments.runner.jobs.request import Request
 from mvest.errors import InputError
 from mvest.files import remove_parts
 from mvest.provenance import write_json
-from mvest.reading.json_file import read_mapping
 
 __all__ = [
     "CONFIG",
@@ -71,16 +63,13 @@ def lock(folder: Path) -> FileLock:
     return FileLock(folder / LOCK)
 
 
-def read_result(folder: Path, config_hash: str) -> dict[str, Any] | None:
+def read_result(folder: Path, config_hash: str) -> Record | None:
     """The record in a folder if it is of this version and configuration, and as it was written."""
     try:
-        data = read_mapping(folder / RESULT)
-        record = record_from(data, Any, str(folder / RESULT))
-        require_written(data, folder / RESULT)
+        record = read_record(folder / RESULT)
     except InputError:
         return None
-    same = record.schema == SCHEMA and record.provenance.config_hash == config_hash
-    return data if same else None
+    return record if record.provenance.config_hash == config_hash else None
 
 
 def is_done(folder: Path) -> bool:
@@ -96,27 +85,27 @@ def result_time(folder: Path) -> int | None:
         return None
 
 
-def finished_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+def finished_record(folder: Path, config_hash: str) -> Record | None:
     """The record of a job that is done; None if it has to be run."""
     return read_result(folder, config_hash) if is_done(folder) else None
 
 
-def last_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+def last_record(folder: Path, config_hash: str) -> Record | None:
     """What the last attempt ended with; None if it did not get to its end.
 
     A record of success without the marker comes from a process that died before everything else was
     on disk.
     """
     record = read_result(folder, config_hash)
-    if record is None or is_done(folder) == (record["status"] == "converged"):
+    if record is None or is_done(folder) == record.converged:
         return record
     return None
 
 
-def computed_record(folder: Path, config_hash: str) -> dict[str, Any] | None:
+def computed_record(folder: Path, config_hash: str) -> Record | None:
     """A record of success without the marker: computed, but not all of it could be written."""
     record = None if is_done(folder) else read_result(folder, config_hash)
-    return record if record is not None and record["status"] == "converged" else None
+    return record if record is not None and record.converged else None
 
 
 def mark_done(folder: Path) -> None:
@@ -128,7 +117,7 @@ def clear(folder: Path) -> None:
     """Take away what an earlier attempt left, its marker first; say so if it was changed since."""
     if is_done(folder) and (folder / RESULT).exists():
         try:
-            require_written(read_mapping(folder / RESULT), folder / RESULT)
+            read_record(folder / RESULT)
         except InputError as error:
             print(f"note: {error}; it is computed again", file=sys.stderr)
     for name in (DONE, RESULT):
@@ -188,7 +177,7 @@ def unwritten(folder: Path) -> str:
     return f"the estimate is in {folder / RESULT}, and the same command writes what is missing"
 
 
-def write_failure(request: Request, reason: str, started: float) -> dict[str, Any]:
+def write_failure(request: Request, reason: str, started: float) -> Record:
     """Record that a job ended without anyone left to record it, and why.
 
     What it had computed before it ended is not lost: that record stays, and the reason is said.
@@ -202,8 +191,8 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
 
     Returns
     -------
-    dict
-        The record that is there now, with the keys of a finished one.
+    Record
+        The record that is there now.
 
     Raises
     ------
@@ -217,9 +206,9 @@ def write_failure(request: Request, reason: str, started: float) -> dict[str, An
     record = stamp(
         request.values,
         request.config_hash,
-        Outcome(findings=None, status="failed", reason=reason),
+        Result(status="failed", reason=reason),
         started,
     )
     write_json(request.folder / CONFIG, without_places(request.values))
     write_record(request.folder / RESULT, record)
-    return read_mapping(request.folder / RESULT)
+    return record

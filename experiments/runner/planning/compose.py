@@ -22,7 +22,7 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.config import hash_of, plain
-from experiments.runner.jobs.compared import last_compared
+from experiments.runner.jobs.folder import last_record
 from experiments.runner.jobs.limits import TIME_LIMIT_S
 from experiments.runner.jobs.request import Request, as_published, publish_as
 from experiments.runner.planning.plan import Attempt, Plan, PlannedJob
@@ -208,7 +208,7 @@ def _as_configured(config: DictConfig) -> bool:
 
 
 def _planned(request: Request, overrides: Sequence[str]) -> PlannedJob:
-    record = last_compared(request.folder, request.config_hash)
+    record = last_record(request.folder, request.config_hash)
     return PlannedJob(
         request.config_hash,
         request.folder,

@@ -16,8 +16,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from experiments.common.records.record import model_of_values
-from experiments.runner.jobs.compared import compared
+from experiments.common.records.record import model_of_values, read_record
 from experiments.runner.jobs.folder import RESULT
 from experiments.runner.jobs.request import Request
 from mvest.errors import InputError
@@ -280,13 +279,13 @@ def _recorded_seconds(folders: Path, plan: Plan) -> dict[str, list[float]]:
     )
     for place in places[:MAX_READ]:
         try:
-            record = compared(read_mapping(place), str(place))
+            record = read_record(place)
         except InputError:
             # Not a result of this version: it tells no time.
             continue
         if record.converged and record.model is not None:
-            seconds = record.seconds_total / len(record.findings.repeats)
-            found.setdefault(json.dumps(asdict(record.model)), []).append(seconds)
+            seconds = record.seconds_total / max(1, len(record.estimates))
+            found.setdefault(json.dumps(record.model.model_dump()), []).append(seconds)
     return found
 
 

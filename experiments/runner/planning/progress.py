@@ -72,11 +72,11 @@ class SweepBar:
             if record is None:
                 continue
             del self._waiting[job]
-            if record["status"] == "converged":
+            if record.converged:
                 self._done += 1
             else:
                 self._failed += 1
-                self._tell(job, record["reason"])
+                self._tell(job, record.reason)
             self._last = time.monotonic()
             self._bar.set_postfix_str(self.said(), refresh=False)
             self._bar.update(1)

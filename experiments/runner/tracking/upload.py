@@ -15,9 +15,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.common.records.record import SCHEMA, Record, require_written
-from experiments.runner.collecting.comparison import inputs, metrics, parameters
-from experiments.runner.jobs.compared import Compared, compared
+from experiments.common.records.record import Record, read_record
+from experiments.runner.collecting.comparison import metrics, parameters
 from experiments.runner.jobs.folder import is_done
 from experiments.runner.tracking.store import Store, open_store, telling
 from mvest.errors import InputError, MvestError
@@ -118,11 +117,7 @@ def upload(
         If a file of the job cannot be read.
     """
     place = folder / "result.json"
-    data, config = read_mapping(place), read_mapping(folder / "config.json")
-    if data.get("schema") != SCHEMA:
-        raise InputError(f"{place} was written by another version")
-    record = compared(data, str(place))
-    require_written(data, place)
+    record, config = read_record(place), read_mapping(folder / "config.json")
     result_hash = _digest(place)
     receipt = read_mapping(folder / RECEIPT) if (folder / RECEIPT).is_file() else {}
     config_hash = record.provenance.config_hash
@@ -158,14 +153,14 @@ def upload(
 def _log(
     store: Store,
     folder: Path,
-    record: Record[Compared],
+    record: Record,
     config: Mapping[str, Any],
     name: str,
     sweep_id: str,
     result_hash: str,
 ) -> str:
     """Log one run, closed as the last step; returns its id."""
-    from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param
+    from mlflow.entities import Metric, Param
 
     provenance = record.provenance
     end = int(1000 * (folder / "result.json").stat().st_mtime)
@@ -179,7 +174,7 @@ def _log(
         "seed": provenance.seed,
         "status": record.status,
         "reason": record.reason,
-        "verdict": record.findings.verdict,
+        "verdict": next((one.verdict.trust for one in record.estimates if one.verdict), None),
         "folder": folder.name,
         "mlflow.source.name": "experiments.run",
         "mlflow.source.type": "LOCAL",
@@ -188,13 +183,6 @@ def _log(
     numbers = [Metric(k, v, end, step) for k, v, step in metrics(record)]
     settings = [
         Param(k, v[:LONGEST_TEXT]) for k, v in parameters(config, record.parameters).items()
-    ]
-    data = [
-        DatasetInput(
-            Dataset(**{key: value for key, value in one.items() if key != "context"}),
-            [InputTag("mlflow.data.context", one["context"])],
-        )
-        for one in inputs(config, record)
     ]
     with telling(store.place):
         run_id = str(
@@ -213,7 +201,6 @@ def _log(
             )
         for first in range(PARAMETERS_AT_ONCE, len(settings), PARAMETERS_AT_ONCE):
             store.client.log_batch(run_id, params=settings[first : first + PARAMETERS_AT_ONCE])
-        store.client.log_inputs(run_id, datasets=data)
         for path in sorted(path for name in FILES for path in folder.glob(name)):
             if path.name != RECEIPT and not path.name.startswith("."):
                 store.client.log_artifact(run_id, str(path))

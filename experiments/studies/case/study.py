@@ -18,8 +18,8 @@ from experiments.common.study import Job, Study
 from experiments.studies.case.settings import Settings
 from mvest.cases.case import Frame, Role, ValveCase
 from mvest.cases.plausibility import doubts, require_plausible
-from mvest.personalise.gate import gate_case, gate_lines
-from mvest.personalise.model import build_model
+from mvest.personalisation.gate import gate_case, gate_lines
+from mvest.personalisation.model import build_model
 from mvest.reporting.case.fields import turn_of
 from mvest.scenarios.measures import contact_reach
 

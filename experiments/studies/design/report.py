@@ -13,7 +13,7 @@ from experiments.common.records.record import Record
 from experiments.common.records.report import heading
 from experiments.studies.design.findings import Findings, Tried
 from mvest.files import write_atomically
-from mvest.personalise.design import ERRORS_MMHG, HALF, KIND_WORDS
+from mvest.personalisation.design import ERRORS_MMHG, HALF, KIND_WORDS
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.style import SMALL, headline, panels
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.settings import PersonalSettings
-from mvest.personalise.considered_geometry import ConsideredGeometry
+from mvest.personalisation.considered_geometry import ConsideredGeometry
 
 __all__ = ["Corner", "FramesSettings", "Settings"]
 

@@ -21,11 +21,11 @@ from experiments.studies.design.findings import Findings, Left, Tried
 from experiments.studies.design.report import design_answer, design_words, write_design
 from experiments.studies.design.settings import Corner, Settings
 from mvest.errors import ConfigurationError, GeometryError
-from mvest.personalise.chain import personalise_case
-from mvest.personalise.design import ERRORS_MMHG, GROUPS, KINDS, FrameDesigns, StatedErrors
-from mvest.personalise.expectation import design_case
-from mvest.personalise.model import build_coarse
-from mvest.personalise.settings import PersonaliseSettings, PressureErrors
+from mvest.personalisation.chain import personalise_case
+from mvest.personalisation.design import ERRORS_MMHG, GROUPS, KINDS, FrameDesigns, StatedErrors
+from mvest.personalisation.expectation import design_case
+from mvest.personalisation.model import build_coarse
+from mvest.personalisation.settings import PersonaliseSettings, PressureErrors
 from mvest.simulation.virtual_patient import VirtualPatient, simulate_patient
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.common.records.tables import write_table
-from mvest.personalise.error_budget import EVERYTHING, IMAGES, MOTION
+from mvest.personalisation.error_budget import EVERYTHING, IMAGES, MOTION
 from mvest.reporting.case.findings import Cost
 from mvest.reporting.figures import save_figure_with
 from mvest.reporting.style import SMALL, headline, panels

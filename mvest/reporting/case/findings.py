@@ -116,7 +116,7 @@ class ToTruth:
 class FrameDistances:
     """Distances of the models from a frame as it was observed, which the filter saw or not.
 
-    Models as in `mvest.personalise.result.FrameDistance`.
+    Models as in `mvest.personalisation.result.FrameDistance`.
     """
 
     frame: str
@@ -151,7 +151,7 @@ class GeometryRow:
     """By how much one kind of a geometry is expected to differ from what was seen.
 
     Root of the mean square in ``unit``; the mode that is moved most, by ``stretch`` standard
-    deviations. See `mvest.personalise.expected.GeometryShift`.
+    deviations. See `mvest.personalisation.expected.GeometryShift`.
     """
 
     name: str
@@ -213,7 +213,7 @@ class ImageErrors:
 class Cost:
     """SD of a modulus' logarithm if a part of what is not known were, and if it were all there is.
 
-    See `mvest.personalise.error_budget`.
+    See `mvest.personalisation.error_budget`.
     """
 
     part: str

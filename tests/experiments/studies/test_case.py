@@ -18,7 +18,7 @@ from experiments.studies.case.settings import Settings
 from experiments.studies.case.study import STUDY, run_own_case
 from mvest.cases.writer import write_case
 from mvest.errors import ConfigurationError, InputError
-from mvest.personalise import Treatment, personalise_case
+from mvest.personalisation import Treatment, personalise_case
 from mvest.problem.verdict import ONE_STATE
 from mvest.reporting.case.fields import read_case_fields
 from tests.experiments.configured import composed, plain
@@ -301,7 +301,7 @@ def test_an_unknown_treatment_names_the_known_ones(config):
 def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, monkeypatch):
     (built,) = [use(monkeypatch)]
     monkeypatch.setattr(
-        "mvest.personalise.estimation.estimate",
+        "mvest.personalisation.estimation.estimate",
         lambda *a, **k: pytest.fail("something was estimated"),
     )
     status, out, err = run(*OWN, f"case={folder}", "check=true")

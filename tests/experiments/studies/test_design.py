@@ -17,12 +17,12 @@ from experiments.studies.design.report import (
 )
 from experiments.studies.design.settings import Corner, FramesSettings, Settings
 from mvest.errors import ConfigurationError
-from mvest.personalise.design import ERRORS_MMHG, KINDS
+from mvest.personalisation.design import ERRORS_MMHG, KINDS
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up as made_record
 from tests.made_up_closure import MESH, TRUE, made_up_case, use
-from tests.personalise.test_fitted_frames import with_fitted
+from tests.personalisation.test_fitted_frames import with_fitted
 
 
 def job(folder, *overrides):

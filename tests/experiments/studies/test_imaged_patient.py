@@ -23,7 +23,7 @@ from experiments.studies.imaged_patient.tables import (
     write_volume_tables,
 )
 from mvest.errors import InputError
-from mvest.personalise.error_budget import EVERYTHING, IMAGES, MOTION
+from mvest.personalisation.error_budget import EVERYTHING, IMAGES, MOTION
 from mvest.reporting.case.findings import Cost, UnknownRow
 from tests.experiments.studies.made_up import made_up
 from tests.experiments.studies.made_up_patients import an_outcome

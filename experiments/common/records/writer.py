@@ -1,0 +1,169 @@
+"""Tables, figures and page of any study, from its records alone.
+
+Of a table of results called NAME there are, in one folder: ``NAME.csv`` and ``NAME_PART.csv`` (tidy
+tables, for programs), ``NAME.md`` (the page: what readers see of the tables), ``NAME.png`` and
+``NAME_PART.png`` (figures), and, of the paper's own tables, LaTeX and PDF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.common.records.record import Record
+from experiments.common.study import Results, Study
+from mvest.files import write_atomically
+from mvest.reporting.tables import Table
+
+__all__ = ["cautions", "provenance_of", "words_of", "write_results", "write_tables"]
+
+LONGEST = 60
+"""Rows of a table that a page shows; a longer one is named as a file."""
+
+
+def write_results(folder: Path, study: Study[Any], results: Results, name: str = "") -> list[Path]:
+    """Write everything that follows from records; returns the paths, tables first.
+
+    Parameters
+    ----------
+    folder : Path
+        Existing folder.
+    study : Study
+    results : Results
+    name : str
+        What files are called; by default as the table that the records belong to.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    base = folder / (name or results.first.table)
+    written = write_tables(
+        base,
+        results.first.title,
+        {part: results.table(part) for part in results.table_names},
+        study.summary(results) if study.summary is not None else None,
+        list(results.records.values()),
+        latex=study.latex,
+    )
+    return [*written, *_write_figures(base, study, results)]
+
+
+def write_tables(
+    base: Path,
+    title: str,
+    tables: Mapping[str, Table],
+    summary: Mapping[str, Table] | None,
+    records: Sequence[Record],
+    *,
+    latex: bool = False,
+) -> list[Path]:
+    """Write tables as CSV, and the page that shows them.
+
+    Parameters
+    ----------
+    base : Path
+        Folder and beginning of all names.
+    title : str
+    tables : mapping of str to Table
+        Part -> table; ``""`` is the main one.
+    summary : mapping of str to Table or None
+        What readers see in place of `tables`; of the same name it replaces one.
+    records : sequence of Record
+        Those that the tables follow from.
+    latex : bool
+        Whether readers' tables are written as LaTeX, too.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written.
+    """
+    lines = sorted({record.line for record in records})
+    comments = "".join(f"# {line}\n" for line in lines[:1])
+    shown = tables if summary is None else summary
+    written = []
+    for part, table in {**tables, **shown}.items():
+        path = _named(base, part, ".csv")
+        written.append(write_atomically(path, comments + table.csv()))
+    parts = [f"# {title}", *(f"**{text}**" for text in cautions(records))]
+    if summary is None and len(records) == 1:
+        parts.append("\n".join(numbers_of(records[0])))
+    for part, table in shown.items():
+        if part:
+            parts.append(f"## {_heading(part)}")
+        file = _named(base, part, ".csv").name
+        parts.append(table.markdown() if len(table) <= LONGEST else f"{len(table)} rows: {file}")
+        if latex:
+            text = f"% {provenance_of(records)}\n{table.latex()}"
+            written.append(write_atomically(_named(base, part, ".tex"), text))
+    parts.append(f"<sub>{provenance_of(records)}</sub>")
+    page = "\n\n".join(part for part in parts if part) + "\n"
+    return [*written, write_atomically(base.with_name(f"{base.name}.md"), page)]
+
+
+def words_of(study: Study[Any], record: Record) -> str:
+    """What a finished run says on the terminal: its cautions, numbers and readers' tables."""
+    parts = cautions([record])
+    if study.words is not None:
+        return "\n".join([*parts, study.words(record)])
+    results = Results({record.experiment: record})
+    tables = {part: results.table(part) for part in results.table_names}
+    if study.summary is not None:
+        tables = dict(study.summary(results))
+    parts += numbers_of(record)
+    for part, table in tables.items():
+        shown = table.text() if len(table) <= LONGEST else f"{len(table)} rows"
+        parts.append(f"{_heading(part)}:\n{shown}" if part else shown)
+    return "\n".join(parts)
+
+
+def numbers_of(record: Record) -> list[str]:
+    """The single values of a record, a line of Markdown each; why a failed run has none."""
+    failed = [] if record.converged else [f"* no result: {record.reason}"]
+    values = {name: f"{v:.4g}" if isinstance(v, float) else v for name, v in record.numbers.items()}
+    return failed + [f"* {_heading(name)}: {value}" for name, value in values.items()]
+
+
+def cautions(records: Sequence[Record]) -> list[str]:
+    """What stands before results whose anatomies have not passed the gate, naming them."""
+    rows: dict[str, list[str]] = {}
+    for record in records:
+        if record.caution:
+            rows.setdefault(record.caution, []).append(record.row)
+    return [
+        text if len(named) == len(records) else f"{'; '.join(named)}: {text}"
+        for text, named in rows.items()
+    ]
+
+
+def provenance_of(records: Sequence[Record]) -> str:
+    """Where the first of several records came from, and how many there are besides."""
+    lines = sorted({record.line for record in records})
+    return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
+
+
+def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path]:
+    if study.figure is None:
+        return []
+    from mvest.reporting.figures import save_figure_with
+
+    drawn = study.figure(results)
+    if drawn is None:
+        return []
+    line = provenance_of(list(results.records.values()))
+    return [
+        path
+        for part, figure in (drawn if isinstance(drawn, Mapping) else {"": drawn}).items()
+        for path in save_figure_with(_named(base, part), figure, line, pdf=study.latex)
+    ]
+
+
+def _named(base: Path, part: str, suffix: str = "") -> Path:
+    return base.with_name(f"{base.name}_{part}{suffix}" if part else f"{base.name}{suffix}")
+
+
+def _heading(name: str) -> str:
+    return name.replace("_", " ")

@@ -1,0 +1,376 @@
+"""A synthetic study: simulate an observation, estimate from it, compare with the truth."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.common.building.extrapolated import Extrapolated
+from experiments.common.building.filters import build_filter
+from experiments.common.building.gate import gate_of
+from experiments.common.building.twin import Twin, build_twin
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.records.record import Mesh, Number, model_of_values
+from experiments.common.study import Check, Job, Result, Results, Study
+from mvest.closure.model import ClosureModel
+from mvest.errors import ConfigurationError, InputError, MvestError
+from mvest.estimation.noise import observation_noise
+from mvest.estimation.wrappers import SharedStart
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.record import EstimateRecord, Unknown, record_of
+from mvest.problem.registration import unit_of
+from mvest.reporting.tables import Column, Table, joined, table
+from mvest.scenarios.measures import contact_reach
+from mvest.valve.measure.annulus import annulus_plane
+from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDY", "run_twin"]
+
+LOCKING = (
+    "note: linear tetrahedra are many times too stiff in bending; moduli estimated with tet4 "
+    "belong to the mesh, not to the tissue"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration: nothing."""
+
+
+def run_twin(job: Job[Settings]) -> Result:
+    """Simulate an observation for each seed and estimate from it; arrays are of the first."""
+    values = job.values
+    twin = build_twin(values)
+    if twin.model.mesh.element_type == "tet4":
+        print(LOCKING, file=sys.stderr)
+    began = time.perf_counter()
+    seeds = range(values["seed"], values["seed"] + values["repeats"])
+    results = _estimate_twin(twin, seeds)
+    result = results[0]
+    confirmed = _confirm(twin, result) if values["confirm"] else None
+    computing = time.perf_counter() - began
+    estimates = tuple(
+        _known(record_of(one, seed=seed, simulated=True), twin)
+        for seed, one in zip(seeds, results, strict=True)
+    )
+    solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
+    closed = (_measured(twin, result) or {} if values["measure"] else {}).get("closed")
+    band = _truth_band(twin, result)
+    row = _row(values, estimates[0], result, closed, band)
+    tables = {"": _table([row | {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}])}
+    if values["paper"]:
+        tables["paper"] = _table([_paper_row(values, estimates[0])])
+    numbers: dict[str, Number] = {
+        "confirmed_mm": confirmed,
+        "seconds_computing": computing,
+        "truth_store": "hit" if twin.source.counts.hits else "miss",
+    }
+    return Result(
+        tables=tables,
+        numbers=numbers,
+        estimates=estimates,
+        arrays=_fields(twin, result) if values["figures"] and result.fitted is not None else {},
+        status=estimates[0].status,
+        reason=result.reason,
+        detail=result.detail,
+        mesh=Mesh.of(twin.model.mesh, twin.truth_model.mesh),
+        forward_solves=solves,
+        gate=gate_of(values),
+    )
+
+
+def _known(record: EstimateRecord, twin: Twin) -> EstimateRecord:
+    """A record with truth and start, also where nothing was estimated."""
+    if record.unknowns:
+        return record
+    start = twin.problem.start
+    unknowns = tuple(
+        Unknown(name=name, unit=unit_of(name), prior_mean=float(m), truth=float(true))
+        for name, m, true in zip(twin.problem.parameters, start, twin.truth_values, strict=True)
+    )
+    return record.model_copy(update={"unknowns": unknowns})
+
+
+def _estimate_twin(twin: Twin, seeds: Sequence[int]) -> list[StudyResult]:
+    """One estimate for each seed; simulation and first closure are common to all."""
+    with SolveBar("observation", len(_steps(twin.truth_model)), 1) as bar:
+        twin.truth_model.on_step = bar.step
+        truth = twin.source(twin.truth_values)
+    problem = replace(twin.problem, model=SharedStart(twin.model, twin.problem.start))
+    results = []
+    steps, solves = len(_steps(twin.model)), TYPICAL_SOLVES * len(seeds)
+    with SolveBar("estimation", steps, solves, problem.parameters) as bar:
+        twin.model.on_step = bar.step
+        for seed in seeds:
+            data = twin.observe(lambda m: truth, twin.truth_values, np.random.default_rng(seed))
+            if data.observation is None:
+                return [StudyResult.failed(twin.problem, data.reason, 0.0) for _ in seeds]
+            result = estimate(problem, data.observation, on_iterate=bar.iterate)
+            results.append(result.against(data.truth))
+    return results
+
+
+def _confirm(twin: Twin, result: StudyResult) -> float | None:
+    """Largest distance (mm) of the fitted closed valve from one closed anew from the open state.
+
+    None where every closure started from the open state or the closed frame is not observed, so
+    that there is nothing to confirm, or where the new closure failed.
+    """
+    usual = twin.model.continuation, twin.model.guide
+    if result.estimate is None or result.fitted is None or usual == (False, None):
+        return None
+    fitted = dict(zip(twin.frames, result.fitted, strict=True)).get("closed")
+    if fitted is None:
+        return None
+    twin.model.continuation, twin.model.guide = False, None
+    with SolveBar("confirmation", len(_steps(twin.model)), 1) as bar:
+        twin.model.on_step = bar.step
+        anew = twin.model.close(result.estimate, sensitivities=False).simulation
+    twin.model.continuation, twin.model.guide = usual
+    if not anew.converged:
+        return None
+    return float(np.linalg.norm(twin.model.observed(anew.frames[-1]) - fitted, axis=1).max())
+
+
+def _truth_band(twin: Twin, result: StudyResult) -> list[float] | None:
+    """By how many percent the least-squares estimate follows the extrapolation of the truth."""
+    predicted = None if result.filtered is None else result.filtered.prediction
+    if not isinstance(twin.source, Extrapolated) or predicted is None:
+        return None
+    correction = twin.source.correction(twin.truth_values)
+    shift = np.linalg.lstsq(predicted.jacobian, correction)[0]
+    return list(100 * np.abs(shift / twin.truth_values))
+
+
+def _measured(twin: Twin, result: StudyResult) -> dict[str, ClosureMeasurements | str] | None:
+    """Measurements of each fitted frame, or why they could not be taken."""
+    if result.observation is None or result.fitted is None:
+        return None
+    valve, surface = twin.valve, twin.valve.surface
+    reach = twin.model.settings.contact.activation_distance * float(surface.thickness.mean())
+    first = np.unique(surface.triangles[surface.region == 0])
+    measured: dict[str, ClosureMeasurements | str] = {}
+    for frame, points in zip(result.observation.frames, result.fitted, strict=True):
+        annulus = points[valve.annulus]
+        anterior = points[np.intersect1d(valve.annulus, first)].mean(axis=0)
+        try:
+            measured[frame] = measure_closure(
+                points,
+                surface.triangles,
+                surface.region,
+                surface.thickness,
+                annulus,
+                annulus_plane(annulus, valve.papillary_tips.mean(axis=0), anterior),
+                reach,
+            )
+        except MvestError as error:
+            # An estimate is not lost because the valve's shape defies a measurement.
+            measured[frame] = str(error)
+    return measured
+
+
+def _fields(twin: Twin, result: StudyResult) -> dict[str, NDArray[Any]]:
+    """The last observed and fitted frame, as those of a case (`mvest.reporting.case.fields`)."""
+    assert isinstance(result.observation, Observation)
+    assert result.fitted is not None
+    valve, surface = twin.valve, twin.valve.surface
+    return {
+        "triangles": surface.triangles.astype(np.int32),
+        "region": surface.region.astype(np.int8),
+        "rest": surface.vertices.astype(np.float32),
+        "annulus": valve.annulus.astype(np.int32),
+        "free_edge": valve.free_edge.astype(np.int32),
+        "frames": np.array(result.observation.frames[-1:]),
+        "seen": np.array([True]),
+        "tips": np.stack([valve.papillary_tips] * 2).astype(np.float32),
+        "observed": result.observation.positions[-1:].astype(np.float32),
+        "fitted": result.fitted[-1:].astype(np.float32),
+        "distance_fitted": np.asarray(result.distance, dtype=np.float64)[None],
+        "reach_mm": np.array(contact_reach(twin.model)),
+    }
+
+
+def _steps(model: ClosureModel) -> Sequence[object]:
+    return model.settings.protocol.steps()
+
+
+def require_twin(values: Mapping[str, Any]) -> None:
+    """Refuse settings of filter and observation that no job could run with.
+
+    Raises
+    ------
+    ConfigurationError
+        If a setting is inadmissible; the message names it.
+    """
+    build_filter(values["filter"], tuple(values["parameters"]))
+    variance = values["filter"]["R"]
+    try:
+        observation_noise(np.atleast_1d(np.asarray(variance, dtype=float)), np.size(variance))
+    except (InputError, TypeError, ValueError) as error:
+        text = str(error) if isinstance(error, MvestError) else "expected a number or numbers"
+        raise ConfigurationError(f"filter.R = {variance}: {text}") from error
+    noise = values["observation"]["noise_mm"]
+    if noise < 0:
+        raise ConfigurationError(f"observation.noise_mm = {noise}, expected at least 0")
+
+
+def _row(
+    values: Mapping[str, Any],
+    record: EstimateRecord,
+    result: StudyResult,
+    closed: ClosureMeasurements | str | None,
+    band: Sequence[float] | None,
+) -> dict[str, Any]:
+    """What tables say of one run: plain numbers, errors without sign."""
+    row: dict[str, Any] = {"run": values["row"], "source": "mvest"}
+    for k, name in enumerate(values["parameters"]):
+        own = record.unknown(name)
+        error = own.relative_error
+        row |= {
+            f"truth {name}": own.truth,
+            f"start {name}": own.prior_mean,
+            f"estimate {name}": own.estimate,
+            f"std {name}": own.std,
+            f"error {name}": None if error is None else 100.0 * abs(error),
+            f"truth of {name} known to": None if band is None else band[k],
+        }
+    errors = [abs(m.relative_error) for m in result.moduli if m.relative_error is not None]
+    distance, model = record.distance_mm, model_of_values(values)
+    measured = closed if isinstance(closed, ClosureMeasurements) else None
+    return row | {
+        "moduli error mean": 100 * float(np.mean(errors)) if errors else None,
+        "moduli error SD": 100 * float(np.std(errors)) if errors else None,
+        "distance mean": distance and distance.mean,
+        "distance SD": distance and distance.std,
+        "distance max": distance and distance.max,
+        "orifice, closed": measured and measured.orifice_area,
+        "passing ball, closed": measured and measured.passing_ball_diameter,
+        "coaptation": measured and measured.coaptation_length,
+        "element": model.element,
+        "cells": " x ".join(str(n) for n in model.cells),
+        "filter": model.filter,
+        "noise": model.noise_mm,
+        "iterations": record.iterations or 0,
+        "status": record.status,
+        "reason": record.reason,
+    }
+
+
+def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, Any]:
+    """What the paper reports of the same experiment."""
+    paper = values["paper"]
+    row: dict[str, Any] = {"run": f"paper, {paper['table']}", "source": "paper"}
+    for k, name in enumerate(values["parameters"]):
+        row |= {
+            f"truth {name}": record.unknown(name).truth,
+            f"estimate {name}": _at(paper["estimate"], k),
+            f"error {name}": _at(paper["error_percent"], k),
+        }
+    return row | {
+        "moduli error mean": _at(paper["moduli_error_percent"], 0),
+        "moduli error SD": _at(paper["moduli_error_percent"], 1),
+        "distance mean": _at(paper["distance_mm"], 0),
+        "distance SD": _at(paper["distance_mm"], 1),
+    }
+
+
+def _at(values: Sequence[float] | None, k: int) -> float | None:
+    return None if values is None or k >= len(values) else values[k]
+
+
+UNITS = {
+    "distance max": "mm",
+    "orifice, closed": "mm²",
+    "passing ball, closed": "mm",
+    "coaptation": "mm",
+    "noise": "mm",
+}
+HIDDEN = ("source", "nodes", "noise", "iterations", "status", "filter", *UNITS)
+"""Columns that only programs see."""
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Rows of runs with the meaning of their columns."""
+    about: dict[str, Column] = {"run": Column()}
+    about |= {name: Column(UNITS.get(name, ""), hidden=True) for name in HIDDEN if name in rows[0]}
+    for name in (key.partition(" ")[2] for key in rows[0] if key.startswith("truth ")):
+        if f"estimate {name}" not in rows[0]:
+            continue
+        unit = unit_of(name)
+        std, band = f"std {name}", f"truth of {name} known to"
+        about[f"truth {name}"] = Column(unit, hidden=True)
+        about[f"estimate {name}"] = Column(unit, std=std if std in rows[0] else "", label=name)
+        about[f"error {name}"] = Column("%", std=band if band in rows[0] else "")
+        if std in rows[0]:
+            about |= {f"start {name}": Column(unit, hidden=True), std: Column(unit)}
+            about[band] = Column("%")
+    about["moduli error mean"] = Column("%", std="moduli error SD", label="error of all moduli")
+    about["moduli error SD"] = Column("%")
+    about["distance mean"] = Column("mm", std="distance SD", label="distance")
+    about["distance SD"] = Column("mm")
+    order = dict.fromkeys([*rows[0], *about])
+    return table([{key: row.get(key) for key in order} for row in rows], **about)
+
+
+def summary(results: Results) -> dict[str, Table]:
+    """A row for each run, failed ones included, below the paper's own row."""
+    parts = [results.table()]
+    if "paper" in results.first.tables:
+        parts.insert(0, results.first.table_of("paper"))
+    whole = {str(k): part for k, part in enumerate(parts)}
+    return {"": joined(whole)}
+
+
+def figure(results: Results) -> dict[str, Figure]:
+    """How the main estimate came about, and the fitted valve if its arrays are there."""
+    from mvest.reporting.case.figures import fitted_figure
+    from mvest.reporting.figures import iterates_figure
+
+    name, record = next(iter(results.records.items()))
+    drawn: dict[str, Figure] = {}
+    first = record.estimates[0] if record.estimates else None
+    if first is not None and first.iterates:
+        unknowns = first.unknowns[: len(first.iterates[0])]
+        drawn[""] = iterates_figure(
+            f"{record.title}: {record.row}",
+            [one.name for one in unknowns],
+            first.iterates,
+            first.iterate_std,
+            [one.truth for one in unknowns],
+        )
+    if name in results.arrays:
+        drawn["valve"] = fitted_figure(results.arrays[name])
+    return drawn
+
+
+def _checks() -> tuple[Check, ...]:
+    # Imports what personalises cases, which an estimate does not need.
+    from experiments.common.expectation import TwinExpectation
+
+    return (TwinExpectation(),)
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run_twin,
+    summary=summary,
+    figure=figure,
+    captions={
+        "": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
+        "valve": "The fitted valve, open and closed. Simulated.",
+    },
+    latex=True,
+    checks=_checks,
+    require=require_twin,
+    keeps_failures=True,
+)

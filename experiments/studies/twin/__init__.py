@@ -1,1 +1,0 @@
-"""A synthetic study: simulate, estimate, compare."""

@@ -1,0 +1,249 @@
+"""What errors of the frames that a model is built from do to what it predicts.
+
+Each error sample of a case is a valve of its own, whose open shape, annulus, papillary tips and
+chordae are elsewhere, and with them the closed valve. How far this moves against that of the case,
+to first order (`mvest.closure.rest_geometry`), less how far its closed frame is moved, is one
+sample of the error of the innovation, that of the observation included. What errors have in common
+in both frames cancels so as far as the valve is the same elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.closure.rest_geometry import RestGeometry
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import ObservationModel, Prediction, predict
+from mvest.mechanics.reference import RestVariation
+from mvest.observation.surfaces import SurfaceObservation
+from mvest.observation.vertices import Observation
+from mvest.personalisation.considered_geometry import (
+    TOLERANCE,
+    closure_at,
+    rest_lengths_by_ends,
+    smooth_modes,
+)
+from mvest.problem.problem import Observed
+from mvest.problem.registration import RegisteredModel
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.band import Band
+from mvest.valve.geometry.proximity import closest_points
+
+__all__ = [
+    "GeometryErrors",
+    "WeighedObservation",
+    "errors_of",
+    "frame_errors",
+    "localised_samples",
+    "sample_geometry",
+]
+
+
+FIELD_SHARE = 0.95
+"""Of the variance of the field by which samples are localised."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeometryErrors:
+    """Samples of how a prediction moves if the geometry was seen in error.
+
+    Attributes
+    ----------
+    predicted : (K, n, 3) mm
+        Displacement of the predicted closed valve.
+    seen : (K, n, 3) mm
+        Displacement of the closed frame in the same samples.
+    """
+
+    predicted: FloatArray
+    seen: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+
+def sample_geometry(
+    case: ValveCase,
+    registered: RegisteredModel,
+    m: FloatArray,
+    vertices: FloatArray | None = None,
+    tips: FloatArray | None = None,
+) -> GeometryErrors | str:
+    """How far the closed valve moves with every error sample of a case, or why that is not known.
+
+    Parameters
+    ----------
+    case : ValveCase
+    registered : RegisteredModel
+        Of the case; its last closed state is gone on from.
+    m : (p,)
+        Parameters at which the model is linearised.
+    vertices : (K, f, n, 3) mm, optional
+    tips : (K, f, t, 3) mm, optional
+        Other samples than those of the case.
+    """
+    if vertices is None or tips is None:
+        assert case.error_samples is not None
+        vertices, tips = case.error_samples.vertices, case.error_samples.tips
+    model, at, states = closure_at(registered, m)
+    geometry = RestGeometry(model)
+    change = geometry.change(at, frame_errors(case, geometry, vertices, tips), states, TOLERANCE)
+    if isinstance(change, str):
+        return change
+    return GeometryErrors(np.moveaxis(change[-1], -1, 0), vertices[:, _numbers(case)[1]])
+
+
+def localised_samples(case: ValveCase, length: float) -> tuple[FloatArray, FloatArray]:
+    """Every error sample of a case, times each of J modes of a smooth field of unit variance.
+
+    Their mean square is the covariance of the samples times the correlation of the field, of each
+    two places: errors that are far apart are not taken for alike because few samples are. Places
+    are those of the open frame's vertices and tips, whichever frame an error is of.
+
+    Parameters
+    ----------
+    case : ValveCase
+        With error samples.
+    length : float
+        Of the field's Matérn correlation, in mm.
+
+    Returns
+    -------
+    vertices : (K, J, f, n, 3) mm
+    tips : (K, J, f, t, 3) mm
+    """
+    samples, open_ = case.error_samples, case.frame(Role.REFERENCE)
+    assert samples is not None
+    modes = smooth_modes(
+        np.concatenate([open_.vertices, open_.papillary_tips]), length, FIELD_SHARE
+    )
+    modes = modes / np.linalg.norm(modes, axis=0)
+    at, n = modes[None, :, None, :, None], len(open_.vertices)
+    return (
+        samples.vertices[:, None] * at[..., :n, :],
+        samples.tips[:, None] * at[..., n:, :],
+    )
+
+
+def frame_errors(
+    case: ValveCase, geometry: RestGeometry, moves: FloatArray, tips: FloatArray
+) -> RestVariation:
+    """What a model is built from, as it is moved by samples of open and closed frame.
+
+    Parameters
+    ----------
+    case : ValveCase
+    geometry : RestGeometry
+        Of its model.
+    moves : (K, f, n, 3) mm
+    tips : (K, f, t, 3) mm
+    """
+    open_, closed = _numbers(case)
+    valve, contact, chordae = geometry.model.valve, geometry.model.contact_valve, case.chordae
+    annulus = moves[:, closed][:, case.annulus]
+    if contact is not valve:
+        band, rest = Band(valve), valve.surface.vertices[valve.annulus]
+        phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
+        still = band.annulus_positions(phi, rest)
+        annulus = np.stack([band.annulus_positions(phi, rest + own) - still for own in annulus])
+    surface = case.surface
+    place = closest_points(chordae.insertion, surface.vertices, surface.triangles)
+
+    def from_tips(number: int) -> FloatArray:
+        ends = place.interpolate(np.moveaxis(moves[:, number], 0, -1), surface.triangles)
+        return np.asarray(np.moveaxis(ends, -1, 0) - tips[:, number][:, chordae.tip])
+
+    rest_lengths = rest_lengths_by_ends(case, from_tips(open_), from_tips(closed))
+    return RestVariation.summed(
+        [
+            geometry.shape(moves[:, open_]),
+            geometry.annulus(annulus),
+            geometry.tips(tips[:, closed], rest_lengths),
+        ]
+    )
+
+
+def _numbers(case: ValveCase) -> tuple[int, int]:
+    """Of the open and the closed frame."""
+    roles = [frame.role for frame in case.frames]
+    return roles.index(Role.REFERENCE), roles.index(Role.CLOSED)
+
+
+def errors_of(
+    observation: Observed, closed: Frame, generic: FloatArray, geometry: GeometryErrors
+) -> FloatArray:
+    """Samples of the error of an observation's innovation ``(k, K)`` mm, one in each column.
+
+    Parameters
+    ----------
+    observation : Observed
+        Of the closed frame, by its vertices or by its surface.
+    closed : Frame
+    generic : array
+        Both frames as they are predicted, stacked.
+    geometry : GeometryErrors
+        About this prediction.
+    """
+    if isinstance(observation, Observation):
+        moved = geometry.predicted - geometry.seen
+        return np.asarray(moved[:, observation.seen[0]].reshape(len(moved), -1).T)
+    assert isinstance(observation, SurfaceObservation)
+    points = observation.seen[-1]
+    _, at = cKDTree(closed.vertices).query(points.points)
+    edge = None if points.free_edge is None else cKDTree(closed.vertices).query(points.free_edge)[1]
+    half = len(generic) // 2
+    plain = replace(observation, correlation_length_mm=0.0)
+
+    def distances(what: SurfaceObservation, predicted: FloatArray) -> FloatArray:
+        y = np.concatenate([generic[:half], generic[half:] + predicted.ravel()])
+        return predict(what.of(lambda _: Prediction.undifferentiated(y)), np.zeros(1)).y
+
+    first = distances(plain, np.zeros(half))
+    columns = []
+    for predicted, seen in zip(geometry.predicted, geometry.seen, strict=True):
+        there = replace(
+            points,
+            points=points.points + seen[at],
+            free_edge=None if edge is None else points.free_edge + seen[edge],
+        )
+        columns.append(distances(replace(plain, seen=(there,)), predicted) - first)
+    return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeighedObservation:
+    """An observation with another noise.
+
+    Attributes
+    ----------
+    plain : Observed
+    R : NoiseCovariance
+    offset : (k,) or float
+        Added to what was seen: the mean of the noise, of other sign.
+    """
+
+    plain: Observed
+    R: NoiseCovariance
+    offset: FloatArray | float = 0.0
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the observed frames."""
+        return self.plain.frames
+
+    @property
+    def y(self) -> FloatArray:
+        """The observation ``(k,)``."""
+        return self.plain.y + self.offset
+
+    def of(self, model: ObservationModel, /) -> ObservationModel:
+        """What a model predicts of this observation."""
+        return self.plain.of(model)
+
+    def distance(self, fitted: FloatArray) -> FloatArray:
+        """Distances (mm) of what was seen in the last frame to fitted ``(f, n, 3)``."""
+        return self.plain.distance(fitted)

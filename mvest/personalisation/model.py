@@ -1,0 +1,159 @@
+"""The closure of a case as a function of its unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.closure.anchors import Anchors
+from mvest.closure.frames import FramesModel, is_frame_pressure
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError
+from mvest.mechanics.valve_system import HeldState, check_parameters
+from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
+from mvest.problem.registration import REGISTRATION
+from mvest.valve.anatomy.band import Band
+from mvest.valve.mesh.given import GivenValve
+from mvest.valve.mesh.solid_mesh import SolidMesh
+
+__all__ = ["build_coarse", "build_model", "frames_model", "held_state", "with_pressures"]
+
+
+def with_pressures(case: ValveCase, settings: PersonaliseSettings) -> PersonaliseSettings:
+    """The settings with the pressures' errors among the unknowns, where a case has several frames.
+
+    With one closed frame the factor on the pressure stands for all of them.
+    """
+    if settings.pressures is None or not case.fitted:
+        return settings
+    frames = (case.frame(Role.CLOSED).name, *(frame.name for frame in case.fitted))
+    own = [u for u in settings.unknowns if not is_frame_pressure(u.name)]
+    return replace(settings, unknowns=(*own, *settings.pressures.unknowns(frames)))
+
+
+def frames_model(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel
+) -> FramesModel | None:
+    """All closed frames that are fitted, if they are several; nearest in pressure go first.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+        From `with_pressures`.
+    model : ClosureModel
+        Of the case.
+
+    Raises
+    ------
+    InputError
+        If errors of pressures are unknown and the factor on all of them is not.
+    """
+    if not case.fitted:
+        return None
+    closed = case.frame(Role.CLOSED)
+    ordered = sorted(case.fitted, key=lambda f: abs(f.pressure_mmHg - closed.pressure_mmHg))
+    states = {frame.name: held_state(model, frame) for frame in ordered}
+    errors = tuple(u.name for u in settings.unknowns if is_frame_pressure(u.name))
+    return FramesModel(model, closed.name, states, closed.pressure_mmHg, errors)
+
+
+def held_state(model: ClosureModel, frame: Frame) -> HeldState:
+    """The loads of a further frame, on the contact valve's annulus."""
+    contact = model.contact_valve
+    annulus = frame.annulus
+    if contact is not model.valve:
+        phi = 360.0 * np.arange(len(contact.annulus)) / len(contact.annulus)
+        annulus = Band(model.valve).annulus_positions(phi, frame.annulus)
+    return HeldState(frame.pressure_mmHg, annulus, frame.papillary_tips)
+
+
+def build_model(
+    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
+) -> ClosureModel:
+    """The closure of a case as a function of its unknowns, those of the registration excluded.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    store : Path, optional
+        Where an unstructured mesh and closed states are kept.
+
+    Raises
+    ------
+    InputError
+        If an unknown is not one of the case's, or a modulus is missing.
+    GeometryError, MeshingError
+        If the leaflets cannot be meshed.
+    """
+    _check_unknowns(case, settings)
+    coarse = build_coarse(case, settings, store)
+    anchors = None if store is None else Anchors(store)
+    shape = GivenValve(case.valve)
+    if shape.band is None:
+        return replace(coarse, anchors=anchors)
+    solid = _solid(shape, settings.mesh, store)
+    return replace(coarse, mesh=solid, guide=coarse, anchors=anchors)
+
+
+def build_coarse(
+    case: ValveCase, settings: PersonaliseSettings, store: Path | None = None
+) -> ClosureModel:
+    """The same on the mesh of the guide alone, where there are two leaflets; see `build_model`."""
+    _check_unknowns(case, settings)
+    mechanical = _mechanical(settings)
+    free = tuple(u.name for u in mechanical if u.treatment is not Treatment.FIXED)
+    fixed = {u.name: u.mean for u in mechanical if u.treatment is Treatment.FIXED}
+    protocol = settings.mechanics.protocol
+    if case.closed is not None:
+        protocol = replace(protocol, pressure_mmHg=case.closed.pressure_mmHg)
+    mechanics = replace(settings.mechanics, protocol=protocol)
+    shape, mesh = GivenValve(case.valve), settings.mesh
+    if shape.band is not None:
+        mesh = replace(mesh, source="structured", columns=mesh.guide_columns, rows=mesh.guide_rows)
+    solid = _solid(shape, mesh, store)
+    return ClosureModel(
+        shape.given,
+        shape.valve(mesh.contact_columns, mesh.contact_rows),
+        solid,
+        mechanics,
+        free,
+        fixed,
+        continuation=True,
+        repeat=False,
+        largest_change=settings.largest_change,
+    )
+
+
+def _mechanical(settings: PersonaliseSettings) -> list[Unknown]:
+    return [
+        u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
+    ]
+
+
+def _check_unknowns(case: ValveCase, settings: PersonaliseSettings) -> None:
+    mechanical = _mechanical(settings)
+    regions = case.surface.region_names
+    others = [u.name for u in mechanical if not u.is_modulus]
+    try:
+        check_parameters(others, case.valve, settings.mechanics)
+    except InputError as error:
+        raise InputError(f"unknowns: {error}; or some of {', '.join(REGISTRATION)}") from error
+    needed = {f"E_f.{region}" for region in regions}
+    given = {u.name for u in mechanical if u.is_modulus}
+    if given != needed:
+        raise InputError(
+            f"unknown moduli {', '.join(sorted(given))}; case {case.name} has the leaflets "
+            f"{', '.join(regions)}: expected {', '.join(sorted(needed))}, or "
+            "leaflets named as the unknowns are"
+        )
+
+
+def _solid(shape: GivenValve, mesh: CaseMesh, store: Path | None) -> SolidMesh:
+    if mesh.source == "structured":
+        return shape.layers("hex18", mesh.columns, mesh.rows)
+    return shape.tetrahedra(mesh.edge_length, "tet10", store)

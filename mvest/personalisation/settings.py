@@ -1,0 +1,235 @@
+"""How a case is personalised: what is unknown of it, and what it is computed on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from mvest.closure.frames import ERROR, OFFSET, is_frame_pressure
+from mvest.errors import InputError
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.mechanics.parameters import is_positive
+from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
+from mvest.observation.learned import ErrorBeliefs
+from mvest.personalisation.considered_geometry import ConsideredGeometry
+from mvest.problem.registration import REGISTRATION
+
+__all__ = [
+    "CaseMesh",
+    "PaperSettings",
+    "PersonaliseSettings",
+    "PressureErrors",
+    "Treatment",
+    "Unknown",
+]
+
+
+class Treatment(Enum):
+    """What becomes of an unknown: estimated, considered (its doubt counts), or fixed."""
+
+    ESTIMATED = "estimated"
+    CONSIDERED = "considered"
+    FIXED = "fixed"
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One quantity that is not known of a case.
+
+    Attributes
+    ----------
+    name : str
+        One of the mechanics' (:data:`mvest.mechanics.parameters.KINDS`): ``E_f.REGION`` (MPa),
+        ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
+    mean, std : float
+        Prior in the same unit.
+    treatment : Treatment
+    """
+
+    name: str
+    mean: float
+    std: float
+    treatment: Treatment = Treatment.ESTIMATED
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
+            raise InputError(
+                f"prior of {self.name}: mean {self.mean} and std {self.std}, expected finite "
+                f"numbers and std > 0"
+            )
+        if self.is_positive and self.mean <= 0:
+            raise InputError(f"prior of {self.name}: mean {self.mean}, expected > 0")
+
+    @property
+    def is_modulus(self) -> bool:
+        """Whether it is what is asked for, and not a nuisance."""
+        return self.name.startswith("E_f.")
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether it is estimated by its logarithm."""
+        if self.name in REGISTRATION or is_frame_pressure(self.name):
+            return False
+        return is_positive(self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class PressureErrors:
+    """How well the stated pressures of several closed frames are known, besides a common factor.
+
+    With one closed frame they and the factor (``pressure_scale``) are one and the same, and the
+    factor's prior stands for all.
+
+    Attributes
+    ----------
+    offset_mmHg : float
+        Standard deviation of an offset that all of them have, as where the zero of a measurement
+        is not that of the left atrium; 0: none.
+    each_mmHg : float
+        Of the error that each has for itself, as where a frame falls on a steep part of the curve
+        that its pressure is read from; 0: none.
+    considered : bool
+        Whether they only widen the intervals, instead of being estimated.
+    """
+
+    offset_mmHg: float = 5.0
+    each_mmHg: float = 5.0
+    considered: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("offset_mmHg", "each_mmHg"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"pressures {name} = {value}, expected >= 0")
+
+    def unknowns(self, frames: Iterable[str]) -> tuple[Unknown, ...]:
+        """What is not known of the pressures of these frames."""
+        stds = {OFFSET: self.offset_mmHg}
+        stds |= {f"{ERROR}.{frame}": self.each_mmHg for frame in frames}
+        treatment = Treatment.CONSIDERED if self.considered else Treatment.ESTIMATED
+        return tuple(Unknown(name, 0.0, std, treatment) for name, std in stds.items() if std)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseMesh:
+    """What a case is computed on.
+
+    Attributes
+    ----------
+    source : str
+        ``structured``: layers of cells in material coordinates (two leaflets only); ``tetwild``: an
+        unstructured mesh of the thickened leaflets.
+    columns, rows : int
+        Cells of a structured mesh.
+    guide_columns, guide_rows : int
+        Cells of the coarser mesh on which the first closure is followed.
+    edge_length : float
+        mm, of an unstructured mesh.
+    contact_columns, contact_rows : int
+        Samples of contact.
+    """
+
+    source: str = "structured"
+    columns: int = 40
+    rows: int = 5
+    guide_columns: int = 24
+    guide_rows: int = 3
+    edge_length: float = 2.5
+    contact_columns: int = 144
+    contact_rows: int = 32
+
+    def __post_init__(self) -> None:
+        if self.source not in ("structured", "tetwild"):
+            raise InputError(f"mesh source {self.source!r}, expected structured or tetwild")
+
+
+@dataclass(frozen=True, slots=True)
+class PaperSettings:
+    """The paper's filter, which knows of no nuisance: all in MPa² and mm².
+
+    Attributes
+    ----------
+    P0, Q, R : float
+        Variances of the prior and of the process, and of a coordinate as seen.
+    max_iterations : int
+    """
+
+    P0: float = 0.01
+    Q: float = 0.01
+    R: float = 0.01
+    max_iterations: int = 12
+
+
+@dataclass(frozen=True, slots=True)
+class PersonaliseSettings:
+    """How a case is personalised.
+
+    Attributes
+    ----------
+    unknowns : tuple of Unknown
+        The means of the moduli are the generic ones.
+    mechanics : MechanicsSettings
+        The pressure of its protocol is replaced by that of the closed frame.
+    mesh : CaseMesh
+    tolerance : float
+        Of the filter, relative.
+    max_iterations : int
+    largest_change : float
+        Of a parameter's logarithm from one equilibrium to the next, see
+        :class:`mvest.closure.model.ClosureModel`.
+    paper : PaperSettings or None
+        Whether the moduli are also estimated as the paper does it.
+    moduli_only : bool
+        Whether they are also estimated with all nuisances fixed, but otherwise as here.
+    confirm : bool
+        Whether the fitted valve is closed anew from the open one.
+    correspondence : bool
+        Whether corresponding vertices are used as such; otherwise only where the surface is.
+    errors : ErrorBeliefs or None
+        How well the errors are known that the case states: they are learned with the unknowns;
+        None takes them as they are stated.
+    considered_geometry : ConsideredGeometry or None
+        How well the geometry is known that the model is built from: what is not counts as an error
+        of the observation. None takes it as it was seen.
+    considered_law : mapping of str to ExponentialTissue
+        Leaflet -> another law that its tissue may follow: what it would do to the prediction counts
+        as an error of the observation. Empty: the linear law is taken to be right.
+    pressures : PressureErrors or None
+        How well stated pressures are known where several closed frames are fitted; None: each of
+        them but for the common factor, if that is an unknown.
+    """
+
+    unknowns: tuple[Unknown, ...]
+    mechanics: MechanicsSettings
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    tolerance: float = 2e-3
+    max_iterations: int = 15
+    largest_change: float = 0.2
+    paper: PaperSettings | None = None
+    moduli_only: bool = False
+    confirm: bool = False
+    correspondence: bool = True
+    errors: ErrorBeliefs | None = field(default_factory=ErrorBeliefs)
+    considered_geometry: ConsideredGeometry | None = None
+    considered_law: Mapping[str, ExponentialTissue] = field(default_factory=dict)
+    pressures: PressureErrors | None = None
+
+    def __post_init__(self) -> None:
+        IteratedFilter(self.tolerance, max_iterations=self.max_iterations)  # refuses what is none
+        names = [unknown.name for unknown in self.unknowns]
+        if len(set(names)) != len(names):
+            raise InputError(f"unknowns {', '.join(names)} are not all different")
+        for u in self.unknowns:
+            if u.name in REGISTRATION and u.treatment is Treatment.FIXED and u.mean != 0:
+                raise InputError(
+                    f"unknown {u.name} is fixed at {u.mean}; expected 0, or a displacement that is "
+                    "estimated or considered"
+                )
+        if not any(u.is_modulus and u.treatment is Treatment.ESTIMATED for u in self.unknowns):
+            raise InputError(
+                f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
+                "E_f.REGION that is estimated"
+            )

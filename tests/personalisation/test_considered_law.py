@@ -1,0 +1,106 @@
+"""What another law of the tissue would do: its own equilibrium, columns, and wider intervals."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mvest.closure.model import ClosureModel
+from mvest.estimation.noise_family import ErrorColumns
+from mvest.mechanics.law.equivalent import as_stiff
+from mvest.mechanics.settings import ExponentialTissue
+from mvest.mechanics.steps import StepReason
+from mvest.mechanics.valve_system import HeldState
+from mvest.observation.vertices import Observation
+from mvest.personalisation import personalise_case
+from mvest.personalisation.considered_law import law_change, law_columns
+from mvest.personalisation.indications import indications_of
+from mvest.problem.registration import RegisteredModel
+from mvest.problem.verdict import judge
+from tests.closure.test_model import AT, CLOSING, GENTLE, SMALL, TISSUE, model_of
+from tests.made_up_closure import FIELDS, made_up_case, settings, use
+
+STIFFENING = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
+
+
+@pytest.fixture(scope="module")
+def model():
+    model = model_of(CLOSING, continuation=True)
+    assert model.close(AT).simulation.converged
+    return model
+
+
+def test_the_change_is_that_to_the_equilibrium_of_the_other_law():
+    # Without contact there is one equilibrium, whatever it is reached from.
+    gentle = model_of(GENTLE, **SMALL)
+    end = gentle.contact_valve.motion
+    state = HeldState(0.3, end.annulus[-1], end.papillary_tips[-1])
+    change = law_change(gentle, AT, [state], STIFFENING)
+    assert change.shape == (3, len(gentle.valve.surface.vertices), 3, 1)
+    assert not change[0].any()
+    # The same valve from its open state, which knows nothing of the linear one.
+    own = as_stiff(STIFFENING["anterior"], TISSUE["anterior"], AT[0])
+    stiffening = replace(TISSUE["anterior"], law="exponential", exponential=own)
+    other = model_of(GENTLE, gentle.names[1:], **SMALL)
+    other.settings = replace(other.settings, tissue={**TISSUE, "anterior": stiffening})
+    linear, anew = gentle.rests(AT, [state]), other.rests(AT[1:], [state])
+    for frame, before, after in zip((2, 1), linear, anew, strict=True):
+        assert before.converged
+        assert after.converged
+        moved = gentle.observed(after.frames[-1]) - gentle.observed(before.frames[-1])
+        assert np.abs(moved).max() > 0.1
+        np.testing.assert_allclose(change[frame, ..., 0], moved, atol=1e-6)
+
+
+def test_a_leaflet_without_another_law_has_no_column(model):
+    assert law_change(model, AT, [], {}).shape[-1] == 0
+    assert law_change(model, AT, [], {"septal": STIFFENING["anterior"]}).shape[-1] == 0
+
+
+def test_columns_are_turned_as_the_valve_is_seen(model):
+    registered = RegisteredModel(model, (*model.names, "turn.z"))
+    m = np.array([*AT, 90.0])
+    n = len(model.valve.surface.vertices)
+    seen = Observation(("closed",), np.zeros((1, n, 3)), np.array(1.0))
+    (law,) = law_columns(STIFFENING, registered, seen, m, registered(m).y)
+    assert (law.name, law.factor) == ("law", 1.0)
+    change = law_change(model, AT, [], STIFFENING)[1, ..., 0]
+    turned = np.stack([-change[:, 1], change[:, 0], change[:, 2]], axis=1)
+    np.testing.assert_allclose(law.columns[:, 0], turned.ravel(), atol=1e-6)
+
+
+def test_a_law_without_an_equilibrium_is_said(model, monkeypatch):
+    failed = SimpleNamespace(converged=False, reason=StepReason.NO_CONVERGENCE)
+    monkeypatch.setattr(ClosureModel, "_rest", lambda *given, **more: failed)
+    reason = law_change(model, AT, [], STIFFENING)
+    assert reason == f"anterior of an exponential law: {StepReason.NO_CONVERGENCE.value}"
+
+
+def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_alone(monkeypatch):
+    use(monkeypatch)
+    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
+    column = 0.2 * FIELDS["E_f.anterior"].reshape(-1, 1)
+    monkeypatch.setattr(
+        "mvest.personalisation.observation_errors.law_columns",
+        lambda *_: (ErrorColumns("law", column),),
+    )
+    known = personalise_case(case, settings(moduli_only=True))
+    doubtful = personalise_case(case, settings(moduli_only=True, considered_law=STIFFENING))
+    anterior = doubtful.names.index("E_f.anterior")
+    assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
+    assert doubtful.narrower["now"][0] > 1.3 * doubtful.narrower["law known exactly"][0]
+    np.testing.assert_allclose(doubtful.moduli_only.std, known.moduli_only.std, rtol=1e-6)
+    assert doubtful.unconsidered == ()
+
+
+def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
+    use(monkeypatch)
+    case = made_up_case(0.3, 8.0, np.random.default_rng(1))
+    monkeypatch.setattr(
+        "mvest.personalisation.observation_errors.law_columns", lambda *_: "it did not close"
+    )
+    fit = personalise_case(case, settings(considered_law=STIFFENING))
+    assert fit.unconsidered == ("it did not close",)
+    grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "case"]
+    assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)

@@ -1,0 +1,151 @@
+"""Designs of frames and pressures: they are what an estimation from such frames expects."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import Role
+from mvest.closure.frames import SCALE
+from mvest.personalisation import PressureErrors, design_case, expect_case
+from mvest.personalisation.considered_geometry import ConsideredGeometry, GeometryModes
+from mvest.personalisation.design import ERRORS_MMHG, HALF, KINDS, StatedErrors, design_text
+from tests.made_up_closure import FIELDS, PRESSURE, made_up_case, settings, unknowns, use
+
+STATED = PressureErrors(offset_mmHg=4.0, each_mmHg=3.0)
+CASE = made_up_case(std_mm=0.6, correlation_length_mm=10.0)
+
+
+@pytest.fixture
+def designs(monkeypatch):
+    use(monkeypatch)
+    found = design_case(CASE, settings(pressures=STATED))
+    assert not isinstance(found, str)
+    return found
+
+
+def held(pressures):
+    """The case with frames as a design has them: held as the closed one is."""
+    open_, closed, *_ = CASE.frames
+    fitted = [
+        replace(closed, name=f"{p:g}", role=Role.FITTED, time=closed.time + k, pressure_mmHg=p)
+        for k, p in enumerate(pressures, start=1)
+    ]
+    return replace(CASE, frames=(open_, closed, *fitted))
+
+
+def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
+    assert designs.pressures_mmHg == (100.0, 87.5, 75.0, 62.5, 50.0)
+    assert designs.chosen(3) == (0, 2, 4)
+    expected = expect_case(held((75.0, 50.0)), settings(pressures=STATED))
+    bound = designs.at(3)
+    std = dict(zip(bound.names, bound.std, strict=True))
+    for k, name in enumerate(expected.parameters[:5]):
+        assert std[name] == pytest.approx(expected.informed.std[k] / expected.assumed[k], rel=1e-6)
+    # Known pressures are those of an estimation that takes them as they are.
+    calibrated = [replace(u, std=0.02) if u.name == SCALE else u for u in unknowns()]
+    known = expect_case(held((75.0, 50.0)), settings(*calibrated))
+    left = designs.left(3, StatedErrors(0.02, 0.0, 0.0))
+    for k, name in enumerate(designs.moduli):
+        share = known.informed.std[k] / known.assumed[k] / designs.knowledge[name]
+        assert left[name] == pytest.approx(share, rel=1e-6)
+
+
+def test_frames_and_knowledge_only_help(designs):
+    for kind in KINDS:
+        table = [
+            [sum(designs.left(n, StatedErrors.of_kind(kind, e, 100.0)).values()) for n in (1, 2, 5)]
+            for e in ERRORS_MMHG
+        ]
+        assert np.all(np.diff(table, axis=1) <= 1e-9)
+        # Two frames out of five need not be among three, but one and two are among all.
+        assert np.all(np.diff(table, axis=0) >= -1e-9)
+    assert sum(designs.left(2, known=(SCALE,)).values()) < sum(designs.left(2).values())
+
+
+def test_a_common_factor_is_not_told_by_frames_and_an_offset_is(monkeypatch):
+    # Of the formula without its loose part only pressure over stiffness matters, as of a valve.
+    rigid = {**FIELDS, "loose": np.zeros_like(FIELDS["loose"])}
+    monkeypatch.setattr("tests.made_up_closure.FIELDS", rigid)
+    use(monkeypatch)
+    sharp = replace(CASE, uncertainty=replace(CASE.uncertainty, std_mm=1e-3))
+    found = design_case(sharp, settings(pressures=STATED))
+    factor, offset = (
+        found.left(5, StatedErrors.of_kind(kind, 20.0, PRESSURE))["E_f.anterior"]
+        for kind in ("factor", "offset")
+    )
+    # Common are two moduli, chordae and pressure, each with its prior: 1 / sum of 1 / variance.
+    prior = [found.knowledge[name] for name in (*found.moduli, "chord_stiffness")]
+    common = 1.0 / np.sqrt(sum(1.0 / std**2 for std in (*prior, 0.2)))
+    assert factor == pytest.approx(common / prior[0], rel=0.02)
+    assert offset < 0.2 * factor
+
+
+def test_geometry_in_doubt_is_common_to_all_frames(monkeypatch):
+    use(monkeypatch)
+    moved = np.zeros((6, *CASE.surface.vertices.shape, 2))
+    moved[1:, ..., 0] = 1.0
+    two = GeometryModes("one", {"fibres": np.eye(2)})
+    monkeypatch.setattr(
+        "mvest.personalisation.observation_errors.geometry_modes", lambda *_: (two,)
+    )
+    monkeypatch.setattr(
+        "mvest.personalisation.considered_geometry.RestVariation.joined", lambda modes: modes[0]
+    )
+
+    class Rest:
+        def __init__(self, model, seen):
+            pass
+
+        def variation(self, parts):
+            return parts
+
+        def change(self, m, variation, states, tolerance):
+            assert len(states) == 4
+            return moved.copy()
+
+    monkeypatch.setattr("mvest.personalisation.considered_geometry.RestGeometry", Rest)
+    exact = design_case(CASE, settings(pressures=STATED))
+    doubted = design_case(
+        CASE, settings(pressures=STATED, considered_geometry=ConsideredGeometry())
+    )
+    assert [n for n in doubted.knowledge if n.startswith("geometry")] == ["geometry.0"]
+    for count in (1, 5):
+        own, other = exact.left(count), doubted.left(count)
+        assert all(other[name] >= own[name] for name in own)
+    # What moves all frames alike is known from all of them.
+    assert doubted.at(5).names[-1] == doubted.at(1).names[-1] == "geometry.0"
+    assert doubted.at(5).std[-1] < doubted.at(1).std[-1]
+
+
+def test_the_text_says_what_it_takes(designs):
+    text = design_text("mine", designs)
+    assert "mine: closed frames like this one under 100, 87.5, 75, 62.5, 50 mmHg" in text
+    assert "as stated (10 % in common, offset 4, each 3)" in text
+    for modulus in designs.moduli:
+        assert f"E_f {modulus.partition('.')[2]}: " in text
+        count = designs.enough(modulus)
+        assert count is not None
+        assert designs.left(count)[modulus] <= HALF
+        assert count == 1 or designs.left(count - 1)[modulus] > HALF
+
+
+def test_where_no_frames_are_enough_it_is_said_what_would_help(monkeypatch):
+    use(monkeypatch)
+    blurred = replace(CASE, uncertainty=replace(CASE.uncertainty, std_mm=40.0))
+    found = design_case(blurred, settings(pressures=STATED))
+    assert found.enough("E_f.anterior") is None
+    assert "more than half of it is left with 5 frames" in design_text("mine", found)
+
+
+def test_a_valve_that_does_not_close_has_no_designs(monkeypatch):
+    use(monkeypatch, fails_above=1.0)
+    assert "no equilibrium" in design_case(CASE, settings(pressures=STATED))
+
+
+def test_without_an_unknown_pressure_nothing_is_said_of_its_errors(monkeypatch):
+    use(monkeypatch)
+    moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
+    found = design_case(CASE, settings(*moduli))
+    assert set(found.knowledge) == {u.name for u in moduli}
+    assert found.left(2, StatedErrors(0.5, 9.0, 9.0)) == found.left(2)

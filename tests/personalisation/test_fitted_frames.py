@@ -1,0 +1,143 @@
+"""Several closed frames of a case as one estimation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvest.cases.case import ErrorSamples, Role
+from mvest.closure.frames import ERROR, OFFSET
+from mvest.errors import InputError
+from mvest.observation.learned import ErrorBeliefs
+from mvest.personalisation import PressureErrors, expect_case, personalise_case
+from mvest.problem.registration import REGISTRATION, displace
+from tests.made_up_closure import (
+    CLOSED_ANNULUS,
+    PRESSURE,
+    TRUE,
+    made_up_case,
+    settings,
+    shape,
+    unknowns,
+    use,
+)
+
+PRESSURES = PressureErrors(offset_mmHg=4.0, each_mmHg=3.0)
+
+
+def seen(pressure):
+    registration = np.array([TRUE[name] for name in REGISTRATION])
+    return displace(shape(TRUE, pressure), registration, CLOSED_ANNULUS.mean(axis=0))
+
+
+def with_fitted(case, **pressures):
+    """A case with further fitted frames, each as the formula has it under its true pressure.
+
+    ``pressures`` has (stated, true) of each; that of ``closed`` replaces the closed frame.
+    """
+    open_, closed, *others = case.frames
+    frames, time = [open_], closed.time - 0.1
+    for name, (stated, true) in pressures.items():
+        role = Role.CLOSED if name == "closed" else Role.FITTED
+        time += 0.01
+        frames.append(
+            replace(
+                closed, name=name, role=role, time=time, pressure_mmHg=stated, vertices=seen(true)
+            )
+        )
+    return replace(case, frames=(*frames, *others))
+
+
+def test_the_frames_are_met_with_the_errors_of_their_pressures(monkeypatch):
+    use(monkeypatch)
+    # Very wide priors of the pressures, a narrow one of their common factor: offset and errors of
+    # two frames are three unknowns of two numbers, but their sums are known.
+    wanted = settings(pressures=PressureErrors(40.0, 30.0), tolerance=1e-8)
+    scale = [
+        replace(u, std=1e-6, mean=TRUE["pressure_scale"]) if u.name == "pressure_scale" else u
+        for u in wanted.unknowns
+    ]
+    case = with_fitted(
+        made_up_case(std_mm=1e-4), early=(60.0, 67.0), closed=(PRESSURE, PRESSURE + 1.0)
+    )
+    found = personalise_case(case, replace(wanted, unknowns=tuple(scale)))
+    assert found.result.converged
+    at = dict(zip(found.names, found.result.estimate, strict=True))
+    for name in ("E_f.anterior", "E_f.posterior", "chord_stiffness", *REGISTRATION):
+        assert at[name] == pytest.approx(TRUE[name], rel=2e-3, abs=2e-3), name
+    assert at[OFFSET] + at[f"{ERROR}.early"] == pytest.approx(7.0, abs=0.05)
+    assert at[OFFSET] + at[f"{ERROR}.closed"] == pytest.approx(1.0, abs=0.05)
+    # The closed frame comes first, and what is held out is predicted with the offset.
+    assert [(d.frame, d.seen) for d in found.distances] == [
+        ("closed", True), ("early", True), ("late", False),
+    ]  # fmt: skip
+    for distance in found.distances[:2]:
+        assert distance.personalised.max() < 1e-3
+        assert distance.generic.mean() > 0.1
+
+
+def test_equal_frames_with_independent_errors_are_one_with_less_variance(monkeypatch):
+    use(monkeypatch)
+    std, count = 0.3, 4
+    many = with_fitted(
+        made_up_case(std_mm=std),
+        **{f"again{k}": (PRESSURE, PRESSURE) for k in range(count - 1)},
+        closed=(PRESSURE, PRESSURE),
+    )
+    one = with_fitted(made_up_case(std_mm=std / np.sqrt(count)), closed=(PRESSURE, PRESSURE))
+    a, b = (personalise_case(case, settings(tolerance=1e-10)).result for case in (many, one))
+    np.testing.assert_allclose(a.estimate, b.estimate, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(a.filtered.covariance, b.filtered.covariance, rtol=1e-6, atol=1e-10)
+
+
+def test_without_a_further_frame_nothing_is_added(monkeypatch):
+    use(monkeypatch)
+    plain = personalise_case(made_up_case(), settings())
+    same = personalise_case(made_up_case(), settings(pressures=PRESSURES))
+    assert same.names == plain.names
+    np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
+
+
+def test_errors_of_pressures_widen_the_intervals(monkeypatch):
+    use(monkeypatch)
+    case = with_fitted(made_up_case(std_mm=2.0), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
+    calibrated = [replace(u, std=0.005) if u.name == "pressure_scale" else u for u in unknowns()]
+    known = expect_case(case, settings(*calibrated))
+    doubted = expect_case(case, settings(*calibrated, pressures=PressureErrors(0.0, 5.0)))
+    assert known.frames == doubted.frames == ("early", "closed")
+    assert set(doubted.parameters) - set(known.parameters) == {
+        f"{ERROR}.early", f"{ERROR}.closed",
+    }  # fmt: skip
+    for k in range(2):
+        assert doubted.informed.std[k] > 1.02 * known.informed.std[k]
+
+
+def test_errors_of_each_frame_are_learned(monkeypatch):
+    use(monkeypatch)
+    rng = np.random.default_rng(5)
+    case = with_fitted(made_up_case(std_mm=0.2), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
+    sizes = {"early": 0.5, "closed": 0.2}
+    frames = [
+        replace(f, vertices=f.vertices + sizes[f.name] * rng.standard_normal(f.vertices.shape))
+        if f.name in sizes
+        else f
+        for f in case.frames
+    ]
+    found = personalise_case(replace(case, frames=tuple(frames)), settings(errors=ErrorBeliefs()))
+    learned = {q.name: q.learned.median for q in found.result.filtered.learned.quantities}
+    assert learned["frame early"] == pytest.approx(2.5, rel=0.1)
+
+
+def test_what_cannot_be_is_refused(monkeypatch):
+    use(monkeypatch)
+    case = with_fitted(made_up_case(), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
+    moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
+    with pytest.raises(InputError, match="need pressure_scale"):
+        personalise_case(case, settings(*moduli, pressures=PRESSURES))
+    n, f = len(case.surface.vertices), len(case.frames)
+    tips = len(case.valve.papillary_tips)
+    samples = ErrorSamples(np.zeros((4, f, n, 3)), np.zeros((4, f, tips, 3)))
+    with pytest.raises(InputError, match="error samples and several fitted frames"):
+        personalise_case(replace(case, error_samples=samples), settings())
+    with pytest.raises(InputError, match="pressures each_mmHg = -1"):
+        PressureErrors(each_mmHg=-1.0)
