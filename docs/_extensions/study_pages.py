@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
-
-from experiments.common.study import load_study, study_names
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -144,9 +141,14 @@ def all_pages(root: Path) -> list[Page]:
     return sorted(pages, key=lambda page: (page.order, page.title))
 
 
+PICTURE = re.compile(r"^!\[(.*)\]\((\w+)\.png\)$", re.MULTILINE)
+"""How a page of ``results/`` shows a figure."""
+
+
 def table_text(path: Path) -> str:
-    """A table of ``results/`` as it is, its headings two levels deeper."""
+    """A page of ``results/`` as it is: headings two levels deeper, figures in full size."""
     text = path.read_text(encoding="utf-8").strip()
+    text = PICTURE.sub(lambda found: picture_text(found[2], found[1]), text)
     return re.sub(r"^(#+) ", r"##\1 ", text, flags=re.MULTILINE)
 
 
@@ -161,22 +163,17 @@ def text_of(page: Page, results: Path) -> str:
         rows = [f"    {experiment.command}" for experiment in page.experiments]
         parts += ["## Run it", "\n".join(rows)]
     parts.append("## Results")
-    parts += [picture_text(stem, page) for stem in page.pictures]
-    parts += [table_text(results / f"{stem}.md") for stem in page.tables]
+    tables = [(results / f"{stem}.md") for stem in page.tables]
+    shown = {found[2] for path in tables for found in PICTURE.finditer(path.read_text("utf-8"))}
+    parts += [picture_text(stem) for stem in page.pictures if stem not in shown]
+    parts += [table_text(path) for path in tables]
     return "\n\n".join(parts) + "\n"
 
 
-def picture_text(stem: str, page: Page) -> str:
+def picture_text(stem: str, caption: str = "") -> str:
     """A figure of ``results/`` that leads to itself in full size."""
-    options = f":alt: {page.title}, {stem}\n:target: ../_images/{stem}.png"
-    return f"```{{figure}} ../../results/{stem}.png\n{options}\n\n{captions().get(stem, '')}\n```"
-
-
-@cache
-def captions() -> dict[str, str]:
-    """Caption of each picture, as the studies give it for the page of all results."""
-    sections = [section for name in study_names() for section in load_study(name).sections]
-    return {stem: text for section in sections for stem, text in section.pictures.items()}
+    options = f":alt: {stem}\n:target: ../_images/{stem}.png"
+    return f"```{{figure}} ../../results/{stem}.png\n{options}\n\n{caption}\n```"
 
 
 def question_of(page: Page) -> str:
@@ -193,8 +190,8 @@ def index_of(pages: list[Page]) -> str:
         "# Studies",
         "Each page holds what a study asks, the command that repeats it, and its tables and "
         "figures as they lie in `results/`, with the commit and the configuration they came from. "
-        "All of them on one page: <a href='../report.html'>report.html</a>. Everything is "
-        "simulated, except where a donor valve or the shape of a reference heart is named.",
+        "Everything is simulated, except where a donor valve or the shape of a reference heart is "
+        "named.",
     ]
     for group in dict.fromkeys(page.group for page in pages):
         members = [page for page in pages if page.group == group]

@@ -163,7 +163,7 @@ class PathsConfig:
     """Folders, relative to where the command is typed."""
 
     outputs: str = "outputs"
-    results: str = "results"
+    results: str = "${.outputs}/results"  # published tables; those of a checkout: results
 
 
 @dataclass

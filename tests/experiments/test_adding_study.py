@@ -1,4 +1,4 @@
-"""The page on adding a study, followed to the letter in a copy of the checkout."""
+"""The page on adding a study, followed literally in a copy of the checkout."""
 
 import os
 import re
@@ -17,38 +17,37 @@ NAME = re.compile(r"`((?:experiments|conf)/[\w/]+\.(?:py|yaml))`")
 COMMAND = re.compile(r"^    python (-m experiments\.run experiment=\w+)$", re.MULTILINE)
 
 
-def test_the_page_on_adding_a_study_works_to_the_letter(tmp_path):
+def test_the_page_on_adding_a_study_works_literally(tmp_path):
     for name in ("experiments", "conf"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     # Text, block, text, ...: a block is of the file that was named last before it.
     parts = SECTION.split("```")
-    files = [
-        (NAME.findall(said)[-1], block.partition("\n")[2])
+    files = {
+        NAME.findall(said)[-1]: block.partition("\n")[2]
         for said, block in zip(parts[::2], parts[1::2], strict=False)
-    ]
-    rooms = {place.rpartition("/")[0] for place, _ in files}
-    assert rooms == {"experiments/studies/tenting", "conf/experiment"}
-    for place, content in files:
+    }
+    assert set(files) == {"experiments/studies/tenting.py", "conf/experiment/tenting.yaml"}
+    lines = [line for content in files.values() for line in content.splitlines() if line.strip()]
+    assert len(lines) <= 40
+    for place, content in files.items():
         path = tmp_path / place
         assert not path.exists(), f"{place} is no new file"
-        path.parent.mkdir(exist_ok=True)
         path.write_text(content, encoding="utf-8")
-    (command,) = COMMAND.findall(SECTION)
-    for arguments in (command.split(), ["-m", "experiments.tables"]):
-        subprocess.run(
-            [sys.executable, *arguments],
-            cwd=tmp_path,
-            check=True,
-            capture_output=True,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
-        )
-    results = tmp_path / "results"
-    assert (results / "records" / "tenting" / "tenting.json").is_file()
-    table = pd.read_csv(results / "tenting.csv")
-    assert list(table["pressure_mmHg"]) == [80.0, 100.0, 120.0]
+    (command, *_) = COMMAND.findall(SECTION)
+    subprocess.run(
+        [sys.executable, *command.split()],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+    )
+    results = tmp_path / "outputs" / "results"
+    assert (results / "records" / "tenting.jsonl").is_file()
+    table = pd.read_csv(results / "tenting.csv", comment="#")
+    assert list(table["pressure [mmHg]"]) == [80.0, 100.0, 120.0]
     # A higher pressure pushes the leaflets further towards the atrium.
-    assert (np.diff(table["tenting_mm"]) < 0).all()
+    assert (np.diff(table["height [mm]"]) < 0).all()
     assert (results / "tenting.png").stat().st_size > 10_000
-    page = (results / "report.html").read_text(encoding="utf-8")
-    assert "Tenting of a closed valve by pressure (simulated)" in page
-    assert f"{table['tenting_mm'][0]:.2f}" in page
+    page = (results / "tenting.md").read_text(encoding="utf-8")
+    assert "# Tenting of a closed valve by pressure (simulated)" in page
+    assert f"| {table['height [mm]'][0]:.2f} |" in page

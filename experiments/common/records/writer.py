@@ -2,7 +2,7 @@
 
 Of a table of results called NAME there are, in one folder: ``NAME.csv`` and ``NAME_PART.csv`` (tidy
 tables, for programs), ``NAME.md`` (the page: what readers see of the tables), ``NAME.png`` and
-``NAME_PART.png`` (figures), and, of the paper's own tables, LaTeX and PDF.
+``NAME_PART.png`` (figures, which the page shows), and, of the paper's own tables, LaTeX and PDF.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 from experiments.common.records.record import Record
 from experiments.common.study import Results, Study
 from mvest.files import write_atomically
+from mvest.reporting.markup import markdown_text
 from mvest.reporting.tables import Table
 
 __all__ = ["cautions", "provenance_of", "words_of", "write_results", "write_tables"]
@@ -40,15 +41,17 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         If a file cannot be written.
     """
     base = folder / (name or results.first.table)
+    drawn = _write_figures(base, study, results)
     written = write_tables(
         base,
         results.first.title,
         {part: results.table(part) for part in results.table_names},
         study.summary(results) if study.summary is not None else None,
         list(results.records.values()),
+        captions=study.captions,
         latex=study.latex,
     )
-    return [*written, *_write_figures(base, study, results)]
+    return [*written, *drawn]
 
 
 def write_tables(
@@ -58,9 +61,10 @@ def write_tables(
     summary: Mapping[str, Table] | None,
     records: Sequence[Record],
     *,
+    captions: Mapping[str, str] | None = None,
     latex: bool = False,
 ) -> list[Path]:
-    """Write tables as CSV, and the page that shows them.
+    """Write tables as CSV, and the page that shows them and the figures that are there already.
 
     Parameters
     ----------
@@ -73,6 +77,8 @@ def write_tables(
         What readers see in place of `tables`; of the same name it replaces one.
     records : sequence of Record
         Those that the tables follow from.
+    captions : mapping of str to str
+        Part -> caption of its figure.
     latex : bool
         Whether readers' tables are written as LaTeX, too.
 
@@ -99,6 +105,9 @@ def write_tables(
         if latex:
             text = f"% {provenance_of(records)}\n{table.latex()}"
             written.append(write_atomically(_named(base, part, ".tex"), text))
+    for part, caption in (captions or {}).items():
+        if (picture := _named(base, part, ".png")).is_file():
+            parts.append(f"![{markdown_text(caption)}]({picture.name})")
     parts.append(f"<sub>{provenance_of(records)}</sub>")
     page = "\n\n".join(part for part in parts if part) + "\n"
     return [*written, write_atomically(base.with_name(f"{base.name}.md"), page)]
