@@ -28,6 +28,8 @@ __all__ = [
     "EstimateRecord",
     "FrameFit",
     "Innovation",
+    "Numbers",
+    "Row",
     "Spread",
     "Unknown",
     "confounded",
@@ -225,8 +227,11 @@ class EstimateRecord(Frozen):
     objective : (i,)
     seconds : float or None
         Wall-clock time of the estimation.
+    alternatives : mapping
+        Name -> another estimate from the same data: ``moduli_only`` with everything else taken as
+        known, ``paper`` as the paper does it.
     details : mapping
-        Name -> rows of plain data: what only a report shows (see `mvest.reporting.case`).
+        Name -> rows of plain data, for reports (see `mvest.personalisation.record`).
     """
 
     case: str = ""
@@ -251,6 +256,7 @@ class EstimateRecord(Frozen):
     iterate_std: tuple[Numbers, ...] = ()
     objective: Numbers = ()
     seconds: float | None = None
+    alternatives: Mapping[str, EstimateRecord] = {}
     details: Mapping[str, tuple[Row, ...]] = {}
 
     @property
@@ -280,6 +286,39 @@ class EstimateRecord(Frozen):
             if unknown.name == name:
                 return unknown
         raise KeyError(name)
+
+    def detail_rows(self, name: str) -> tuple[Row, ...]:
+        """The rows of a detail; none where it was not computed."""
+        return self.details.get(name, ())
+
+    def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
+        """The same with the true values of its unknowns, for a simulated valve.
+
+        Derived moduli, and the alternatives, are given theirs as well.
+
+        Parameters
+        ----------
+        truth : mapping
+            Name -> value; an unknown that it does not name keeps what it has.
+        """
+        known = dict(truth)
+        for unknown in self.unknowns:
+            own = f"E_f.{unknown.region}"
+            if unknown.kind == "derived" and own in truth and unknown.estimate is not None:
+                fibre = self.unknown(own).estimate
+                if fibre:
+                    known[unknown.name] = unknown.estimate / fibre * truth[own]
+        return self.model_copy(
+            update={
+                "unknowns": tuple(
+                    one.model_copy(update={"truth": known.get(one.name, one.truth)})
+                    for one in self.unknowns
+                ),
+                "alternatives": {
+                    name: other.with_truth(truth) for name, other in self.alternatives.items()
+                },
+            }
+        )
 
     def rows(self) -> list[dict[str, Any]]:
         """A row for each unknown, with what is true of the whole estimate in each: a tidy table."""
@@ -373,7 +412,7 @@ def _unknowns(result: StudyResult) -> tuple[Unknown, ...]:
         return nothing if values is None else _numbers(values)
 
     bound = None if result.identifiability is None else result.identifiability.std
-    ends = (None, None)
+    ends: tuple[FloatArray | None, FloatArray | None] = (None, None)
     if result.estimate is not None and filtered is not None:
         ends = filtered.interval(LEVEL)
     truth = None if result.truth is None else result.truth.values

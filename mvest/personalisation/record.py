@@ -1,0 +1,361 @@
+"""The record of a personalised case, and the arrays that its report draws.
+
+`EstimateRecord.details` of a case holds plain rows by name, for the report and for tables. A name
+whose rows were not computed is missing. Lengths are in mm, intervals hold 95 %.
+
+============== ==================================================================================
+name           columns of a row
+============== ==================================================================================
+about          (one row) description, source, licence, sha256, regions, derived, implausible,
+               std_mm and correlation_length_mm of an observed coordinate, confirmed_mm (largest
+               distance of the fitted closed valve from the one closed anew), law_share (how far
+               the tissue is expected to be on its way from the linear law to an exponential one)
+settings       setting, value
+check          (one row) compared, value, limit: `mvest.estimation.check.ApproximationCheck`
+errors         name, unit (empty: a factor), believed, believed_low, believed_high, learned, low,
+               high, stretch: what was learned of the errors of the closed frame
+geometry       name, unit, size, stretch: `mvest.personalisation.expected.GeometryShift`
+whiteness      name, statistic, p_value: tests of the standardised innovation
+narrower       what, parameter, std_now, std_if_known: SD of the logarithm of a modulus
+image_errors   parameter, samples, share_of_variance (None: they did not enter)
+budget         part, modulus, without, alone: `mvest.personalisation.error_budget.BudgetRow`
+measurements   frame, shape (observed, generic or personalised), and one column for each of
+               `mvest.valve.measure.clinical.clinical_measurements`
+seconds        part, seconds: wall-clock time
+image_step     (one row), image_frames, pictures: `mvest.cases.from_images.image_step`
+============== ==================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from mvest.cases.case import Role
+from mvest.cases.plausibility import doubts
+from mvest.closure.frames import ERROR, OFFSET
+from mvest.estimation.information.consistency import moran, zero_mean
+from mvest.personalisation.indications import indications_of
+from mvest.personalisation.result import FrameDistance, Personalised
+from mvest.problem.estimate import StudyResult
+from mvest.problem.record import (
+    EstimateRecord,
+    FrameFit,
+    Numbers,
+    Row,
+    Spread,
+    Unknown,
+    finite,
+    record_of,
+)
+from mvest.problem.registration import unit_of
+from mvest.problem.verdict import judge
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.triangles import surface_edges
+from mvest.valve.measure.clinical import clinical_measurements
+
+__all__ = ["arrays_of_case", "label_of", "record_of_case"]
+
+Rows = tuple[Row, ...]
+
+LABELS = {
+    "pressure_scale": "pressure (factor)",
+    OFFSET: "offset of pressures",
+    "chord_stiffness": "chordal stiffness (factor)",
+    "chord_rest_length": "chordal rest length (factor)",
+    "stiffening": "stiffening",
+    "prestretch": "stretch when seen open (factor)",
+}
+
+
+def record_of_case(
+    fit: Personalised,
+    *,
+    gate: bool | None = None,
+    images: Mapping[str, Rows] | None = None,
+) -> EstimateRecord:
+    """The record of a personalised case.
+
+    Parameters
+    ----------
+    fit : Personalised
+    gate : bool, optional
+        Whether its anatomy has passed the gate; None if that was not tested.
+    images : mapping, optional
+        What `mvest.cases.from_images.image_step` says of the volume that the case is from.
+    """
+    result, images = fit.result, images or {}
+    others = {"moduli_only": fit.moduli_only, "paper": fit.paper}
+    unlike = images["image_step"][0]["unlike"] if "image_step" in images else ""
+    details = {name: tuple(rows) for name, rows in _details(fit)} | dict(images)
+    return _record(fit, result).model_copy(
+        update={
+            "verdict": judge(replace(indications_of(fit, gate), unlike=unlike)),
+            "correlation": _correlation(result),
+            "frames": tuple(map(_frame_fit, fit.distances)),
+            "alternatives": {
+                name: _record(fit, other) for name, other in others.items() if other is not None
+            },
+            "details": {name: rows for name, rows in details.items() if rows},
+        }
+    )
+
+
+def label_of(name: str) -> str:
+    """What a reader calls an unknown: ``E_f anterior`` for ``E_f.anterior``."""
+    kind, _, part = name.partition(".")
+    if kind in ("E_f", "E_perp", "G"):
+        return f"{kind} {part}"
+    if kind == ERROR:
+        return f"pressure in frame {part}"
+    if kind in ("shift", "turn"):
+        return f"{kind} {'along' if kind == 'shift' else 'about'} {part}"
+    return LABELS.get(name, name)
+
+
+def _record(fit: Personalised, result: StudyResult) -> EstimateRecord:
+    """The record of one of a case's estimations, with what its settings say of each unknown."""
+    record = record_of(result, case=fit.case.name, simulated=fit.case.simulated)
+    own = record.unknowns or tuple(
+        Unknown(name=name, unit=unit_of(name)) for name in result.parameters
+    )
+    about = {unknown.name: unknown for unknown in fit.settings.unknowns}
+
+    def told(row: Unknown) -> Unknown:
+        more: dict[str, Any] = {"label": label_of(row.name)}
+        if row.name in about:
+            prior = about[row.name]
+            more |= {
+                "kind": "modulus" if prior.is_modulus else "nuisance",
+                "treatment": prior.treatment.value,
+                "prior_mean": prior.mean,
+                "prior_std": prior.std,
+            }
+        return row.model_copy(update=more)
+
+    return record.model_copy(update={"unknowns": tuple(map(told, own))})
+
+
+def _correlation(result: StudyResult) -> tuple[Numbers, ...]:
+    """Of the errors of the estimates, in the coordinates of the filter."""
+    if result.filtered is None or result.estimate is None:
+        return ()
+    after = result.filtered.transformed
+    share = after.covariance / np.outer(after.std, after.std)
+    return tuple(tuple(map(finite, row)) for row in share.tolist())
+
+
+def _frame_fit(distance: FrameDistance) -> FrameFit:
+    return FrameFit(
+        frame=distance.frame,
+        seen=distance.seen,
+        generic=Spread.of(distance.generic),
+        registered=Spread.of(distance.registered),
+        personalised=Spread.of(distance.personalised),
+    )
+
+
+def _details(fit: Personalised) -> Iterator[tuple[str, Iterator[Row]]]:
+    """Name -> rows; see the head of this module."""
+    yield "about", iter([_about(fit)])
+    yield "settings", _settings("", fit.settings)
+    check = None if fit.result.filtered is None else fit.result.filtered.check
+    if check is not None:
+        row = {"compared": check.compared, "value": finite(check.value), "limit": check.limit}
+        yield "check", iter([row])
+    yield "errors", _errors(fit.result)
+    yield "geometry", (_fields(own) for own in fit.expected_geometry)
+    yield "whiteness", _whiteness(fit)
+    yield "narrower", _narrower(fit)
+    yield "image_errors", _image_errors(fit)
+    yield "budget", (_fields(row) | {"part": label_of(row.part)} for row in fit.budget)
+    yield "measurements", _measurements(fit)
+    yield "seconds", ({"part": part, "seconds": s} for part, s in fit.seconds.items())
+
+
+def _about(fit: Personalised) -> Row:
+    case = fit.case
+    return {
+        "description": case.description,
+        "source": case.source,
+        "licence": case.licence,
+        "sha256": case.sha256,
+        "regions": list(case.surface.region_names),
+        "derived": list(case.derived),
+        "implausible": list(map(str, doubts(case))),
+        "std_mm": case.uncertainty.typical_mm,
+        "correlation_length_mm": case.uncertainty.correlation_length_mm,
+        "confirmed_mm": fit.confirmed_mm,
+        "law_share": fit.law_share,
+    }
+
+
+def _fields(row: Any) -> dict[str, Any]:
+    return {field.name: getattr(row, field.name) for field in fields(row)}
+
+
+def _settings(name: str, value: Any) -> Iterator[Row]:
+    """The settings below ``name``, a row each; unknowns are in the record itself."""
+    if is_dataclass(value):
+        value = _fields(value)
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if key != "unknowns":
+                yield from _settings(f"{name}.{key}" if name else key, item)
+    else:
+        plain = value if isinstance(value, str | int | float | None) else str(value)
+        yield {"setting": name, "value": plain}
+
+
+def _errors(result: StudyResult) -> Iterator[Row]:
+    learned = None if result.filtered is None else result.filtered.learned
+    for quantity in () if learned is None else learned.quantities:
+        low, high = quantity.learned.interval()
+        before = quantity.believed.interval()
+        yield {
+            "name": quantity.name,
+            "unit": "" if quantity.is_factor else "mm",
+            "believed": float(quantity.believed.median),
+            "believed_low": float(before[0]),
+            "believed_high": float(before[1]),
+            "learned": float(quantity.learned.median),
+            "low": float(low),
+            "high": float(high),
+            "stretch": float(quantity.stretch),
+        }
+
+
+def _whiteness(fit: Personalised) -> Iterator[Row]:
+    """Tests of the standardised innovation of the closed frame."""
+    filtered, surface = fit.result.filtered, fit.case.surface
+    if filtered is None or filtered.innovation is None:
+        return
+    standardised = filtered.innovation.standardised
+    tests = {"mean zero": zero_mean(standardised)}
+    if standardised.size == surface.vertices.size * (1 + len(fit.case.fitted)):
+        adjacency = _adjacency(len(surface.vertices), surface.triangles)
+        by_axis = standardised[-surface.vertices.size :].reshape(-1, 3)
+        for k, axis in enumerate("xyz"):
+            tests[f"neighbours alike, {axis}"] = moran(by_axis[:, k], adjacency)
+    for name, test in tests.items():
+        yield {
+            "name": name,
+            "statistic": finite(test.statistic),
+            "p_value": finite(test.p_value),
+        }
+
+
+def _adjacency(n: int, triangles: IntArray) -> sparse.csr_array:
+    """Which of n vertices share an edge."""
+    a, b = surface_edges(triangles).T
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+
+
+def _moduli(fit: Personalised) -> list[str]:
+    return [name for name in fit.names if name.startswith("E_f.")]
+
+
+def _narrower(fit: Personalised) -> Iterator[Row]:
+    """The SD of each modulus if something more were known."""
+    for what, values in fit.narrower.items():
+        if what == "now":
+            continue
+        for k, name in enumerate(_moduli(fit)):
+            yield {
+                "what": f"{label_of(name)}, {what}",
+                "parameter": name,
+                "std_now": float(fit.narrower["now"][k]),
+                "std_if_known": float(values[k]),
+            }
+
+
+def _image_errors(fit: Personalised) -> Iterator[Row]:
+    """What errors of the frames that the model was built from do to the estimate."""
+    if fit.geometry is None:
+        return
+    share = fit.image_share
+    for k, name in enumerate(_moduli(fit)):
+        yield {
+            "parameter": name,
+            "samples": len(fit.geometry),
+            "share_of_variance": None if share is None else float(share[k]),
+        }
+
+
+def _measurements(fit: Personalised) -> Iterator[Row]:
+    case, surface = fit.case, fit.case.surface
+    reach = fit.settings.mechanics.contact.activation_distance * float(surface.thickness.mean())
+    for frame in case.frames:
+        shapes: dict[str, FloatArray] = {}
+        if frame.corresponds:
+            shapes["observed"] = frame.vertices
+        for which, positions in (("generic", fit.generic), ("personalised", fit.fitted)):
+            if frame.name in positions:
+                shapes[which] = positions[frame.name]
+        for which, points in shapes.items():
+            yield {
+                "frame": frame.name,
+                "shape": which,
+                **clinical_measurements(
+                    points, surface, points[case.annulus], frame.papillary_tips, reach
+                ),
+            }
+
+
+def arrays_of_case(fit: Personalised) -> dict[str, Any]:
+    """The arrays (mm) that `mvest.reporting.case` draws; empty without an estimate."""
+    if not fit.distances:
+        return {}
+    case, surface, filtered = fit.case, fit.case.surface, fit.result.filtered
+    frames = [d.frame for d in fit.distances]
+    by_name = {frame.name: frame for frame in case.frames}
+    seen = [by_name[name] for name in frames]
+    shapes = {"generic": fit.generic, "registered": fit.registered, "fitted": fit.fitted}
+    reference = case.frame(Role.REFERENCE)
+    whole = {
+        "triangles": surface.triangles,
+        "annulus": case.annulus,
+        "free_edge": case.free_edge,
+        "chord_tip": case.chordae.tip,
+        "chord_insertion": [
+            np.argmin(np.linalg.norm(surface.vertices - point, axis=1))
+            for point in case.chordae.insertion
+        ],
+    }
+    reals: dict[str, Any] = {
+        "rest": surface.vertices,
+        "tips": np.stack([reference.papillary_tips, *(frame.papillary_tips for frame in seen)]),
+        **{name: np.stack([of[frame] for frame in frames]) for name, of in shapes.items()},
+    }
+    arrays: dict[str, Any] = {
+        "region": surface.region.astype(np.int8),
+        "frames": np.array(frames),
+        "seen": np.array([d.seen for d in fit.distances]),
+        "reach_mm": fit.settings.mechanics.contact.activation_distance
+        * surface.thickness[case.free_edge].mean(),
+    }
+    if all(frame.corresponds for frame in seen):
+        reals["observed"] = np.stack([frame.vertices for frame in seen])
+        if fit.settings.correspondence:
+            arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
+            arrays["distance_registered"] = np.stack([d.registered for d in fit.distances])
+            arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
+    else:
+        reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
+    if filtered is not None and filtered.prediction is not None:
+        sensitivity, own = filtered.prediction.jacobian, surface.vertices.size
+        # Of the closed frame, which comes last.
+        if len(sensitivity) == own * (1 + len(case.fitted)):
+            reals["sensitivity"] = sensitivity[-own:].reshape(-1, 3, len(fit.names))
+            if filtered.innovation is not None:
+                arrays["innovation"] = filtered.innovation.standardised[-own:].reshape(-1, 3)
+    return (
+        arrays
+        | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}
+        | {name: values.astype(np.float32) for name, values in reals.items()}
+    )

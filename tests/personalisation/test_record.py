@@ -1,0 +1,145 @@
+"""The record of a personalised case: unknowns, frames, errors, and its arrays."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mvest.personalisation import PaperSettings, personalise_case
+from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
+from mvest.problem.record import EstimateRecord
+from mvest.problem.verdict import ONE_STATE
+from mvest.reporting.case.fields import read_case_fields
+from tests.made_up_closure import TISSUE, made_up_case, settings, use
+
+
+def personalised(fails_above=np.inf, corresponds=True, **changes):
+    with pytest.MonkeyPatch.context() as patch:
+        use(patch, fails_above=fails_above)
+        case = made_up_case(0.3, 8.0, np.random.default_rng(1), corresponds=corresponds)
+        return personalise_case(case, settings(**changes))
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return personalised(moduli_only=True, paper=PaperSettings())
+
+
+@pytest.fixture(scope="module")
+def record(fit):
+    return record_of_case(fit)
+
+
+def test_it_is_plain_data_and_knows_no_truth(fit, record):
+    text = json.dumps(record.model_dump(mode="json"), allow_nan=False)
+    assert EstimateRecord.model_validate_json(text) == record
+    assert (record.case, record.simulated, record.status) == ("made_up", True, "converged")
+    free = [row for row in record.unknowns if row.kind != "derived"]
+    assert tuple(row.name for row in free) == fit.names
+    assert [row.estimate for row in free] == fit.result.estimate.tolist()
+    assert [(row.prior_mean, row.prior_std) for row in free[:2]] == [(6.23, 3.1), (2.09, 1.05)]
+    for one in (record, *record.alternatives.values()):
+        assert all(row.truth is None for row in one.unknowns)
+    assert all(frame.personalised_to_truth is None for frame in record.frames)
+    assert np.diag(record.correlation) == pytest.approx(np.ones(len(fit.names)))
+    shown = {row["setting"]: row["value"] for row in record.details["settings"]}
+    assert shown["mesh.columns"] == fit.settings.mesh.columns
+    assert shown["mechanics.tissue.anterior.nu"] == TISSUE["anterior"].nu
+
+
+def test_a_truth_that_is_revealed_is_that_of_all_moduli_and_of_the_alternatives(record):
+    known = record.with_truth({"E_f.anterior": 5.0, "shift.x": 0.1})
+    ratio = 6.23 / 2.35
+    assert known.unknown("E_perp.anterior").truth == pytest.approx(5.0 / ratio)
+    assert known.unknown("shift.x").truth == 0.1
+    assert known.unknown("E_f.posterior").truth is None
+    assert set(known.alternatives) == {"moduli_only", "paper"}
+    for other in known.alternatives.values():
+        assert other.unknown("E_f.anterior").truth == 5.0
+
+
+def test_derived_moduli_follow_by_their_ratios(record):
+    for region, tissue in TISSUE.items():
+        own, other = (record.unknown(f"{name}.{region}") for name in ("E_f", "E_perp"))
+        for key in ("estimate", "std", "low", "high"):
+            assert getattr(other, key) == pytest.approx(getattr(own, key) / tissue.ratio)
+        assert own.low < own.estimate < own.high
+
+
+def test_intervals_of_what_is_positive_are_those_of_its_logarithm(fit, record):
+    for k, name in enumerate(fit.names):
+        row, std = record.unknown(name), fit.result.filtered.transformed.std[k]
+        if name.startswith(("shift", "turn")):
+            assert row.high - row.estimate == pytest.approx(1.959964 * std)
+        else:
+            assert np.log(row.high / row.estimate) == pytest.approx(1.959964 * std)
+            assert row.low * row.high == pytest.approx(row.estimate**2)
+
+
+def test_every_frame_is_measured_as_it_was_seen_and_as_it_is_predicted(record):
+    rows = record.details["measurements"]
+    assert [(row["frame"], row["shape"]) for row in rows] == [
+        ("open", "observed"),
+        *((frame, shape) for frame in ("closed", "late") for shape in
+          ("observed", "generic", "personalised")),
+    ]  # fmt: skip
+    # The template's annulus is 36 mm wide, and contracts by a few per cent at most.
+    for row in rows:
+        assert row["commissural_diameter_mm"] == pytest.approx(36, rel=0.05)
+    assert rows[0]["orifice_mm2"] > 100
+
+
+def test_what_would_narrow_is_said_of_each_modulus(fit, record):
+    # The prior's 10 % of 100 mmHg, five times as well.
+    measured = "pressure measured to ±2 mmHg"
+    rows = [row for row in record.details["narrower"] if row["what"].endswith(measured)]
+    assert [row["parameter"] for row in rows] == ["E_f.anterior", "E_f.posterior"]
+    for k, row in enumerate(rows):
+        assert row["std_if_known"] == fit.narrower[measured][k]
+        assert row["std_now"] == fit.narrower["now"][k] > row["std_if_known"]
+
+
+def test_gate_and_images_speak_in_the_verdict(fit, record):
+    assert ONE_STATE in record.verdict.missing
+    assert ONE_STATE in record_of_case(fit, gate=True).verdict.passed
+    failed = record_of_case(fit, gate=False).verdict
+    assert [ground.check for ground in failed.grounds if ground.check == ONE_STATE]
+    step = {"image_step": ({"unlike": "the volume is unlike those of training"},)}
+    unlike = record_of_case(fit, images=step)
+    assert any("unlike those of training" in ground.text for ground in unlike.verdict.grounds)
+    assert unlike.details["image_step"] == step["image_step"]
+
+
+def test_a_failed_estimation_has_a_record_too():
+    fit = personalised(fails_above=4.0, moduli_only=True)
+    record = record_of_case(fit)
+    assert (record.status, record.frames, record.correlation) == ("failed", (), ())
+    assert [row.name for row in record.unknowns] == list(fit.names)
+    assert all(row.estimate is row.low is None for row in record.unknowns)
+    assert record.unknowns[0].prior_mean == 6.23
+    assert not record.alternatives["moduli_only"].converged
+    assert not {"narrower", "errors", "whiteness"} & set(record.details)
+    assert arrays_of_case(fit) == {}
+
+
+@pytest.mark.parametrize("corresponds", [True, False])
+def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
+    fit = fit if corresponds else personalised(corresponds=False)
+    np.savez(tmp_path / "fields.npz", **arrays_of_case(fit))
+    fields = read_case_fields(tmp_path / "fields.npz")
+    assert fields.frames == ("closed", "late")
+    assert fields.seen.tolist() == [True, False]
+    assert fields.truth is None
+    if corresponds:
+        assert fields.sensitivity.shape == (288, 3, 11)
+        distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
+        np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)
+    else:
+        assert fields.observed is None
+        assert set(fields.observed_points) == {"closed", "late"}
+
+
+def test_what_unknowns_are_called():
+    assert [label_of(name) for name in ("E_f.anterior", "shift.x", "turn.y", "pressure_scale")] == [
+        "E_f anterior", "shift along x", "turn about y", "pressure (factor)",
+    ]  # fmt: skip
