@@ -180,8 +180,8 @@ class Study(Generic[S]):
         draw.
     captions : mapping
         Name of a figure -> its caption.
-    latex : bool
-        Whether tables are written as LaTeX and figures as PDF, too: those of the paper.
+    latex : tuple of str
+        Tables of results that are also written as LaTeX, and their figures as PDF: the paper's own.
     words : callable or None
         Record -> text for the terminal; by default its tables.
     files : callable or None
@@ -207,7 +207,7 @@ class Study(Generic[S]):
     summary: Callable[[Results], Mapping[str, Table]] | None = None
     figure: Callable[[Results], Figure | Mapping[str, Figure] | None] | None = None
     captions: Mapping[str, str] = field(default_factory=dict)
-    latex: bool = False
+    latex: tuple[str, ...] = ()
     words: Callable[[Record], str] | None = None
     files: Callable[[Path, Record], list[Path]] | None = None
     keep: Callable[[Record], Record] = lambda record: record

@@ -26,7 +26,7 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import StudyResult, estimate
 from mvest.problem.record import EstimateRecord, Unknown, record_of
 from mvest.problem.registration import unit_of
-from mvest.reporting.tables import Column, Table, joined, table
+from mvest.reporting.tables import Column, Table, table
 from mvest.scenarios.measures import contact_reach
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.measurements import ClosureMeasurements, measure_closure
@@ -67,16 +67,15 @@ def run_twin(job: Job[Settings]) -> Result:
     closed = (_measured(twin, result) or {} if values["measure"] else {}).get("closed")
     band = _truth_band(twin, result)
     row = _row(values, estimates[0], result, closed, band)
-    tables = {"": _table([row | {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}])}
-    if values["paper"]:
-        tables["paper"] = _table([_paper_row(values, estimates[0])])
+    row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
+    paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     numbers: dict[str, Number] = {
         "confirmed_mm": confirmed,
         "seconds_computing": computing,
         "truth_store": "hit" if twin.source.counts.hits else "miss",
     }
     return Result(
-        tables=tables,
+        tables={"": _table([*paper, row])},
         numbers=numbers,
         estimates=estimates,
         arrays=_fields(twin, result) if values["figures"] and result.fitted is not None else {},
@@ -262,6 +261,7 @@ def _row(
         "noise": model.noise_mm,
         "iterations": record.iterations or 0,
         "status": record.status,
+        "ended": record.reason.partition(":")[0],
         "reason": record.reason,
     }
 
@@ -273,8 +273,11 @@ def _paper_row(values: Mapping[str, Any], record: EstimateRecord) -> dict[str, A
     for k, name in enumerate(values["parameters"]):
         row |= {
             f"truth {name}": record.unknown(name).truth,
+            f"start {name}": None,
             f"estimate {name}": _at(paper["estimate"], k),
+            f"std {name}": None,
             f"error {name}": _at(paper["error_percent"], k),
+            f"truth of {name} known to": None,
         }
     return row | {
         "moduli error mean": _at(paper["moduli_error_percent"], 0),
@@ -295,40 +298,38 @@ UNITS = {
     "coaptation": "mm",
     "noise": "mm",
 }
-HIDDEN = ("source", "nodes", "noise", "iterations", "status", "filter", *UNITS)
+HIDDEN = ("source", "nodes", "iterations", "status", "filter", "reason", *UNITS)
 """Columns that only programs see."""
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Rows of runs with the meaning of their columns."""
     about: dict[str, Column] = {"run": Column()}
-    about |= {name: Column(UNITS.get(name, ""), hidden=True) for name in HIDDEN if name in rows[0]}
-    for name in (key.partition(" ")[2] for key in rows[0] if key.startswith("truth ")):
-        if f"estimate {name}" not in rows[0]:
-            continue
-        unit = unit_of(name)
-        std, band = f"std {name}", f"truth of {name} known to"
-        about[f"truth {name}"] = Column(unit, hidden=True)
-        about[f"estimate {name}"] = Column(unit, std=std if std in rows[0] else "", label=name)
-        about[f"error {name}"] = Column("%", std=band if band in rows[0] else "")
-        if std in rows[0]:
-            about |= {f"start {name}": Column(unit, hidden=True), std: Column(unit)}
-            about[band] = Column("%")
+    for name in (key.removeprefix("start ") for key in rows[0] if key.startswith("start ")):
+        unit, std, band = unit_of(name), f"std {name}", f"truth of {name} known to"
+        about |= {
+            f"truth {name}": Column(unit, hidden=True),
+            f"start {name}": Column(unit, hidden=True),
+            f"estimate {name}": Column(unit, std=std, label=name),
+            std: Column(unit),
+            f"error {name}": Column("%", std=band, label=f"error {name}"),
+            band: Column("%"),
+        }
     about["moduli error mean"] = Column("%", std="moduli error SD", label="error of all moduli")
     about["moduli error SD"] = Column("%")
     about["distance mean"] = Column("mm", std="distance SD", label="distance")
     about["distance SD"] = Column("mm")
-    order = dict.fromkeys([*rows[0], *about])
-    return table([{key: row.get(key) for key in order} for row in rows], **about)
+    about |= {name: Column(UNITS.get(name, ""), hidden=True) for name in HIDDEN}
+    names = list(dict.fromkeys([*about, *(name for row in rows for name in row)]))
+    return table([{name: row.get(name) for name in names} for row in rows], **about)
 
 
 def summary(results: Results) -> dict[str, Table]:
     """A row for each run, failed ones included, below the paper's own row."""
-    parts = [results.table()]
-    if "paper" in results.first.tables:
-        parts.insert(0, results.first.table_of("paper"))
-    whole = {str(k): part for k, part in enumerate(parts)}
-    return {"": joined(whole)}
+    whole = results.table()
+    rows = [row for row in whole.rows if row["source"] != "paper"]
+    paper = [row for row in whole.rows if row["source"] == "paper"]
+    return {"": table([*paper[:1], *rows], **whole.columns)}
 
 
 def figure(results: Results) -> dict[str, Figure]:
@@ -338,6 +339,9 @@ def figure(results: Results) -> dict[str, Figure]:
 
     name, record = next(iter(results.records.items()))
     drawn: dict[str, Figure] = {}
+    if len(results.records) > 1 and name != record.table:
+        # No run stands for the others.
+        return drawn
     first = record.estimates[0] if record.estimates else None
     if first is not None and first.iterates:
         unknowns = first.unknowns[: len(first.iterates[0])]
@@ -369,7 +373,7 @@ STUDY = Study(
         "": "Estimates after each iteration, ± 2 standard deviations, and the truth. Simulated.",
         "valve": "The fitted valve, open and closed. Simulated.",
     },
-    latex=True,
+    latex=("table1",),
     checks=_checks,
     require=require_twin,
     keeps_failures=True,

@@ -41,7 +41,8 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         If a file cannot be written.
     """
     base = folder / (name or results.first.table)
-    drawn = _write_figures(base, study, results)
+    print_too = results.first.table in study.latex
+    drawn = _write_figures(base, study, results, pdf=print_too)
     written = write_tables(
         base,
         results.first.title,
@@ -49,7 +50,7 @@ def write_results(folder: Path, study: Study[Any], results: Results, name: str =
         study.summary(results) if study.summary is not None else None,
         list(results.records.values()),
         captions=study.captions,
-        latex=study.latex,
+        latex=print_too,
     )
     return [*written, *drawn]
 
@@ -154,7 +155,7 @@ def provenance_of(records: Sequence[Record]) -> str:
     return lines[0] + (f" (and {len(lines) - 1} runs more)" if len(lines) > 1 else "")
 
 
-def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path]:
+def _write_figures(base: Path, study: Study[Any], results: Results, *, pdf: bool) -> list[Path]:
     if study.figure is None:
         return []
     from mvest.reporting.figures import save_figure_with
@@ -166,7 +167,7 @@ def _write_figures(base: Path, study: Study[Any], results: Results) -> list[Path
     return [
         path
         for part, figure in (drawn if isinstance(drawn, Mapping) else {"": drawn}).items()
-        for path in save_figure_with(_named(base, part), figure, line, pdf=study.latex)
+        for path in save_figure_with(_named(base, part), figure, line, pdf=pdf)
     ]
 
 
