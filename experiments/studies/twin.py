@@ -66,7 +66,7 @@ def run_twin(job: Job[Settings]) -> Result:
     solves = (estimates[0].forward_solves or 0) + (confirmed is not None)
     closed = (_measured(twin, result) or {} if values["measure"] else {}).get("closed")
     band = _truth_band(twin, result)
-    row = _row(values, estimates[0], result, closed, band)
+    row = _row(values, estimates[0], closed, band)
     row |= {"nodes": len(twin.model.mesh.nodes), "forward solves": solves}
     paper = [_paper_row(values, estimates[0])] if values["paper"] else []
     numbers: dict[str, Number] = {
@@ -226,7 +226,6 @@ def require_twin(values: Mapping[str, Any]) -> None:
 def _row(
     values: Mapping[str, Any],
     record: EstimateRecord,
-    result: StudyResult,
     closed: ClosureMeasurements | str | None,
     band: Sequence[float] | None,
 ) -> dict[str, Any]:
@@ -243,7 +242,8 @@ def _row(
             f"error {name}": None if error is None else 100.0 * abs(error),
             f"truth of {name} known to": None if band is None else band[k],
         }
-    errors = [abs(m.relative_error) for m in result.moduli if m.relative_error is not None]
+    moduli = [one for one in record.unknowns if one.kind != "nuisance"]
+    errors = [abs(one.relative_error) for one in moduli if one.relative_error is not None]
     distance, model = record.distance_mm, model_of_values(values)
     measured = closed if isinstance(closed, ClosureMeasurements) else None
     return row | {
