@@ -247,7 +247,7 @@ def use(monkeypatch: Any, **changes: Any) -> list[MadeUpClosure]:
         return built[-1]
 
     monkeypatch.setattr("mvest.personalisation.estimation.build_model", build)
-    monkeypatch.setattr("mvest.personalisation.expectation.build_model", build)
+    monkeypatch.setattr("mvest.personalisation.design.build_model", build)
     monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_modes", lambda *_: ())
     monkeypatch.setattr("mvest.personalisation.observation_errors.law_columns", lambda *_: ())
     return built

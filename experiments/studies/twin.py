@@ -15,9 +15,10 @@ from experiments.common.building.extrapolated import Extrapolated
 from experiments.common.building.filters import build_filter
 from experiments.common.building.gate import gate_of
 from experiments.common.building.twin import Twin, build_twin
+from experiments.common.expectation import TwinExpectation
 from experiments.common.progress import TYPICAL_SOLVES, SolveBar
 from experiments.common.records.record import Mesh, Number, model_of_values
-from experiments.common.study import Check, Job, Result, Results, Study
+from experiments.common.study import Job, Result, Results, Study
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError, InputError, MvestError
 from mvest.estimation.noise import observation_noise
@@ -357,13 +358,6 @@ def figure(results: Results) -> dict[str, Figure]:
     return drawn
 
 
-def _checks() -> tuple[Check, ...]:
-    # Imports what personalises cases, which an estimate does not need.
-    from experiments.common.expectation import TwinExpectation
-
-    return (TwinExpectation(),)
-
-
 STUDY = Study(
     settings=Settings,
     run=run_twin,
@@ -374,7 +368,7 @@ STUDY = Study(
         "valve": "The fitted valve, open and closed. Simulated.",
     },
     latex=("table1",),
-    checks=_checks,
+    checks=lambda: (TwinExpectation(),),
     require=require_twin,
     keeps_failures=True,
 )

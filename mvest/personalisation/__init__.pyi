@@ -1,7 +1,7 @@
 from .chain import personalise_case as personalise_case
 from .design import FrameDesigns as FrameDesigns
-from .expectation import design_case as design_case
-from .expectation import expect_case as expect_case
+from .design import design_case as design_case
+from .design import expect_case as expect_case
 from .gate import gate_case as gate_case
 from .model import build_model as build_model
 from .result import FrameDistance as FrameDistance

@@ -1,31 +1,41 @@
-"""How many closed frames under how well known pressures it takes to know the moduli of a case.
+"""What the frames of a case will tell, and how many more it takes, before anything is estimated.
 
-From derivatives at the generic moduli alone, nothing is estimated: information adds up over frames
-whose errors are independent, what is not known of pressures, chordae, displacement and geometry is
-common to them. Each design is a few small matrices; all of them need one set of closures.
+From derivatives at the generic moduli alone: information adds up over frames whose errors are
+independent; what is not known of pressures, chordae, displacement and geometry is common to them.
+Each design is a few small matrices; all of them need one set of closures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 
+from mvest.cases.case import Role, ValveCase
 from mvest.closure.frames import ERROR, OFFSET, SCALE
+from mvest.closure.model import ClosureModel
 from mvest.estimation.information.design import Design, together
 from mvest.estimation.information.identifiability import Identifiability
+from mvest.estimation.prediction import predict
+from mvest.personalisation.estimation import CaseEstimation
+from mvest.personalisation.model import build_model
+from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
+from mvest.problem.expectation import Expectation, expect
 
 __all__ = [
     "ERRORS_MMHG",
     "GROUPS",
     "HALF",
     "KINDS",
-    "KIND_WORDS",
     "SHARES",
     "FrameDesigns",
     "StatedErrors",
+    "design_case",
     "design_text",
+    "expect_case",
 ]
 
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
@@ -34,18 +44,15 @@ SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 HALF = 0.5
 """Of the prior's standard deviation, at which half the error of the generic guess is left."""
 
-
-KINDS = ("factor", "offset", "each")
-"""Of errors of pressures: a factor on all of them, an offset of all, and one of each by itself."""
-
 ERRORS_MMHG = (0.0, 2.0, 5.0, 10.0, 20.0)
-"""Errors of pressures that are looked at."""
+"""Errors of pressures that designs are compared with."""
 
-KIND_WORDS = {
+KINDS = {
     "factor": "as a factor on all",
     "offset": "as an offset of all",
     "each": "of each by itself",
 }
+"""Of errors of pressures, and what a reader calls them."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "the pressures": (SCALE, OFFSET, ERROR),
@@ -53,6 +60,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "the displacement": ("shift", "turn"),
     "the geometry": ("geometry",),
 }
+"""Unknowns that might be known exactly, by the first part of their names."""
 
 EXACT = 1e-9
 """Relative error of a factor that is known; zero would take it out of what is estimated."""
@@ -100,6 +108,16 @@ class FrameDesigns:
         """Names of the moduli."""
         return tuple(name for name in self.knowledge if name.startswith("E_f."))
 
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Those of `GROUPS` of which something is unknown here."""
+        names = {name.partition(".")[0] for name in self.frames[0].names}
+        return {words: group for words, group in GROUPS.items() if names & set(group)}
+
+    def of_kind(self, kind: str, mmhg: float) -> StatedErrors:
+        """Errors of one of `KINDS`, as large under the closed frame's pressure."""
+        return StatedErrors.of_kind(kind, mmhg, self.pressures_mmHg[0])
+
     def chosen(self, count: int) -> tuple[int, ...]:
         """Which frames make a design of ``count``: spread evenly over the pressures."""
         if count == 1:
@@ -136,8 +154,13 @@ class FrameDesigns:
     def left(
         self, count: int, errors: StatedErrors | None = None, known: tuple[str, ...] = ()
     ) -> dict[str, float]:
-        """`shares` of what `at` says."""
-        return self.shares(self.at(count, errors, known))
+        """Standard deviation of each modulus as a share of the prior's; arguments as of `at`.
+
+        The generic guess has 1: it is what is left of its error.
+        """
+        bound = self.at(count, errors, known)
+        std = dict(zip(bound.names, map(float, bound.std), strict=True))
+        return {modulus: std[modulus] / self.knowledge[modulus] for modulus in self.moduli}
 
     def enough(self, modulus: str, errors: StatedErrors | None = None) -> int | None:
         """How many frames leave half of the generic guess's error or less; None: all leave more."""
@@ -146,13 +169,30 @@ class FrameDesigns:
                 return count
         return None
 
-    def shares(self, bound: Identifiability) -> dict[str, float]:
-        """Standard deviation of each modulus as a share of the prior's.
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Tidy rows of what each design leaves of each modulus' error, ``left`` in percent of it.
 
-        The generic guess has 1: it is what is left of its error.
+        The pressures' errors are of one kind and have a size in mmHg, or are as stated, with
+        nothing or one group of unknowns ``known``.
         """
-        std = dict(zip(bound.names, map(float, bound.std), strict=True))
-        return {modulus: std[modulus] / self.knowledge[modulus] for modulus in self.moduli}
+        designs: list[tuple[str, float, str, StatedErrors | None, tuple[str, ...]]] = [
+            (kind, mmhg, "", self.of_kind(kind, mmhg), ())
+            for kind, mmhg in product(KINDS, ERRORS_MMHG)
+        ]
+        designs += [
+            ("stated", 0.0, words, None, group) for words, group in {"": (), **self.groups}.items()
+        ]
+        for kind, mmhg, words, errors, known in designs:
+            for count in range(1, len(self.frames) + 1):
+                for modulus, share in self.left(count, errors, known).items():
+                    yield {
+                        "errors": kind,
+                        "error": mmhg,
+                        "known": words,
+                        "frames": count,
+                        "modulus": modulus,
+                        "left": 100.0 * share,
+                    }
 
 
 def design_text(title: str, designs: FrameDesigns) -> str:
@@ -161,22 +201,22 @@ def design_text(title: str, designs: FrameDesigns) -> str:
     Shares are in percent, one for each modulus.
     """
     names = [modulus.partition(".")[2] for modulus in designs.moduli]
-    pressures, own = designs.pressures_mmHg, designs.stated
+    own = designs.stated
     rows = {
         f"as stated ({100 * own.factor:.3g} % in common, offset {own.offset:g}, each {own.each:g})":
         None,
-        "none": StatedErrors.of_kind("each", 0.0, pressures[0]),
-    }  # fmt: skip
-    rows |= {
-        f"{mmhg:g} mmHg {KIND_WORDS[kind]}": StatedErrors.of_kind(kind, mmhg, pressures[0])
-        for kind in KINDS
+        "none": designs.of_kind("each", 0.0),
+    } | {
+        f"{mmhg:g} mmHg {words}": designs.of_kind(kind, mmhg)
+        for kind, words in KINDS.items()
         for mmhg in (5.0, 20.0)
-    }
+    }  # fmt: skip
     counts = range(1, len(designs.frames) + 1)
     width = max(map(len, rows))
     lines = [
-        f"{title}: closed frames like this one under {', '.join(f'{p:.3g}' for p in pressures)} "
-        f"mmHg; what they leave of the generic guess's error, {' / '.join(names)} (%)",
+        f"{title}: closed frames like this one under "
+        f"{', '.join(f'{p:.3g}' for p in designs.pressures_mmHg)} mmHg; "
+        f"what they leave of the generic guess's error, {' / '.join(names)} (%)",
         f"  {'errors of the pressures':<{width}}"
         + "".join(f"{f'{n} frame' + 's' * (n > 1):>10}" for n in counts),
     ]
@@ -192,35 +232,109 @@ def _enough(designs: FrameDesigns, modulus: str) -> str:
     name, largest = modulus.partition(".")[2], len(designs.frames)
     count = designs.enough(modulus)
     if count is not None:
+        widest = [
+            (
+                max(
+                    (e for e in ERRORS_MMHG
+                     if designs.left(count, designs.of_kind(kind, e))[modulus] <= HALF),
+                    default=0.0,
+                ),
+                kind,
+            )
+            for kind in KINDS
+        ]  # fmt: skip
         frames = "this frame" if count == 1 else f"{count} frames"
         return (
             f"E_f {name}: half of it is left with {frames} and pressures as stated; with errors of "
-            "one kind alone, up to "
-            + ", ".join(f"{_widest(designs, modulus, count, k):.0f} mmHg ({k})" for k in KINDS)
+            f"one kind alone, up to {', '.join(f'{e:.0f} mmHg ({kind})' for e, kind in widest)}"
         )
-    exact = designs.enough(modulus, StatedErrors.of_kind("each", 0.0, designs.pressures_mmHg[0]))
+    exact = designs.enough(modulus, designs.of_kind("each", 0.0))
     if exact is not None:
         return (
             f"E_f {name}: half of it is left with {exact} frame{'s' * (exact > 1)} if the "
             f"pressures are exact, not with {largest} as they are stated"
         )
-    names = {name.partition(".")[0] for name in designs.frames[0].names}
-    left = {
-        words: designs.left(largest, known=known)[modulus]
-        for words, known in GROUPS.items()
-        if names & set(known)
-    }
-    best = min(left, key=lambda words: left[words])
+    left, best = min(
+        (designs.left(largest, known=known)[modulus], words)
+        for words, known in designs.groups.items()
+    )
     return (
         f"E_f {name}: more than half of it is left with {largest} frames, also if the pressures "
-        f"were exact; to know {best} would help best ({100 * left[best]:.0f} % left)"
+        f"were exact; to know {best} would help best ({100 * left:.0f} % left)"
     )
 
 
-def _widest(designs: FrameDesigns, modulus: str, count: int, kind: str) -> float:
-    """The largest of some errors (mmHg) of one kind with which half is reached."""
-    sizes = {
-        mmhg: designs.left(count, StatedErrors.of_kind(kind, mmhg, designs.pressures_mmHg[0]))
-        for mmhg in ERRORS_MMHG
-    }
-    return max((mmhg for mmhg, left in sizes.items() if left[modulus] <= HALF), default=0.0)
+def expect_case(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
+) -> Expectation:
+    """What the frames of a case will tell, found out with one closure; see `personalise`.
+
+    Errors that samples of the frames tell of are left out: each sample would be a closure.
+
+    Parameters
+    ----------
+    case : ValveCase
+    settings : PersonaliseSettings
+    model : ClosureModel, optional
+        As `build_model` makes it; one that has closed already need not do so again.
+    """
+    estimation = CaseEstimation(case, settings, None, None, model=model)
+    generic = estimation.shared(estimation.shared.start)
+    if generic.converged:
+        estimation.errors.consider(estimation.shared.start, generic.y)
+    return expect(estimation.problem(estimation.filter), estimation.errors.observation())
+
+
+def design_case(
+    case: ValveCase, settings: PersonaliseSettings, model: ClosureModel | None = None
+) -> FrameDesigns | str:
+    """What several closed frames of a case would tell, or why that is not known.
+
+    The frames are held and seen as the closed one, under shares of its pressure (`SHARES`): one
+    closure, and an equilibrium with its derivatives for each. Errors of which samples tell are left
+    out. Parameters are those of `expect_case`.
+    """
+    model = build_model(case, settings) if model is None else model
+    closed = case.frame(Role.CLOSED)
+    pressures = tuple(share * closed.pressure_mmHg for share in SHARES)
+    frames = [
+        replace(
+            closed,
+            name=str(k),
+            time=closed.time + k,
+            role=Role.FITTED if k else Role.CLOSED,
+            pressure_mmHg=pressure,
+        )
+        for k, pressure in enumerate(pressures)
+    ]
+    case = replace(case, frames=(case.frame(Role.REFERENCE), *frames), error_samples=None)
+    stated = settings.pressures or PressureErrors(0.0, 0.0)
+    # As unknowns they are differentiated by; how large they are is for the designs to say.
+    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    differentiated = PressureErrors(1.0, 1.0) if SCALE in free else None
+    estimation = CaseEstimation(
+        case, replace(settings, pressures=differentiated), None, None, model=model
+    )
+    start, errors, fitted = estimation.shared.start, estimation.errors, estimation.fitted
+    generic = estimation.registered(start)
+    if not generic.converged:
+        return generic.reason
+    errors.consider(start, generic.y)
+    observation, knowledge = fitted.observation(), estimation.knowledge()
+    H = predict(observation.of(lambda _: generic), start, derivatives=True).jacobian
+    H = np.concatenate([H, *(own.columns for own in errors.considered)], axis=1)
+    values = [u.mean if u.is_positive else 1.0 for u in estimation.unknowns]
+    at = np.array([*values, *(1.0 for _ in errors.modes)])
+    names = (*estimation.names, *errors.modes)
+    noise = errors.noise(without=errors.kinds)
+    # Errors of different frames are independent: without the others' rows a frame is by itself.
+    of_frame = np.repeat([int(frame.name) for frame in fitted.frames], observation.sizes)
+    return FrameDesigns(
+        pressures,
+        tuple(
+            Design.of(np.where(of_frame[:, None] == k, H, 0.0), noise, at, names)
+            for k in range(len(fitted.frames))
+        ),
+        knowledge,
+        StatedErrors(knowledge.get(SCALE, 0.0), stated.offset_mmHg, stated.each_mmHg),
+    )

@@ -13,13 +13,12 @@ from scipy.special import ndtri
 
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.information.identifiability import Identifiability, identifiability
-from mvest.estimation.noise import NoiseCovariance
-from mvest.estimation.prediction import ObservationModel, predict
-from mvest.estimation.transform import Transform, to_filter
+from mvest.estimation.prediction import predict
+from mvest.estimation.transform import to_filter
 from mvest.problem.problem import Observed, Problem
 from mvest.typing import FloatArray
 
-__all__ = ["Expectation", "expect", "expect_of_model"]
+__all__ = ["Expectation", "expect"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,18 +27,13 @@ class Expectation:
 
     Attributes
     ----------
-    parameters : tuple of str, (p,)
-    assumed : (p,) in the units of the parameters
-        The prior's mean, where the model is linearised.
-    prior : Gaussian
-        Of the parameters.
-    transform : Transform
-        Coordinates in which intervals are symmetric.
+    problem : Problem
     frames : tuple of str
+        To be observed.
     observations : int
         How many numbers are observed.
     data : Identifiability or None
-        What the data alone will say.
+        What the data alone will say, at the mean of the prior.
     informed : Identifiability or None
         What data and prior will say together; None also where a parameter is held by a prior
         without width.
@@ -47,15 +41,17 @@ class Expectation:
         Why the model has no prediction at the assumed parameters, if it has none.
     """
 
-    parameters: tuple[str, ...]
-    assumed: FloatArray
-    prior: Gaussian
-    transform: Transform
-    frames: tuple[str, ...]
-    observations: int
-    data: Identifiability | None
-    informed: Identifiability | None
-    reason: str
+    problem: Problem
+    frames: tuple[str, ...] = ()
+    observations: int = 0
+    data: Identifiability | None = None
+    informed: Identifiability | None = None
+    reason: str = ""
+
+    @property
+    def assumed(self) -> FloatArray:
+        """Where the model is linearised, ``(p,)`` in the units of the parameters."""
+        return self.problem.start
 
     def interval(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
         """Expected interval of each parameter with the prior, (p,) and (p,).
@@ -67,9 +63,10 @@ class Expectation:
         """
         if self.informed is None:
             raise ValueError("nothing is known of the parameters with the prior")
-        z = self.transform.forward(self.assumed)
-        reach = ndtri(0.5 + 0.5 * level) * self.informed.std / self.transform.derivative(z)
-        return self.transform.inverse(z - reach), self.transform.inverse(z + reach)
+        transform = self.problem.transform
+        z = transform.forward(self.assumed)
+        reach = ndtri(0.5 + 0.5 * level) * self.informed.std / transform.derivative(z)
+        return transform.inverse(z - reach), transform.inverse(z + reach)
 
 
 def expect(problem: Problem, observation: Observed) -> Expectation:
@@ -83,58 +80,16 @@ def expect(problem: Problem, observation: Observed) -> Expectation:
         Which points are seen, and how well; the values that were seen play no part where points
         correspond.
     """
-    return expect_of_model(
-        observation.of(problem.model),
-        problem.prior,
-        observation.R,
-        parameters=problem.parameters,
-        transform=problem.transform,
-        frames=observation.frames,
-    )
-
-
-def expect_of_model(
-    model: ObservationModel,
-    prior: Gaussian,
-    R: NoiseCovariance,
-    *,
-    parameters: tuple[str, ...],
-    transform: Transform,
-    frames: tuple[str, ...],
-) -> Expectation:
-    """Expected intervals of an estimation of any model that is not run.
-
-    Parameters
-    ----------
-    model : ObservationModel
-        Predicts what is to be observed. It is run once, at the mean of the prior.
-    prior : Gaussian
-        Of the parameters themselves.
-    R : noise covariance
-        Of the observation.
-    parameters, transform, frames
-        See `Expectation`.
-    """
-    # As filters start, whose first prediction may be shared.
-    assumed = transform.inverse(transform.forward(prior.mean))
-    predicted = predict(model, assumed, derivatives=True)
-    data = informed = None
-    if predicted.converged:
-        scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)
-        data = identifiability(predicted.jacobian, R, scale, names=parameters)
-        if np.all(prior.std > 0.0):
-            D = transform.derivative(transform.forward(assumed))
-            inner = to_filter(transform, prior).covariance
-            known = Gaussian(assumed, inner * np.outer(D, D))
-            informed = identifiability(predicted.jacobian, R, scale, prior=known, names=parameters)
-    return Expectation(
-        parameters,
-        assumed,
-        prior,
-        transform,
-        frames,
-        len(predicted.y),
-        data,
-        informed,
-        "" if predicted.converged else predicted.reason,
-    )
+    prior, transform, names = problem.prior, problem.transform, problem.parameters
+    assumed, R = problem.start, observation.R
+    predicted = predict(observation.of(problem.model), assumed, derivatives=True)
+    if not predicted.converged:
+        return Expectation(problem, observation.frames, reason=predicted.reason)
+    scale = np.where(assumed != 0.0, np.abs(assumed), prior.std)
+    data = identifiability(predicted.jacobian, R, scale, names=names)
+    informed = None
+    if np.all(prior.std > 0.0):
+        D = transform.derivative(transform.forward(assumed))
+        known = Gaussian(assumed, to_filter(transform, prior).covariance * np.outer(D, D))
+        informed = identifiability(predicted.jacobian, R, scale, prior=known, names=names)
+    return Expectation(problem, observation.frames, len(predicted.y), data, informed)

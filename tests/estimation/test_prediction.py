@@ -21,7 +21,9 @@ from mvest.estimation import (
 )
 from mvest.estimation.prediction import as_prediction, predict
 from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of, stacked
-from mvest.problem.expectation import expect_of_model
+from mvest.observation.vertices import Observation
+from mvest.problem.expectation import expect
+from mvest.problem.problem import Problem
 
 H = np.random.default_rng(5).standard_normal((6, 2))
 Y = H @ np.array([1.0, 2.0]) + 0.01
@@ -68,9 +70,8 @@ def run_profile(model):
 
 
 def run_expectation(model):
-    return expect_of_model(
-        model, PRIOR, 0.1, parameters=("a", "b"), transform=Identity(), frames=("closed",)
-    )
+    problem = Problem(("a", "b"), model, PRIOR, IteratedFilter(), Identity(), {})
+    return expect(problem, Observation(("closed",), Y.reshape(1, 2, 3), 0.1, predicted=("closed",)))
 
 
 USES = {

@@ -40,7 +40,7 @@ def test_a_design_is_what_an_estimation_of_these_frames_expects(designs):
     expected = expect_case(held((75.0, 50.0)), settings(pressures=STATED))
     bound = designs.at(3)
     std = dict(zip(bound.names, bound.std, strict=True))
-    for k, name in enumerate(expected.parameters[:5]):
+    for k, name in enumerate(expected.problem.parameters[:5]):
         assert std[name] == pytest.approx(expected.informed.std[k] / expected.assumed[k], rel=1e-6)
     # Known pressures are those of an estimation that takes them as they are.
     calibrated = [replace(u, std=0.02) if u.name == SCALE else u for u in unknowns()]

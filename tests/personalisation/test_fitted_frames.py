@@ -105,7 +105,7 @@ def test_errors_of_pressures_widen_the_intervals(monkeypatch):
     known = expect_case(case, settings(*calibrated))
     doubted = expect_case(case, settings(*calibrated, pressures=PressureErrors(0.0, 5.0)))
     assert known.frames == doubted.frames == ("early", "closed")
-    assert set(doubted.parameters) - set(known.parameters) == {
+    assert set(doubted.problem.parameters) - set(known.problem.parameters) == {
         f"{ERROR}.early", f"{ERROR}.closed",
     }  # fmt: skip
     for k in range(2):

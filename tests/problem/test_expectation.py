@@ -11,7 +11,8 @@ from mvest.observation.vertices import Observation
 from mvest.problem.estimate import estimate
 from mvest.problem.expectation import expect
 from mvest.problem.problem import Problem
-from mvest.reporting.expectation import alike, alike_words, expectation_text
+from mvest.problem.record import confounded
+from mvest.reporting.expectation import alike_words, expectation_text
 
 NAMES = ("E_f.anterior", "E_f.posterior", "pressure_scale")
 TRUTH = np.array([6.0, 2.0, 1.0])
@@ -71,9 +72,7 @@ def test_what_was_seen_plays_no_part():
 def test_the_text_names_what_is_told_badly_and_how_it_hides():
     case = case_of([3.0, 1.0, 0.1])
     found = expect(case, observation(0.02))
-    text = expectation_text(
-        "twin", found.assumed, found.prior, found.transform, found.data, found.informed, "points"
-    )
+    text = expectation_text("twin", found, "no noise")
     # Only p/a and p/b are seen well: whatever the pressure, both moduli are as much larger.
     assert "The data hardly tell apart" in text
     assert text.count("+10 % of") == 3
@@ -85,7 +84,7 @@ def test_the_text_names_what_is_told_badly_and_how_it_hides():
     assert then == pytest.approx(2.0, rel=0.05)
     assert now in np.round(100 * found.informed.std / found.data.scale, 1)
     assert text.endswith("No estimation was run.")
-    (group,) = alike(found.data)
+    (group,) = confounded(found.data)
     assert sorted(group.parameters) == sorted(NAMES)
     change = dict(zip(group.parameters, group.changes, strict=True))
     assert change == pytest.approx(
@@ -102,11 +101,9 @@ def test_a_prior_without_width_and_a_model_that_fails():
     assert held.informed is None
     with pytest.raises(ValueError, match="nothing is known"):
         held.interval()
-    assert "–" in expectation_text(
-        "twin", held.assumed, held.prior, held.transform, held.data, None, "points"
-    )
+    assert "–" in expectation_text("twin", held, "no noise")
     failing = case_of([3.0, 1.0, 0.1])
     object.__setattr__(failing, "model", lambda m: Prediction.failed("no equilibrium"))
     lost = expect(failing, observation(0.02))
     assert lost.data is None
-    assert lost.reason == "no equilibrium"
+    assert "is not known, the model has no prediction" in expectation_text("twin", lost, "no noise")

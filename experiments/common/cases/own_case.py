@@ -13,20 +13,24 @@ import numpy as np
 from experiments.common.building.closure import mechanics_of, mesh_store
 from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
 from experiments.common.cases.settings import PersonalSettings
+from experiments.common.expectation import noise_words
 from experiments.common.progress import SolveBar
 from experiments.common.records.record import NOT_GATED, Outcome
+from experiments.common.schema import build
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.personalisation.chain import personalise_case
-from mvest.personalisation.model import with_pressures
+from mvest.personalisation.design import design_case, design_text, expect_case
+from mvest.personalisation.model import build_model, with_pressures
 from mvest.personalisation.settings import PersonaliseSettings, Treatment, Unknown
 from mvest.problem.registration import REGISTRATION
 from mvest.reporting.case.findings import ImageStep
+from mvest.reporting.expectation import expectation_text
 
-__all__ = ["FIELDS", "read_configured", "run_case", "settings_of"]
+__all__ = ["FIELDS", "expect_own", "read_configured", "run_case", "settings_of"]
 
 Values = Mapping[str, Any]
 
@@ -110,6 +114,33 @@ def read_configured(place: str | None) -> ValveCase:
             "mvest/cases/README.md says what it holds"
         )
     return read_case(Path(place))
+
+
+def expect_own(values: Values, _folder: Path | None = None) -> str:
+    """What ``check=true`` says of a case: the answer of the Fisher information.
+
+    Raises
+    ------
+    MvestError
+        If the case is not in order.
+    """
+    case = read_configured(values["case"])
+    if case.closed is None:
+        return f"{case.name}: an open frame alone, from which nothing can be estimated"
+    settings = settings_of(values, build(PersonalSettings, values["personal"]))
+    model = build_model(case, settings, mesh_store(values))
+    with SolveBar(case.name, len(settings.mechanics.protocol.steps()), 1) as bar:
+        model.on_step = bar.step
+        expected = expect_case(case, settings, model)
+        designs = design_case(case, settings, model)
+    stated = case.uncertainty
+    noise = noise_words("stated", [stated.typical_mm], stated.correlation_length_mm)
+    further = (
+        f"{case.name}: what further closed frames would tell is not known ({designs})"
+        if isinstance(designs, str)
+        else design_text(case.name, designs)
+    )
+    return f"{expectation_text(case.name, expected, noise)}\n{further}"
 
 
 def run_case(

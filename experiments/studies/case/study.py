@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.common.building.closure import mesh_store
 from experiments.common.cases.findings import Findings
-from experiments.common.cases.own_case import read_configured, run_case, settings_of
+from experiments.common.cases.own_case import expect_own, read_configured, run_case, settings_of
 from experiments.common.cases.report import case_text, write_cases
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.expectation import expect_own
 from experiments.common.records.record import Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job, Study

@@ -14,9 +14,8 @@ from experiments.common.building.patient_store import PatientPlace, make_patient
 from experiments.common.building.virtual_patients import PatientSettings
 from experiments.common.cases.blind import estimate_blindly
 from experiments.common.cases.findings import Findings, Revealed
-from experiments.common.cases.own_case import FIELDS
+from experiments.common.cases.own_case import FIELDS, expect_own
 from experiments.common.cases.report import case_text, write_case_run
-from experiments.common.expectation import expect_own
 from experiments.common.records.record import NOT_GATED, Outcome
 from experiments.common.schema import build
 from experiments.common.study import Job, Section, Study

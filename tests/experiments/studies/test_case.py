@@ -316,7 +316,7 @@ def test_a_check_draws_the_case_and_estimates_nothing(run, folder, tmp_path, mon
     (model,) = built
     for at in model.calls:
         assert at == pytest.approx([6.23, 2.09, 1.0, 1.0, 1.0])
-    assert "864 numbers of closed; 0.3 mm of noise stated, alike over 8 mm" in out
+    assert "864 numbers of closed; 0.3 mm of noise stated, correlated over 8 mm" in out
     assert "No estimation was run." in out
     # The same valve goes on to further pressures, for what several frames would tell.
     assert [s.pressure_mmHg for s in model.states] == pytest.approx([87.5, 75.0, 62.5, 50.0])
