@@ -18,5 +18,5 @@ EXPERIMENTS = CONF / "experiment"
 ANATOMIES = tuple(sorted({path.stem for path in (CONF / "valve").glob("*.yaml")} - {"folder"}))
 """The anatomies that ship; ``folder`` is whatever a case folder holds."""
 
-GATE_RECORDS = _PACKAGE.parent / "results" / "records" / "gate"
+GATE_RECORDS = _PACKAGE.parent / "results" / "records" / "gate.jsonl"
 """Kept records of the gate in a checkout; an installation has none."""

@@ -1,8 +1,9 @@
-"""What the gate has said of an anatomy, from the kept records."""
+"""The gate of an anatomy (`mvest.closure.robustness`): what to ask, rows of it, kept verdicts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,52 @@ from experiments.common.places import GATE_RECORDS
 from experiments.common.records.record import FAILED_GATE, NOT_GATED, PASSED_GATE
 from experiments.common.schema import build
 from mvest.closure.anchors import content_digest
-from mvest.errors import InputError
-from mvest.reading.json_file import read_mapping
+from mvest.closure.robustness import GATE_CASES, GateCase, GateReport
+from mvest.errors import ConfigurationError
+from mvest.reporting.tables import Table, table
 from mvest.valve.anatomy.template import TemplateParameters
 
-__all__ = ["anatomy_digest", "gate_of"]
+__all__ = ["anatomy_digest", "gate_cases", "gate_of", "gate_rows"]
+
+
+def gate_cases(names: Sequence[str]) -> tuple[GateCase, ...]:
+    """The variations of these names.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is none of a name.
+    """
+    known = {case.name: case for case in GATE_CASES}
+    for name in names:
+        if name not in known:
+            raise ConfigurationError(f"gate has {name!r}, expected some of {', '.join(known)}")
+    return tuple(known[name] for name in names)
+
+
+def gate_rows(report: GateReport) -> Table:
+    """A row for each variation, and for each path along moduli (``along E_f``).
+
+    The largest distance of a path is what the derivatives do not explain at any one vertex; of it
+    there is also the share of the whole way, and the curvature of the way.
+    """
+    rows = [
+        {"variation": r.case, "mean": r.mean_mm, "max": r.max_mm, "passed": r.passed}
+        | {"reason": r.reason}
+        for r in report.rows
+    ]
+    paths = [
+        {
+            "variation": f"along {path.name}",
+            "max": max((piece.unexplained_mm for piece in path.pieces), default=None),
+            "share": path.share,
+            "curvature": path.curvature,
+            "passed": path.passed,
+            "reason": path.reason,
+        }
+        for path in report.paths
+    ]
+    return table([*rows, *paths], **{"variation": "", "mean": "mm:.2g", "max": "mm:.2g"})
 
 
 def anatomy_digest(values: Mapping[str, Any]) -> str:
@@ -34,23 +76,23 @@ def gate_of(values: Mapping[str, Any], records: Path = GATE_RECORDS) -> str:
     values : mapping
         The resolved configuration.
     records : Path
-        Folder of the gate's kept records.
+        The gate's kept records, one a line.
     """
     return _verdicts(records).get(anatomy_digest(values), NOT_GATED)
 
 
 @cache
 def _verdicts(records: Path) -> dict[str, str]:
-    """Digest of an anatomy -> what the gate said of it; a damaged record says nothing."""
+    """Digest of an anatomy -> the gate's verdict; a damaged record has none."""
     found: dict[str, str] = {}
-    for path in sorted(records.glob("*.json")):
+    for line in records.read_bytes().splitlines() if records.is_file() else ():
         try:
-            record = read_mapping(path)
+            record = json.loads(line)["record"]
             cells, element = record["model"]["cells"], record["model"]["element"]
-            passed = PASSED_GATE if record["findings"]["passed"] is True else FAILED_GATE
-            found[str(record["findings"]["anatomy"])] = (
+            passed = PASSED_GATE if record["numbers"]["passed"] is True else FAILED_GATE
+            found[str(record["numbers"]["anatomy"])] = (
                 f"{passed} on {cells[0]} x {cells[1]} {element}"
             )
-        except (InputError, KeyError, TypeError, IndexError):
+        except (ValueError, KeyError, TypeError, IndexError):
             continue
     return found

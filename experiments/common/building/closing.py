@@ -1,0 +1,192 @@
+"""One closure of a configured valve with every step kept: computed, measured and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from experiments.common.building.anatomy import anatomy_of
+from experiments.common.building.closure import closure_model
+from experiments.common.progress import SolveBar
+from mvest.closure.measures import measure_steps
+from mvest.closure.model import ClosureModel, ClosureResult
+from mvest.errors import InputError
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.reading.npz import read_npz
+from mvest.reporting.tables import Table, table
+from mvest.scenarios.measures import contact_reach
+from mvest.scenarios.stress import contact_pressure, nodal_stress
+from mvest.typing import FloatArray
+from mvest.valve.geometry.thickening import thicken
+from mvest.valve.mesh.embedding import embed
+
+__all__ = ["Closing", "close_valve", "draw_closing"]
+
+COLUMNS = {
+    "time": "s:.2f",
+    "pressure": "mmHg:.0f",
+    "orifice": "mm²:.1f",
+    "passing ball": "mm:.2f",
+    "coaptation": "mm:.1f",
+    "intersections": "",
+    "chord strain": ":.3f",
+    "chord force": "N:.2f",
+    "smallest det F": ":.2f",
+    "Newton iterations": "",
+}
+"""Names and units of `mvest.closure.measures.StepMeasures`, in its order."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closing:
+    """A closure from the open valve.
+
+    Attributes
+    ----------
+    model : ClosureModel
+    result : ClosureResult
+        With a frame for each step.
+    normals : (n, 3)
+        Directions of the thickness at the observed vertices.
+    """
+
+    model: ClosureModel
+    result: ClosureResult
+    normals: FloatArray
+
+    @property
+    def contact_distance_mm(self) -> float:
+        """Between midsurfaces, up to which leaflets count as coapting."""
+        contact, surface = self.model.settings.contact, self.model.valve.surface
+        share = contact.reference_distance + contact.activation_distance
+        return 0.5 * share * float(surface.thickness.mean())
+
+    def ends(self) -> Closing:
+        """The same with the open and the last state only."""
+        whole = self.result.simulation
+        two = replace(whole, times=whole.times[[0, -1]], frames=whole.frames[[0, -1]])
+        return replace(self, result=replace(self.result, simulation=two))
+
+    def steps(self) -> Table:
+        """What each step measures (`mvest.closure.measures.StepMeasures`)."""
+        steps = measure_steps(self.model, self.result, self.contact_distance_mm, self.normals)
+        rows = [dict(zip(COLUMNS, asdict(step).values(), strict=True)) for step in steps]
+        return table(rows, **COLUMNS)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Each step: thick leaflets with stress and contact pressure (MPa), chordae and tips."""
+        model, system, simulation = self.model, self.result.system, self.result.simulation
+        valve = model.valve
+        surface = thicken(valve.surface, self.normals)
+        faces = embed(model.mesh, surface.vertices)
+        loading = boundary_loading(system, valve, model.contact_valve, model.settings)
+        assert system.cables is not None
+        pressed = [contact_pressure(system, x) for x in simulation.frames]
+        # The samples are finer than the surface, whose two faces lie over the same ones.
+        at_face = np.tile(cKDTree(pressed[0][0]).query(valve.surface.vertices)[1], 2)
+        moving = {
+            "stress": [faces(nodal_stress(system, x)) for x in simulation.frames],
+            "contact_pressure": [values[at_face] for _, values in pressed],
+            "frames": [faces(x) for x in simulation.frames],
+            "tips": [loading(float(t)).tips for t in simulation.times],
+            "chord_end": [system.cables.patches(x) for x in simulation.frames],
+        }
+        return {name: np.stack(states).astype(np.float32) for name, states in moving.items()} | {
+            "times": simulation.times,
+            "triangles": surface.triangles.astype(np.int32),
+            "region": surface.region.astype(np.int8),
+            # Along the atrial faces.
+            "annulus": valve.annulus + len(valve.surface.vertices),
+            "chord_tip": system.cables.tip,
+            # Of faces, which are half a thickness nearer than midsurfaces on both sides.
+            "reach_mm": np.array(
+                contact_reach(model) - valve.surface.thickness[valve.free_edge].mean()
+            ),
+        }
+
+
+def close_valve(values: Mapping[str, Any], name: str = "closure") -> Closing:
+    """Close the configured valve with the configured moduli of the truth.
+
+    Parameters
+    ----------
+    values : mapping
+        The resolved configuration.
+    name : str
+        Of the progress bar.
+
+    Raises
+    ------
+    MvestError
+        If a setting is inadmissible.
+    """
+    model = closure_model(values)
+    truth = np.array(values["truth"]["values"], dtype=float)
+    with SolveBar(name, len(model.settings.protocol.steps()), 1) as bar:
+        model.on_step = bar.step
+        result = model.close(truth, sensitivities=False, every_frame=True)
+    seen = values["observation"]
+    return Closing(model, result, anatomy_of(values).normals(seen["columns"], seen["rows"]))
+
+
+def draw_closing(part: Any, path: Path, steps: Mapping[int, str], names: Sequence[str]) -> None:
+    """Draw some steps of a closure from the atrium and from the posterior side.
+
+    Parameters
+    ----------
+    part : Figure or SubFigure
+    path : Path
+        An ``.npz`` file with `Closing.arrays`.
+    steps : mapping of int to str
+        Number of a step -> its title. What leaks of the last one is painted.
+    names : sequence of str
+        Of the leaflets.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    from mvest.reporting.case import drawing
+    from mvest.reporting.case.fields import CaseFields
+
+    try:
+        arrays = read_npz(path)
+        count = len(arrays["chord_tip"])
+        # The ends of the chordae are points of no triangle.
+        shapes = np.concatenate([arrays["frames"], arrays["chord_end"]], axis=1).astype(float)
+        valve = CaseFields(
+            triangles=arrays["triangles"].astype(np.int64),
+            region=arrays["region"].astype(np.int64),
+            rest=shapes[0],
+            annulus=arrays["annulus"].astype(np.int64),
+            free_edge=np.zeros(0, dtype=np.int64),
+            frames=tuple(f"{t:g} s" for t in arrays["times"][1:]),
+            seen=np.ones(len(shapes) - 1, dtype=bool),
+            tips=arrays["tips"].astype(float),
+            chord_tip=arrays["chord_tip"].astype(np.int64),
+            chord_insertion=shapes.shape[1] - count + np.arange(count),
+            observed_points={},
+            reach_mm=float(arrays["reach_mm"]),
+        )
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: no arrays of a closing valve ({error})") from error
+    posterior = drawing.View("seen from the posterior side", 8.0, -90.0)
+    panels = part.subplots(2, len(steps), height_ratios=[1.0, 1.35])
+    colours, last = drawing.leaflet_colours(valve.region), len(shapes) - 1
+    for column, (k, title) in zip(panels.T, steps.items(), strict=True):
+        for view, axes in zip((drawing.ATRIUM, posterior), column, strict=True):
+            shown = view is posterior
+            drawing.draw_valve(axes, valve, shapes[k], colours, view, k, chords=shown)
+        column[0].set_title(title, fontsize=10)
+    drawing.paint_leak(panels[0, -1], valve, shapes[last], last)
+    drawing.name_leaflets(panels[0, 0], valve, names)
+    drawn = [shapes[k] for k in steps]
+    drawing.same_scale(list(panels[0]), drawn, drawing.ATRIUM)
+    drawing.same_scale(list(panels[1]), [*drawn, *(valve.tips[k] for k in steps)], posterior)

@@ -1,1 +1,0 @@
-"""A closing valve, step by step."""

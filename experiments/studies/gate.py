@@ -1,0 +1,229 @@
+"""How a valve closes, and whether its closed state is the only one.
+
+The gate closes an anatomy under variations that must not matter and follows it along its moduli
+(`mvest.closure.robustness`). With ``gate.every_step`` one closure is measured step by step instead.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.common.building.closing import close_valve, draw_closing
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import anatomy_digest, gate_of, gate_rows
+from experiments.common.records.record import Mesh, Record
+from experiments.common.study import Job, Result, Results, Study
+from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import GateReport, run_gate
+from mvest.reporting.tables import Column, Table, joined, table
+from mvest.scenarios.measures import contact_reach
+from mvest.scenarios.scenario import plane_of
+from mvest.typing import FloatArray
+from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.passing_ball import largest_passing_ball
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDY"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GateSettings:
+    """What is done with the valve."""
+
+    every_step: bool = False  # measure one closure step by step, and ask no gate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    gate: GateSettings = field(default_factory=GateSettings)
+
+
+def run(job: Job[Settings]) -> Result:
+    """Measure one closure, or ask the gate."""
+    return _closing(job) if job.settings.gate.every_step else _gate(job)
+
+
+def _gate(job: Job[Settings]) -> Result:
+    values = job.values
+    report = run_gate(
+        lambda case: closure_model(values, case),
+        np.array(values["truth"]["values"], dtype=float),
+        on_case=lambda row: _say(f"{row.case}: max {row.max_mm:.3g} mm, {row.reason}"),
+        on_path=lambda path: _say(f"along {path.name}: {path.reason or 'no jump'}"),
+    )
+    model = closure_model(values)
+    closures = len(report.rows) + sum(path.closures for path in report.paths)
+    gap, ball = (None, None) if report.closed is None else _open(model, report.closed)
+    verdict = {
+        "passed": report.passed,
+        "gap": gap,
+        "passing ball": ball,
+        "closures": closures,
+        "fails by": "; ".join(_failures(report)),
+    }
+    reference = report.rows[0]
+    return Result(
+        tables={"": _verdicts([verdict]), "variations": gate_rows(report)},
+        # By these others look the verdict up.
+        numbers={"anatomy": anatomy_digest(values), "passed": report.passed},
+        status="converged" if reference.passed else "failed",
+        reason="completed" if reference.passed else reference.reason,
+        mesh=Mesh.of(model.mesh),
+        forward_solves=closures,
+    )
+
+
+def _verdicts(rows: list[dict[str, Any]]) -> Table:
+    return table(rows, **{"passed": "", "gap": "mm²:.2g", "passing ball": "mm:.2g"})
+
+
+def _failures(report: GateReport) -> list[str]:
+    rows = [
+        f"{row.case}: " + (f"{row.max_mm:.2g} mm off" if row.max_mm > 0 else row.reason)
+        for row in report.rows
+        if not row.passed
+    ]
+    return [*rows, *(f"{p.name}: {p.reason}" for p in report.paths if not p.passed)]
+
+
+def _open(model: ClosureModel, vertices: FloatArray) -> tuple[float, float]:
+    """Gap (mm²) of a closed valve, and diameter (mm) of the largest ball that passes it."""
+    surface = model.valve.surface
+    annulus = vertices[model.valve.annulus]
+    seen = vertices, surface.triangles, annulus, plane_of(model.valve, annulus)
+    gap = find_gap(*seen, contact_reach(model))
+    return gap.area, largest_passing_ball(*seen, thickness=surface.thickness).diameter
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _closing(job: Job[Settings]) -> Result:
+    closing = close_valve(job.values)
+    simulation = closing.result.simulation
+    return Result(
+        tables={"": closing.steps()},
+        numbers={
+            "contact_distance_mm": closing.contact_distance_mm,
+            "ends_at_rest": closing.model.settings.protocol.equilibrium and simulation.converged,
+        },
+        arrays=closing.arrays(),
+        status="converged" if simulation.converged else "failed",
+        reason="completed" if simulation.converged else simulation.reason.value,
+        mesh=Mesh.of(closing.model.mesh),
+        forward_solves=1,
+        gate=gate_of(job.values),
+    )
+
+
+def summary(results: Results) -> dict[str, Table]:
+    """The verdict on each anatomy and the largest distance of each variation; steps as they are."""
+    parts = {record.row: record.table_of() for record in results.records.values()}
+    if "variations" not in results.table_names:
+        return {"": results.table()}
+    distances: dict[str, dict[str, Any]] = {}
+    for record in results.records.values():
+        for row in record.table_of("variations").rows[1:]:
+            mine = distances.setdefault(row["variation"], {"variation": row["variation"]})
+            mine[record.row] = row["max"]
+    columns = {name: Column("mm", ".2g", label=name) for name in parts}
+    shown = table(distances.values(), variation=Column(), **columns)
+    return {"": joined(parts, "anatomy"), "largest_distance": shown}
+
+
+MOMENTS = (0.75, 0.1)
+"""Shares of the open orifice at which a closing valve is drawn, beside the open and the last."""
+
+CURVES = {
+    "orifice": "orifice (mm²)",
+    "passing ball": "largest ball that passes (mm)",
+    "coaptation": "coaptation in the middle (mm)",
+    "chord strain": "largest strain of a chord (%)",
+}
+
+
+def figure(results: Results) -> Figure | None:
+    """Four moments of a closing valve from the atrium and from the side, above four curves."""
+    name, record = next(iter(results.records.items()))
+    return draw_steps(record, results.arrays[name]) if name in results.arrays else None
+
+
+def draw_steps(record: Record, arrays: Path) -> Figure:
+    """A closing valve from its record and its arrays (`Closing.arrays`).
+
+    Raises
+    ------
+    InputError
+        If the arrays cannot be read.
+    """
+    from matplotlib.figure import Figure
+
+    values = record.table_of().values
+    at_rest = bool(record.numbers["ends_at_rest"])
+    moments = _moments(np.array(values["orifice"], dtype=float))
+    titles = {
+        k: ("at rest" if at_rest and k == len(values["time"]) - 1 else f"{values['time'][k]:.2f} s")
+        + f", {values['pressure'][k]:.0f} mmHg"
+        for k in moments
+    }
+    drawn = Figure(figsize=(11, 8.4), layout="constrained")
+    parts: Any = drawn.subfigures(2, 1, height_ratios=[2.2, 1.0])
+    draw_closing(parts[0], arrays, titles, ("anterior", "posterior"))
+    _draw_curves(parts[1], values, moments, at_rest)
+    drawn.suptitle(
+        "A simulated valve closing, from the atrium and from the posterior side"
+        " (dots: the moments shown)",
+        fontsize=11,
+    )
+    return drawn
+
+
+def _moments(orifice: FloatArray) -> list[int]:
+    """Open, half open, nearly closed, closed; the last one for what is never reached."""
+    share, last = orifice / max(float(orifice[0]), 1e-9), len(orifice) - 1
+    reached = [int(np.append(np.flatnonzero(share < level), last)[0]) for level in MOMENTS]
+    return [0, *reached, last]
+
+
+def _draw_curves(part: Any, values: Mapping[str, Any], moments: list[int], at_rest: bool) -> None:
+    """Measures over time, the drawn moments marked; the equilibrium is at no time, so apart."""
+    from mvest.reporting.style import COLOURS, plain_axes
+
+    time = np.array(values["time"], dtype=float)
+    moving = len(time) - at_rest
+    end = time[moving - 1]
+    place = np.append(time[:moving], 1.13 * end)[: len(time)]
+    for axes, (name, label) in zip(part.subplots(1, len(CURVES)), CURVES.items(), strict=True):
+        plain_axes(axes)
+        y = (100.0 if label.endswith("(%)") else 1.0) * np.array(values[name], dtype=float)
+        axes.plot(place[:moving], y[:moving], ".-", color="black", lw=1, ms=4)
+        axes.plot(place[moments], y[moments], "o", color=COLOURS[1], ms=5.5)
+        axes.set_xlabel("time (s)")
+        axes.set_ylim(bottom=min(0.0, 1.1 * y.min()))
+        axes.set_title(label, fontsize=9, loc="left")
+        if at_rest:
+            axes.axvline(1.065 * end, color="0.8", lw=0.8)
+            ticks = [t for t in axes.get_xticks() if 0 <= t <= 0.9 * end]
+            axes.set_xticks([*ticks, place[-1]], [*(f"{t:g}" for t in ticks), "at rest"])
+            axes.set_xlim(-0.03 * end, 1.22 * end)
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run,
+    summary=summary,
+    figure=figure,
+    captions={"": "A valve closing. Simulated."},
+    keeps_failures=True,
+)

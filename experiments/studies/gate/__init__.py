@@ -1,1 +1,0 @@
-"""The gate: whether the closed valve is one state."""

@@ -1,0 +1,254 @@
+"""The gate and a closure step by step, and what other studies read of the gate's records."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.common.building.closure import closure_model
+from experiments.common.building.gate import anatomy_digest, gate_of
+from experiments.common.places import ANATOMIES, GATE_RECORDS
+from experiments.common.records.record import NOT_GATED, Record, has_passed, read_record, stamp
+from experiments.common.records.writer import cautions, write_results
+from experiments.common.study import Result, Results
+from experiments.results.keep import records_of, write_records
+from experiments.studies.gate import STUDY
+from mvest.closure.model import ClosureModel
+from mvest.closure.robustness import GATE_CASES, MAX_LIMIT, MEAN_LIMIT, GateCase
+from mvest.closure.smoothness import JUMP_LIMIT
+from mvest.estimation import Prediction
+from mvest.reporting.tables import table
+from tests.experiments.configured import composed, plain
+from tests.places import CONF
+
+SMALL = (
+    "mesh.columns=12",
+    "mesh.rows=2",
+    "observation.columns=16",
+    "observation.rows=5",
+    "mechanics.contact_points.columns=24",
+    "mechanics.contact_points.rows=6",
+    "mechanics.protocol.pressure_mmHg=5",
+    "mechanics.protocol.ramp=0.1",
+    "mechanics.protocol.dt=0.1",
+    "mechanics.protocol.end=0.1",
+    "mechanics.protocol.equilibrium=false",
+    "tracking.enabled=false",
+)
+ONE = ("hydra.mode=RUN",)
+"""One anatomy, not all."""
+
+
+def settings(name, *more):
+    return plain(composed("experiment=gate", f"valve={name}", *more)) | {"row": name}
+
+
+def record_of(name, passed, *variations):
+    """A record of the gate that says this of an anatomy."""
+    values = settings(name)
+    rows = [{"variation": "reference", "mean": 0.0, "max": 0.0, "passed": True}]
+    rows += [{"variation": v, "mean": x, "max": x, "passed": x is not None} for v, x in variations]
+    verdict = {"passed": passed, "gap": 0.0, "passing ball": 0.0, "closures": 1, "fails by": ""}
+    result = Result(
+        tables={"": table([verdict]), "variations": table(rows)},
+        numbers={"anatomy": anatomy_digest(values), "passed": passed},
+    )
+    return stamp(values, "b" * 64, result, 0.0)
+
+
+@pytest.fixture
+def run(run_here):
+    def call(*arguments):
+        status, _, folder, said = run_here(*SMALL, *arguments)
+        return status, read_record(folder / "result.json"), folder, said
+
+    return call
+
+
+def test_all_anatomies_are_one_table(tmp_path):
+    calm = record_of("template", True, ("mesh x 1.5", 0.07))
+    other = record_of("prolapse", False, ("mesh x 1.5", None), ("ramp / 3", 0.61))
+    write_results(tmp_path, STUDY, Results({"a": calm, "b": other}))
+    page = (tmp_path / "gate.md").read_text()
+    assert "| mesh x 1.5 | 0.07 | – |" in page
+    assert "| ramp / 3 | – | 0.61 |" in page
+    assert "reference" not in page
+    assert "| prolapse | no |" in page
+    assert (tmp_path / "gate_variations.csv").read_text().count("\n") == 1 + 1 + 2 + 3
+
+
+def test_a_verdict_is_looked_up_by_the_anatomy_and_not_by_its_name(tmp_path):
+    records = {"one": record_of("template", True), "two": record_of("prolapse", False)}
+    (tmp_path / "records").mkdir()
+    path = write_records(tmp_path, "gate", records)
+    damaged = ["{", json.dumps({"record": []}), json.dumps([])]
+    path.write_text("\n".join([*damaged, path.read_text()]), encoding="utf-8")
+    assert gate_of(settings("template"), path) == "passed on 54 x 6 hex18"
+    assert gate_of(settings("prolapse"), path) == "NOT passed on 54 x 6 hex18"
+    # Whatever else is configured, the anatomy is the same; a millimetre is another one.
+    assert gate_of(settings("template", "mesh.columns=40"), path).startswith("passed")
+    wider = settings("template", "valve.annulus.anteroposterior_half_axis=15.0")
+    assert gate_of(wider, path) == NOT_GATED
+    assert gate_of(settings("half_open"), path) == NOT_GATED
+    assert gate_of(settings("template"), tmp_path / "none") == NOT_GATED
+
+
+def test_every_anatomy_that_ships_is_one_of_those_that_are_asked():
+    asked = CONF.joinpath("experiment", "gate.yaml").read_text(encoding="utf-8")
+    (line,) = (line for line in asked.splitlines() if line.strip().startswith("valve:"))
+    assert sorted(line.partition(":")[2].strip().split(",")) == list(ANATOMIES)
+
+
+def test_kept_verdicts_are_of_the_anatomies_as_they_ship():
+    results = records_of(GATE_RECORDS.parent.parent, "gate")
+    assert {record.row for record in results.records.values()} == set(ANATOMIES)
+    for record in results.records.values():
+        assert record.numbers["anatomy"] == anatomy_digest(settings(record.row))
+        rows = record.table_of("variations").rows
+        assert record.numbers["passed"] == all(row["passed"] for row in rows)
+        for row in rows:
+            along = row["variation"].startswith("along")
+            assert row["max"] <= (JUMP_LIMIT if along else MAX_LIMIT)
+            assert along or row["mean"] <= MEAN_LIMIT
+        # Dilated and tethered leaflets alone leak; all others close, seen as predictions see them.
+        (verdict,) = record.table_of().rows
+        assert (verdict["gap"] == 0.0) == (record.row != "functional_mr")
+
+
+def test_what_has_not_passed_says_so_before_its_results():
+    values = settings("template")
+
+    def stamped(gate):
+        return stamp(values, "b" * 64, Result(row=f"on {gate}", gate=gate), 0.0)
+
+    passed, failed = stamped("passed on 54 x 6 hex18"), stamped("NOT passed on 54 x 6 hex18")
+    never, none = stamped(NOT_GATED), stamped(None)
+    assert [has_passed(r.gate) for r in (passed, failed, never)] == [True, False, None]
+    assert passed.caution == none.caution == ""
+    assert "did NOT pass the gate (NOT passed on 54 x 6 hex18)" in failed.caution
+    assert "experiment=gate" in never.caution
+    assert failed.line.endswith("seed 1; gate of the anatomy: NOT passed on 54 x 6 hex18")
+    assert "gate of" not in none.line
+    # Of several, those that it is said of are named.
+    assert cautions([failed]) == [failed.caution]
+    assert cautions([passed, failed]) == [f"on NOT passed on 54 x 6 hex18: {failed.caution}"]
+    assert cautions([passed, none]) == []
+
+
+def test_each_case_changes_its_own_setting_only():
+    config = plain(composed("experiment=gate", "mesh.columns=12", "mesh.rows=2"))
+    base = closure_model(config)
+
+    def described(model: ClosureModel) -> dict:
+        settings = model.settings
+        return {
+            "dt": settings.protocol.dt,
+            "ramp": settings.protocol.ramp,
+            "converged_path": settings.newton.path_tolerance,
+            "activation": settings.contact.activation_distance,
+            "sampling": len(model.contact_valve.surface.vertices),
+            "mesh": model.mesh.sha256,
+            "guided": model.guide is not None,
+            "perturbed": None if model.perturbation is None else float(model.perturbation.sum()),
+            "start": model.continuation,
+            "rest": (settings.tissue, settings.damping, model.names, model.anchors),
+            "observed": model.valve.surface.vertices.shape,
+        }
+
+    reference = described(base)
+    changed = {}
+    for case in GATE_CASES:
+        varied = described(closure_model(config, case))
+        changed[case.name] = {k for k, v in varied.items() if v != reference[k]}
+    unchanged = GateCase("x")
+    for case in GATE_CASES:
+        asked = {k for k in unchanged.__slots__ if getattr(case, k) != getattr(unchanged, k)} - {
+            "name"
+        }
+        # No mesh is coarser than that of 24 x 3 cells which guides are on.
+        assert changed[case.name] == asked - {"guided"}
+    (finer,) = (closure_model(config, c).mesh for c in GATE_CASES if c.mesh != 1)
+    assert len(finer.elements) == 18 * 3
+    (guided,) = (c for c in GATE_CASES if c.guided)
+    usual = plain(composed("experiment=gate"))
+    assert closure_model(usual).guide is None
+    assert len(closure_model(usual, guided).guide.mesh.elements) < 54 * 6
+    assert closure_model(config, GATE_CASES[0]).settings.protocol.dt == pytest.approx(
+        0.5 * reference["dt"]
+    )
+
+
+def test_the_gate_study_records_every_case(run):
+    status, record, folder, said = run("experiment=gate", *ONE, "valve=half_open")
+    assert status == 0
+    assert (record.status, record.row) == ("converged", "half_open")
+    rows = record.table_of("variations").rows
+    names = ["reference", *(c.name for c in GATE_CASES)]
+    paths = [f"along {name}" for name in ("E_f", "E_f.anterior", "E_f.posterior")]
+    assert [row["variation"] for row in rows] == names + paths
+    # No contact and little load: nothing jumps, and no piece is halved.
+    assert all(row["passed"] for row in rows[len(names) :])
+    assert record.forward_solves == 1 + len(GATE_CASES) + 4 + 2 + 2
+    assert 0 < rows[len(names)]["max"] < 0.1
+    (verdict,) = record.table_of().rows
+    assert verdict["passed"] is record.numbers["passed"]
+    # The valve has hardly begun to close.
+    assert verdict["gap"] > 10
+    assert verdict["passing ball"] > 1
+    assert {"gate.csv", "gate.md"} <= {path.name for path in folder.iterdir()}
+    for case in GATE_CASES:
+        assert f"{case.name}: max" in said.err
+
+
+def test_a_reference_that_does_not_close_is_recorded_as_a_failure(run, monkeypatch):
+    monkeypatch.setattr(ClosureModel, "__call__", lambda self, m: Prediction.failed("it buckled"))
+    status, record, _, said = run("experiment=gate", *ONE)
+    assert status == 1
+    assert (record.status, record.reason) == ("failed", "it buckled")
+    assert record.numbers["passed"] is False
+    (verdict,) = record.table_of().rows
+    assert verdict["gap"] is None
+    assert verdict["fails by"] == "reference: it buckled"
+    assert len(record.table_of("variations")) == 1
+    assert "it buckled" in said.err
+
+
+def test_a_case_that_does_not_close_has_no_distance(run, monkeypatch):
+    true = ClosureModel.__call__
+
+    def sometimes(self, m):
+        return Prediction.failed("it buckled") if len(self.mesh.elements) > 24 else true(self, m)
+
+    monkeypatch.setattr(ClosureModel, "__call__", sometimes)
+    status, record, _, _ = run("experiment=gate", *ONE)
+    assert status == 0
+    rows = {row["variation"]: row for row in record.table_of("variations").rows}
+    assert rows["mesh x 1.5"]["mean"] is None
+    assert (rows["mesh x 1.5"]["passed"], rows["mesh x 1.5"]["reason"]) == (False, "it buckled")
+    assert record.numbers["passed"] is False
+    assert "mesh x 1.5: it buckled" in record.table_of().rows[0]["fails by"]
+
+
+def test_the_closure_study_measures_every_step(run):
+    status, record, folder, _ = run(
+        "experiment=closure", "mechanics.protocol.end=0.2", "mechanics.protocol.growth=1"
+    )
+    assert status == 0
+    assert isinstance(record, Record)
+    rows = record.table_of().rows
+    assert [row["time"] for row in rows] == pytest.approx([0.0, 0.1, 0.2])
+    assert [row["pressure"] for row in rows] == pytest.approx([0.0, 5.0, 5.0])
+    assert all(row["intersections"] == 0 for row in rows)
+    assert rows[0]["orifice"] > rows[-1]["orifice"] > 0
+    # Drawn is the thick leaflets' closed surface: both faces of 16 x 5 vertices, 2 x 128 triangles,
+    # and two rims of 2 x 16.
+    with np.load(folder / "fields.npz") as fields:
+        assert fields["frames"].shape == (3, 160, 3)
+        assert fields["triangles"].shape == (2 * 128 + 2 * 32, 3)
+        assert fields["region"].shape == fields["triangles"].shape[:1]
+        assert np.isfinite(fields["frames"]).all()
+        assert fields["stress"].shape == fields["contact_pressure"].shape == (3, 160)
+        # Contact acts within two thicknesses of midsurfaces, one of faces: that of the free edge.
+        assert 0.5 < fields["reach_mm"] < 1.32
+    names = {path.name for path in folder.iterdir()}
+    assert {"closure.csv", "closure.md", "closure.png"} <= names
