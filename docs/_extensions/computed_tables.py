@@ -17,7 +17,9 @@ from study_pages import comment_of
 
 from experiments.common.cases.findings import Findings as OfPatients
 from experiments.common.cases.skill import median_errors
-from experiments.common.ranges import ANY, RANGES
+from experiments.common.config import PARTS, Config
+from experiments.common.schema import ranges
+from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
 from experiments.studies.imaged_patient.findings import Findings as OfVolumes
 from experiments.studies.imaged_patient.report import moduli_of_volumes
@@ -65,19 +67,17 @@ def setting_groups() -> str:
 
 
 def setting_ranges() -> str:
-    """What every setting may be."""
+    """What settings may be, by the kinds of quantities."""
+    found: dict[tuple[str, ...], set[str]] = {}
+    for kind in [*PARTS["valve"], *PARTS["mechanics"], Config, *map(load_settings, study_names())]:
+        for key, within in ranges(kind):
+            bounds = {type(one).__name__: one for one in within.metadata}
+            unit, _, why = (within.description or "").rpartition("; ")
+            row = (f"{bounds['Ge'].ge:.10g}", f"{bounds['Le'].le:.10g}", unit, why)
+            found.setdefault(row, set()).add(key.rpartition(".")[2] if "*" not in key else key)
     return markdown(
         ["from", "to", "unit", "why", "settings"],
-        [
-            [
-                f"{row.low:.10g}",
-                f"{row.high:.10g}",
-                row.unit,
-                row.why,
-                ", ".join(f"`{name}`" for name in row.names.split()),
-            ]
-            for row in (*RANGES, ANY)
-        ],
+        [[*row, ", ".join(f"`{name}`" for name in sorted(names))] for row, names in found.items()],
     )
 
 

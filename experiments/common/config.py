@@ -1,7 +1,7 @@
 """The schema of every configuration, registered with Hydra.
 
-What the library names is taken from the library (``experiments.common.schema``); only what a study
-adds to it is written down here.
+What the library names is taken from the library (`experiments.common.schema`); what a study adds is
+its own `Settings`. Everything else is declared here.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
@@ -17,157 +17,150 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-from experiments.common.building.anatomy import ValveFolderConfig, folder_hash
-from experiments.common.schema import schema, with_contents
+from experiments.common.building.anatomy import ValveFolder, folder_hash
+from experiments.common.schema import (
+    BY_PARAMETER,
+    NOT_HASHED,
+    hints_of,
+    marked,
+    require_admissible_values,
+    require_within,
+    schema,
+    with_contents,
+    without,
+)
 from experiments.common.study import load_settings, study_names
-from mvest.estimation.filters.ensemble import EnsembleFilter
-from mvest.estimation.filters.monte_carlo import MonteCarloFilter
+from mvest.errors import ConfigurationError
 from mvest.files import sha256_of
 from mvest.imaging.models import MODEL_FILE
 from mvest.mechanics.settings import MechanicsSettings
+from mvest.problem.registration import range_of
 from mvest.provenance import config_hash
+from mvest.quantities import (
+    AxisCount,
+    CellsAlong,
+    CellsAround,
+    EdgeLength,
+    Factor,
+    Gigabytes,
+    Layers,
+    Length,
+    Logarithm,
+    Modulus,
+    Percent,
+    Place,
+    PointsAlong,
+    PointsAround,
+    Ratio,
+    Refinement,
+    Repeats,
+    Seed,
+    TimeLimit,
+    Value,
+    Values,
+)
 from mvest.valve.anatomy.template import TemplateParameters
 
-__all__ = ["NOT_THE_RESULT", "hash_of", "plain", "register", "without_places"]
-
-AS_BEFORE: dict[str, Any] = {
-    "check_runs": 0,
-    "curve": [],
-    "active": True,
-    "extrapolated_from": [],
-    "folder_sha256": None,
-    "annulus_contraction": 0.0,
-}
-"""Settings that came after results which are as with these values; so they leave no trace in the
-hash, wherever they stand in a configuration."""
+__all__ = ["hash_of", "is_hashed", "plain", "register", "require_in_range", "without_places"]
 
 GROUP = "study"
-"""The configuration group of the rooms."""
+"""The configuration group of the studies."""
 
-NOT_THE_RESULT = (
-    "hydra",
-    "paths",
-    "tracking",
-    "sweep",
-    "factors",
-    "figures",
-    "publish",
-    "force",
-    "dry_run",
-    "detach",
-    "time_limit_s",
-    "memory_limit_gb",
-    "isolate",
-    "check",
-    "imaging.processes",
-    "imaging.publish_model",
-    "external.folder",
-    "external.processes",
-    "models.processes",
-    "valve.folder",
-)
-"""What in a configuration changes no number of the result, left out of its hash."""
+MAX_NAME = 120
+"""Letters of a text that names files."""
+
+Switch: TypeAlias = Annotated[bool, NOT_HASHED]
+ByParameter: TypeAlias = Annotated[dict[str, float], BY_PARAMETER]
 
 
-TemplateConfig = schema(TemplateParameters, ValveFolderConfig)
-EnsembleFilterConfig = schema(EnsembleFilter)
-MonteCarloFilterConfig = schema(MonteCarloFilter)
-
-
-@dataclass
-class MeshConfig:
+@dataclass(frozen=True, kw_only=True)
+class Mesh:
     """The estimator's mesh."""
 
     source: str = "structured"  # or tetwild: an unstructured mesh of the thickened leaflets
-    columns: int = MISSING  # cells around the valve
-    rows: int = MISSING  # cells from annulus to free edge
-    layers: int = 1  # cells through the thickness
-    edge_length: float = 2.5  # mm, of an unstructured mesh
+    columns: CellsAround = MISSING
+    rows: CellsAlong = MISSING
+    layers: Layers = 1
+    edge_length: EdgeLength = 2.5  # of an unstructured mesh
 
 
-@dataclass
-class ContactPointsConfig:
+@dataclass(frozen=True, kw_only=True)
+class ContactPoints:
     """Where contact is sampled, in material coordinates: the same for every mesh."""
 
-    columns: int = 144
-    rows: int = 32
+    columns: PointsAround = 144
+    rows: PointsAlong = 32
 
 
-@dataclass
-class FilterConfig:
-    """The filter and what it is told."""
+@dataclass(frozen=True, kw_only=True)
+class FilterSettings:
+    """The prior, the assumed noise, and the filter."""
 
-    mode: str = MISSING  # paper, extended, iterated, unscented, ensemble, monte_carlo or importance
-    initial: list[float] = MISSING  # prior mean of the parameters
-    P0: Any = MISSING  # variance, variances or matrix
-    Q: Any = 0.01  # the same, added each round of the paper's mode
-    R: Any = 0.01  # mm², one or one for each observed frame
-    R_correlation_mm: float = 0.0  # correlation length of R along the leaflets; 0: independent
+    mode: str = MISSING  # what tables call the filter
+    method: dict[str, Any] = field(default_factory=dict)  # its _target_ and its own settings
+    initial: tuple[Value, ...] = MISSING  # prior mean of the parameters
+    P0: Values = MISSING  # variance, variances or matrix
+    R: Values = 0.01  # mm², one or one for each observed frame
+    R_correlation_mm: Length = 0.0  # correlation length of R along the leaflets; 0: independent
     transform: str = "identity"  # or log
-    tolerance: float = 1e-4
-    max_iterations: int = 30
-    spread: float = 1.0  # of sigma points, in parts of the simplex whose covariance is P
-    check_runs: int = 0  # made at the end to check the posterior; an ensemble has its own
-    ensemble: EnsembleFilterConfig = field(default_factory=EnsembleFilterConfig)  # type: ignore[valid-type]
-    monte_carlo: MonteCarloFilterConfig = field(default_factory=MonteCarloFilterConfig)  # type: ignore[valid-type]
 
 
-@dataclass
-class ObservationConfig:
+@dataclass(frozen=True, kw_only=True)
+class Observation:
     """What is seen of the valve, and how it differs from what is there."""
 
-    frames: list[str] = field(default_factory=lambda: ["open", "closed"])
-    columns: int = 112
-    rows: int = 29
+    frames: tuple[str, ...] = ("open", "closed")
+    columns: PointsAround = 112
+    rows: PointsAlong = 29
     label: str = "none"  # what a table calls its errors
-    noise_mm: float = 0.0  # SD of independent errors of each coordinate
-    correlated_mm: float = 0.0  # SD of errors that are alike at neighbouring vertices
-    correlation_length_mm: float = 5.0
-    dropout_mm: float = 0.0  # closed vertices this near to another leaflet are not seen
-    annulus_offset_mm: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    noise_mm: Length = 0.0  # SD of independent errors of each coordinate
+    correlated_mm: Length = 0.0  # SD of errors that neighbouring vertices share
+    correlation_length_mm: Length = 5.0
+    dropout_mm: Length = 0.0  # closed vertices this near to another leaflet are not seen
+    annulus_offset_mm: tuple[Place, ...] = (0.0, 0.0, 0.0)
 
 
-@dataclass
-class TruthConfig:
+@dataclass(frozen=True, kw_only=True)
+class Truth:
     """What the synthetic observation is made from; null means as the estimator's model."""
 
-    values: list[float] = MISSING
+    values: tuple[Value, ...] = MISSING
     label: str = MISSING  # what a table calls it
-    refine: int = 1  # cells of the truth's mesh per cell of the estimator's, in each direction
+    refine: Refinement = 1  # cells of the truth's mesh per cell of the estimator's, each way
     source: str | None = None
-    columns: int | None = None
-    rows: int | None = None
-    layers: int | None = None
+    columns: CellsAround | None = None
+    rows: CellsAlong | None = None
+    layers: Layers | None = None
     element: str | None = None
-    # Columns and rows of a coarser mesh: closures on both are carried on to cells of no size.
-    extrapolated_from: list[int] = field(default_factory=list)
-    dt_factor: float = 1.0
-    reading: str | None = None  # of the Poisson ratio
-    ratio: dict[str, float] = field(default_factory=dict)  # region -> E_f over E_perp
-    fixed: dict[str, float] = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
+    # Columns and rows of a coarser mesh: both closures are extrapolated to zero mesh size.
+    extrapolated_from: tuple[AxisCount, ...] = ()
+    dt_factor: Factor = 1.0
+    reading: str | None = None  # Poisson option
+    ratio: dict[str, Ratio] = field(default_factory=dict)  # region -> E_f over E_perp
+    fixed: ByParameter = field(default_factory=dict)  # pressure_scale, chord_stiffness, ...
 
 
-@dataclass
-class PaperConfig:
+@dataclass(frozen=True, kw_only=True)
+class Paper:
     """What the paper reports for the same experiment."""
 
     table: str = MISSING
-    estimate: list[float] | None = None  # MPa
-    error_percent: list[float] | None = None
-    moduli_error_percent: list[float] | None = None  # mean and SD over all moduli
-    distance_mm: list[float] | None = None  # mean and SD
+    estimate: tuple[Modulus, ...] | None = None
+    error_percent: tuple[Percent, ...] | None = None
+    moduli_error_percent: tuple[Percent, ...] | None = None  # mean and SD over all moduli
+    distance_mm: tuple[Length, ...] | None = None  # mean and SD
 
 
-@dataclass
-class PathsConfig:
+@dataclass(frozen=True, kw_only=True)
+class Paths:
     """Folders, relative to where the command is typed."""
 
     outputs: str = "outputs"
     results: str = "${.outputs}/results"  # published tables; those of a checkout: results
 
 
-@dataclass
-class TrackingConfig:
+@dataclass(frozen=True, kw_only=True)
+class Tracking:
     """MLflow; null is a local database in the outputs folder."""
 
     enabled: bool = True
@@ -175,58 +168,65 @@ class TrackingConfig:
     runs: bool | None = None  # whether each job of a sweep is a run; null: of up to 1000 jobs
 
 
-@dataclass
-class DiscretisationConfig:
-    """What the mechanics are computed on, added to the library's settings."""
+@dataclass(frozen=True, kw_only=True)
+class Discretisation:
+    """What the mechanics are computed on."""
 
     element: str = "hex18"
-    reading: str = "A"  # of the Poisson ratio, for every region
-    contact_points: ContactPointsConfig = field(default_factory=ContactPointsConfig)
+    reading: str = "A"  # Poisson option of every region
+    contact_points: ContactPoints = field(default_factory=ContactPoints)
 
 
-MechanicsConfig = schema(MechanicsSettings, DiscretisationConfig)
-
-
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Config:
-    """A study."""
+    """What every study has."""
 
     name: str = MISSING
-    study: str = MISSING  # a room of experiments/studies
+    study: str = MISSING
     title: str = MISSING
     row: str = MISSING  # what a table calls this run
     table: str = "${name}"  # which table in results/ it belongs to
-    publish: bool = False  # whether results/ takes it over if run without overrides
-    paper: PaperConfig | None = None
-    parameters: list[str] = MISSING
-    fixed: dict[str, float] = field(default_factory=dict)
-    valve: TemplateConfig = field(default_factory=TemplateConfig)  # type: ignore[valid-type]
-    mesh: MeshConfig = field(default_factory=MeshConfig)
-    mechanics: MechanicsConfig = field(default_factory=MechanicsConfig)  # type: ignore[valid-type]
-    filter: FilterConfig = field(default_factory=FilterConfig)
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    truth: TruthConfig = field(default_factory=TruthConfig)
-    check: bool = False  # only check the case, or the image step of a volume, and draw it
+    publish: Switch = False  # whether results take it over if run without overrides
+    paper: Paper | None = None
+    parameters: tuple[str, ...] = MISSING
+    fixed: ByParameter = field(default_factory=dict)
+    valve: Any = None
+    mesh: Mesh = field(default_factory=Mesh)
+    mechanics: Any = None
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    observation: Observation = field(default_factory=Observation)
+    truth: Truth = field(default_factory=Truth)
+    check: Switch = False  # only check the case, or the image step of a volume, and draw it
     continuation: bool = True  # later closures start from the last closed state
-    continuation_reach: float | None = None  # if no logarithm of a parameter changes by more
+    continuation_reach: Logarithm | None = None  # unless the log of a parameter changes by more
     guided: bool = True  # the first closure is followed on coarser meshes
     confirm: bool = True  # close the fitted valve anew from the open state
     measure: bool = True  # orifice, coaptation and passing ball of the fitted valve: seconds
-    seed: int = 1
-    repeats: int = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
-    figures: bool = True  # draw the run; a sweep need not draw every job
-    force: bool = False  # run again what is done
-    dry_run: bool = False  # only say what would run, and how long it would take
-    detach: bool = False  # of a sweep: submit its jobs, or only plan them, and leave
-    time_limit_s: float | None = None  # after which a job is stopped and recorded as failed
-    memory_limit_gb: float | None = None  # beyond which it fails; null: its part of the machine
-    isolate: bool = True  # in a sweep, jobs run in a process apart, whose death costs one row
-    factors: dict[str, Any] = field(default_factory=dict)  # what is varied in this job, by name
+    seed: Seed = 1
+    repeats: Repeats = 1  # observations with the seeds seed, seed + 1, ..., each estimated from
+    figures: Switch = True  # draw the run; a sweep need not draw every job
+    force: Switch = False  # run again what is done
+    dry_run: Switch = False  # only say what would run, and how long it would take
+    detach: Switch = False  # of a sweep: submit its jobs, or only plan them, and leave
+    # After this a job is stopped and recorded as failed.
+    time_limit_s: Annotated[TimeLimit | None, NOT_HASHED] = None
+    # Beyond this a job fails; null: its part of the machine.
+    memory_limit_gb: Annotated[Gigabytes | None, NOT_HASHED] = None
+    isolate: Switch = True  # in a sweep, each job runs in a process of its own
+    # What is varied in this job, by name.
+    factors: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
     # A sweep's name, size, kind, and under the name of each size its grid, or a list of grids of
     # which it is the union; empty for a run by itself.
-    sweep: dict[str, Any] = field(default_factory=dict)
-    paths: PathsConfig = field(default_factory=PathsConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    sweep: Annotated[dict[str, Any], NOT_HASHED] = field(default_factory=dict)
+    paths: Annotated[Paths, NOT_HASHED] = field(default_factory=Paths)
+    tracking: Annotated[Tracking, NOT_HASHED] = field(default_factory=Tracking)
+
+
+PARTS: Mapping[str, tuple[type, ...]] = {
+    "valve": (TemplateParameters, ValveFolder),
+    "mechanics": (MechanicsSettings, Discretisation),
+}
+"""Parts of a configuration that join settings of the library with those of the experiments."""
 
 
 def plain(config: DictConfig, without: Collection[str] = ("hydra",)) -> dict[str, Any]:
@@ -246,13 +246,45 @@ def hash_of(config: DictConfig | Mapping[str, Any]) -> str:
 
     Of files and folders that it names what lies there counts, and not their names.
     """
-    values = plain(config, NOT_THE_RESULT) if isinstance(config, DictConfig) else config
-    kept = {str(key): value for key, value in values.items() if key not in NOT_THE_RESULT}
-    for name in NOT_THE_RESULT:
-        part, _, inner = name.partition(".")
-        if inner and kept.get(part) is not None:
-            kept[part] = {key: value for key, value in kept[part].items() if key != inner}
-    return config_hash(with_contents(_settings(kept.get("study")), _without_as_before(kept)))
+    values = plain(config) if isinstance(config, DictConfig) else config
+    study = values.get("study")
+    kept = without(values, ("hydra", *_not_hashed(study)))
+    return config_hash(_with_contents(study, kept))
+
+
+def is_hashed(key: str, study: str | None) -> bool:
+    """Whether a setting, or what it is part of, can change the result of a study."""
+    return not any(key == name or key.startswith(f"{name}.") for name in _not_hashed(study))
+
+
+def require_in_range(values: Mapping[str, Any]) -> None:
+    """Refuse a configuration with a number outside its range, or a text that is none.
+
+    Parameters
+    ----------
+    values : mapping
+        Plain data, resolved.
+
+    Raises
+    ------
+    ConfigurationError
+        One line with the setting, its value and the range.
+    """
+    for name in ("name", "table", "study"):
+        if len(str(values.get(name) or "")) > MAX_NAME:
+            raise ConfigurationError(f"{name} has more than {MAX_NAME} letters")
+    for name, value in values.items():
+        for kind in _kinds(values.get("study")).get(name, (Any,)):
+            part = value
+            if name in PARTS:
+                part = {k: v for k, v in value.items() if k in kind.__dataclass_fields__}
+            require_admissible_values(kind, part, name, range_of)
+    for part, key in (("truth", "values"), ("filter", "initial")):
+        given = (values.get(part) or {}).get(key)
+        for parameter, value in zip(values.get("parameters") or (), given or (), strict=False):
+            within = range_of(str(parameter))
+            if within is not None and isinstance(value, int | float):
+                require_within(f"{part}.{key} of {parameter}", value, within)
 
 
 def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -261,15 +293,31 @@ def without_places(values: Mapping[str, Any]) -> dict[str, Any]:
     What a setting reads has its SHA-256 in the place of its name; where results lie is left out.
     """
     kept = {str(key): value for key, value in values.items() if key != "paths"}
-    return dict(with_contents(_settings(kept.get("study")), kept))
+    return dict(_with_contents(kept.get("study"), kept))
 
 
-def _without_as_before(part: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: _without_as_before(value) if isinstance(value, Mapping) else value
-        for key, value in part.items()
-        if not (key in AS_BEFORE and value == AS_BEFORE[key])
-    }
+def _with_contents(study: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
+    settings = _settings(study)
+    return dict(values) if settings is None else dict(with_contents(settings, values))
+
+
+@cache
+def _not_hashed(study: str | None) -> tuple[str, ...]:
+    """Dotted names of the settings that change no number of a study's results."""
+    return tuple(
+        name
+        for top, kinds in _kinds(study).items()
+        for kind in kinds
+        for name in marked(kind, NOT_HASHED, top)
+    )
+
+
+@cache
+def _kinds(study: str | None) -> dict[str, tuple[Any, ...]]:
+    """Setting of a study at the top -> its type, or the types that it joins."""
+    settings = _settings(study)
+    own = {} if settings is None else hints_of(settings)
+    return {name: (kind,) for name, kind in {**hints_of(Config), **own}.items()} | dict(PARTS)
 
 
 @cache
@@ -285,9 +333,9 @@ def _package_model() -> str | None:
 
 
 class StudySource(ConfigSource):
-    """The configuration group ``study``: the schema of each room, made when it is asked for.
+    """The configuration group ``study``: the schema of each study, made when it is asked for.
 
-    So a job imports its own study's settings only, and a new room needs no registration.
+    So a job imports its own study's settings only, and a new study needs no registration.
     """
 
     @staticmethod
@@ -296,10 +344,15 @@ class StudySource(ConfigSource):
         return "studies"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """The schema of a room: what every study has, and what its own settings add."""
-        name = _room(config_path)
-        node = schema(load_settings(name), Config)
-        whole = make_dataclass(f"{name}_study", [("study", str, name)], bases=(node,))
+        """The schema of a study: what every study has, and what its own settings add."""
+        name = _study_of(config_path)
+        node = schema(Config, load_settings(name))
+        parts = [
+            (part, kind, field(default_factory=kind))
+            for part, classes in PARTS.items()
+            for kind in [schema(*classes)]
+        ]
+        whole = make_dataclass(f"{name}_study", [("study", str, name), *parts], bases=(node,))
         return ConfigResult(
             provider=self.provider,
             path=self.full_path(),
@@ -312,21 +365,21 @@ class StudySource(ConfigSource):
         return config_path.strip("/") in ("", GROUP)
 
     def is_config(self, config_path: str) -> bool:
-        """Whether there is such a room."""
-        return _room(config_path) in study_names()
+        """Whether there is such a study."""
+        return _study_of(config_path) in study_names()
 
     def available(self) -> bool:
         """Always."""
         return True
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """The group, or the rooms in it."""
+        """The group, or the studies."""
         if config_path.strip("/") != GROUP:
             return [] if results_filter == ObjectType.CONFIG else [GROUP]
         return [] if results_filter == ObjectType.GROUP else sorted(study_names())
 
 
-def _room(config_path: str) -> str:
+def _study_of(config_path: str) -> str:
     group, _, name = config_path.strip("/").partition("/")
     return name.removesuffix(".yaml") if group == GROUP else ""
 

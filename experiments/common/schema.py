@@ -1,7 +1,7 @@
-"""Configuration schemas made from the library's own frozen dataclasses, and back.
+"""Configuration schemas made from frozen dataclasses of the library and the studies, and back.
 
-So a setting has one name, one type and one default, those of the library, and a misspelt or wrongly
-typed override is refused by Hydra before anything is built.
+A setting has one name, one type, one default and one range, and all of them stand where it is
+declared. A misspelt, wrongly typed or inadmissible override is refused before anything is built.
 """
 
 from __future__ import annotations
@@ -9,19 +9,42 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from omegaconf import MISSING
+from pydantic.fields import FieldInfo
 
-from mvest.errors import ConfigurationError
+from mvest.errors import ConfigurationError, InputError
 from mvest.files import sha256_of
+from mvest.reading.text import check_words
 
-__all__ = ["InputFile", "Reads", "build", "contents", "schema", "with_contents"]
+__all__ = [
+    "BY_PARAMETER",
+    "NOT_HASHED",
+    "InputFile",
+    "Reads",
+    "build",
+    "contents",
+    "hints_of",
+    "marked",
+    "ranges",
+    "require_admissible_values",
+    "require_within",
+    "schema",
+    "with_contents",
+    "without",
+]
 
 T = TypeVar("T")
+
+MAX_ENTRIES, MAX_LETTERS = 10_000, 10_000
+"""Of a list or mapping, and of a text."""
+
+LARGEST = 1e15
+"""Of a number whose type has no range: a factor of a sweep, a setting of another program."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -37,6 +60,20 @@ class Reads:
     """
 
     contents: Callable[[Any, Mapping[str, Any]], Any]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Mark:
+    """Marks a setting; see `NOT_HASHED` and `BY_PARAMETER`."""
+
+    name: str
+
+
+NOT_HASHED = Mark("not hashed")
+"""Of a setting that changes no number of a result, and stays out of its hash."""
+
+BY_PARAMETER = Mark("by parameter")
+"""Of values that are named by parameters, and in the range of what those are."""
 
 
 def contents(value: Any, _beside: Mapping[str, Any] | None = None) -> Any:
@@ -60,16 +97,13 @@ def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None
     """Values of a schema, or of one of its types, with what its settings read in their place."""
     if value is None or value == MISSING or not _may_read(kind):
         return value
+    kind, marks = _unwrapped(kind)
+    for mark in marks:
+        if isinstance(mark, Reads):
+            return mark.contents(value, beside or {})
     arguments = typing.get_args(kind)
-    if typing.get_origin(kind) is Annotated:
-        for mark in arguments[1:]:
-            if isinstance(mark, Reads):
-                return mark.contents(value, beside or {})
-        return with_contents(arguments[0], value)
-    if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        return with_contents(arguments[0], value)
     if _is_schema(kind):
-        hints = _hints(kind)
+        hints = hints_of(kind)
         return {k: with_contents(hints.get(k), item, value) for k, item in value.items()}
     if isinstance(value, Mapping):
         return {key: with_contents(arguments[1], item) for key, item in value.items()}
@@ -78,7 +112,7 @@ def with_contents(kind: Any, value: Any, beside: Mapping[str, Any] | None = None
 
 @cache
 def _may_read(kind: Any) -> bool:
-    inner = _hints(kind).values() if _is_schema(kind) else typing.get_args(kind)
+    inner = hints_of(kind).values() if _is_schema(kind) else typing.get_args(kind)
     return isinstance(kind, Reads) or any(map(_may_read, inner))
 
 
@@ -87,33 +121,150 @@ def _is_schema(kind: Any) -> bool:
 
 
 @cache
-def _hints(cls: type) -> dict[str, Any]:
+def hints_of(cls: type) -> dict[str, Any]:
+    """Types of the fields of a dataclass, with their marks."""
     names = {field.name for field in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls, include_extras=True)
     return {name: hint for name, hint in hints.items() if name in names}
 
 
-def schema(cls: type, *more: type) -> type:
-    """A mutable dataclass that OmegaConf accepts, with the fields of the frozen ``cls``.
+def _unwrapped(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type without its marks and without None, and the marks."""
+    marks: tuple[Any, ...] = ()
+    while True:
+        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+        if origin is Annotated:
+            kind, marks = arguments[0], (*marks, *arguments[1:])
+        elif origin in (types.UnionType, typing.Union):
+            kind = next(one for one in arguments if one is not types.NoneType)
+        else:
+            return kind, marks
 
-    Tuples become lists, nested dataclasses schemas of their own; defaults are kept. ``more`` are
-    mutable dataclasses whose fields are added.
+
+def marked(kind: Any, mark: Mark, key: str = "") -> Iterator[str]:
+    """Dotted names of the marked settings of a schema; a marked part stands for what is in it."""
+    kind, marks = _unwrapped(kind)
+    if mark in marks:
+        yield key
+    elif _is_schema(kind):
+        for name, hint in hints_of(kind).items():
+            yield from marked(hint, mark, f"{key}.{name}".lstrip("."))
+
+
+def without(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Nested values without those of the dotted names."""
+    kept = {key: value for key, value in values.items() if key not in names}
+    for name in names:
+        part, _, inner = name.partition(".")
+        if inner and isinstance(kept.get(part), Mapping):
+            kept[part] = without(kept[part], (inner,))
+    return kept
+
+
+def ranges(kind: Any, key: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Dotted names of all settings of a schema with a range; names within mappings are ``*``."""
+    kind, marks = _unwrapped(kind)
+    for mark in marks:
+        if isinstance(mark, FieldInfo):
+            yield key, mark
+    if _is_schema(kind):
+        for name, hint in hints_of(kind).items():
+            yield from ranges(hint, f"{key}.{name}".lstrip("."))
+    elif typing.get_origin(kind) in (dict, Mapping):
+        yield from ranges(typing.get_args(kind)[1], f"{key}.*")
+    else:
+        for part in typing.get_args(kind):
+            yield from ranges(part, key)
+
+
+def require_admissible_values(
+    kind: Any,
+    value: Any,
+    key: str = "",
+    by_parameter: Callable[[str], FieldInfo | None] = lambda name: None,
+) -> None:
+    """Refuse values of a schema with a number outside its range, or a text that is none.
+
+    Parameters
+    ----------
+    kind : type
+    value : plain data
+    key : str
+        Dotted name of the value.
+    by_parameter : callable
+        Name of a parameter -> its range, for settings marked `BY_PARAMETER`.
+
+    Raises
+    ------
+    ConfigurationError
+        One line with the setting, its value and the range.
     """
-    hints = typing.get_type_hints(cls)
-    fields: list[Any] = []
-    for field in dataclasses.fields(cls):
-        kind = _config_type(hints[field.name])
-        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            fields.append((field.name, kind, dataclasses.field(default=MISSING)))
-            continue
-        default = (
-            field.default_factory()
-            if field.default_factory is not dataclasses.MISSING
-            else field.default
-        )
-        plain = _config_value(default)
-        fields.append((field.name, kind, _field(kind, plain)))
-    return dataclasses.make_dataclass(f"{cls.__name__}Config", fields, bases=more)
+    kind, marks = _unwrapped(kind)
+    within = next((mark for mark in marks if isinstance(mark, FieldInfo)), None)
+    if value is None or isinstance(value, bool):
+        return
+    if isinstance(value, int | float):
+        require_within(key, value, within)
+    elif isinstance(value, str):
+        try:
+            check_words(value, MAX_LETTERS)
+        except InputError as error:
+            raise ConfigurationError(f"{key} has {error}") from error
+    elif len(value) > MAX_ENTRIES:
+        raise ConfigurationError(f"{key} has {len(value)} entries, expected at most {MAX_ENTRIES}")
+    elif isinstance(value, Mapping):
+        hints = hints_of(kind) if _is_schema(kind) else {}
+        arguments = typing.get_args(kind)
+        inner = Any if within is None else Annotated[Any, within]
+        if len(arguments) == 2:
+            inner = arguments[1]
+        for name, part in value.items():
+            own = by_parameter(str(name)) if BY_PARAMETER in marks else None
+            hint = hints.get(name, inner) if own is None else Annotated[Any, own]
+            require_admissible_values(hint, part, f"{key}.{name}".lstrip("."), by_parameter)
+    else:
+        arguments = typing.get_args(kind)
+        inner = arguments[0] if arguments else Any
+        for part in value:
+            hint = inner if within is None else Annotated[Any, within]
+            require_admissible_values(hint, part, key, by_parameter)
+
+
+def require_within(key: str, value: float, within: FieldInfo | None) -> None:
+    """Refuse a number outside a range; without a range, one that no setting has.
+
+    Raises
+    ------
+    ConfigurationError
+        One line with the setting, its value and the range.
+    """
+    bounds = {} if within is None else {type(one).__name__: one for one in within.metadata}
+    low = bounds["Ge"].ge if "Ge" in bounds else -LARGEST
+    high = bounds["Le"].le if "Le" in bounds else LARGEST
+    if not low <= value <= high:
+        unit, _, why = ((within and within.description) or "").rpartition("; ")
+        text = f"{key} = {value:.10g}, expected {low:.10g} to {high:.10g} {unit}".rstrip()
+        raise ConfigurationError(text + (f" ({why})" if why else ""))
+
+
+def schema(*classes: type) -> type:
+    """A mutable dataclass that OmegaConf accepts, with the fields of frozen dataclasses.
+
+    Tuples become lists, nested dataclasses schemas of their own; defaults are kept.
+    """
+    fields: dict[str, Any] = {}
+    for cls in classes:
+        hints = typing.get_type_hints(cls)
+        for field in dataclasses.fields(cls):
+            kind = _config_type(hints[field.name])
+            if field.default_factory is not dataclasses.MISSING:
+                default = _field(kind, _config_value(field.default_factory()))
+            elif field.default is not dataclasses.MISSING:
+                default = _field(kind, _config_value(field.default))
+            else:
+                default = dataclasses.field(default=MISSING)
+            fields[field.name] = (field.name, kind, default)
+    return dataclasses.make_dataclass(f"{classes[0].__name__}Config", list(fields.values()))
 
 
 def _field(kind: Any, plain: Any) -> Any:

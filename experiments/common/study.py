@@ -20,7 +20,6 @@ from mvest.reporting.tables import Table, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 __all__ = [
     "Check",
@@ -95,7 +94,7 @@ class Result:
     tables: Mapping[str, Table] = field(default_factory=dict)
     numbers: Mapping[str, Number] = field(default_factory=dict)
     estimates: tuple[EstimateRecord, ...] = ()
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    arrays: Mapping[str, Any] = field(default_factory=dict)
     status: Status = "converged"
     reason: str = "completed"
     detail: str = ""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
 
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from experiments.common.progress import announce_compilation
-from experiments.common.ranges import require_in_range
+from experiments.common.schema import require_admissible_values
 from experiments.common.study import load_study
 from experiments.results.page import write_report
 from experiments.runner.collecting.collect import NOT_RUN, collect, read_ends
@@ -32,8 +32,23 @@ from experiments.sweeps.collected import Sweep
 from experiments.sweeps.report import write_sweep
 from mvest.errors import ConfigurationError, MvestError
 from mvest.provenance import sealed, write_json
+from mvest.quantities import Gigabytes, Processes, within
 
 __all__ = ["collect_sweep", "run_sweep"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LauncherSettings:
+    """Ranges of the settings of launchers (``conf/hydra/launcher``)."""
+
+    n_jobs: Annotated[int, within(-1024, 1024, "", "processes; -1: one for each core")]
+    jobs_per_task: Annotated[int, within(1, 1_000_000, "", "jobs of a sweep")]
+    array_parallelism: Annotated[int, within(1, 1_000_000, "", "tasks of a sweep")]
+    timeout_min: Annotated[int, within(1, 525_600, "min", "up to a year")]
+    cpus_per_task: Processes
+    mem_gb: Gigabytes
+    poll_s: Annotated[float, within(0.01, 3600, "s", "an hour is too long to notice an end")]
+
 
 LAUNCHERS = ("local", "basic", "slurm")
 """Who can run jobs; Hydra's basic one stands for one process."""
@@ -64,7 +79,7 @@ def run_sweep(context: HydraContext, config: DictConfig, arguments: Sequence[str
         If the request is wrong.
     """
     launcher: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
-    require_in_range({"hydra": {"launcher": launcher}})
+    require_admissible_values(LauncherSettings, launcher, "hydra.launcher")
     plan = make_plan(config, context.config_loader, arguments)
     for job in plan.jobs:
         _check(job.values, job.overrides)

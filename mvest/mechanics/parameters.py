@@ -49,6 +49,8 @@ class Kind:
     whole : bool
         Whether it also exists without a part, for the whole valve.
     description : str
+    low, high : float
+        Ends of the range that a configuration may ask for.
     """
 
     unit: str
@@ -56,29 +58,67 @@ class Kind:
     part: NamePart
     whole: bool
     description: str
+    low: float
+    high: float
 
 
 KINDS: dict[str, Kind] = {
-    "E_f": Kind("MPa", True, NamePart.REGION, False, "Young's modulus along the fibre"),
-    "ratio": Kind("", True, NamePart.REGION, False, "E_f over E_perp, at the same E_f"),
-    "G": Kind("MPa", True, NamePart.REGION, False, "shear modulus, where it does not follow E_f"),
-    "field": Kind(
-        "", False, NamePart.MODE, False, "coefficient of a mode of log E_f within a leaflet"
+    "E_f": Kind(
+        "MPa", True, NamePart.REGION, False, "Young's modulus along the fibre", 1e-06, 10000
     ),
-    "pressure_scale": Kind("", True, NamePart.NONE, True, "factor on the pressure"),
-    "chord_stiffness": Kind("", True, NamePart.CHORDS, True, "factor on the axial stiffness"),
-    "chord_rest_length": Kind("", True, NamePart.CHORDS, True, "factor on the rest length"),
-    "damping": Kind("s", True, NamePart.NONE, True, "stiffness-proportional part of the damping"),
-    "c0": Kind("MPa", True, NamePart.REGION, False, "scale of the exponential law"),
-    "c1": Kind("", True, NamePart.REGION, False, "its exponent of the isochoric deformation"),
-    "c2": Kind("", True, NamePart.REGION, False, "its exponent of the fibres' stretch"),
-    "mu": Kind("MPa", True, NamePart.REGION, False, "its shear modulus at rest"),
-    "kappa": Kind("MPa", True, NamePart.REGION, False, "its bulk modulus"),
+    "ratio": Kind(
+        "", True, NamePart.REGION, False, "E_f over E_perp, at the same E_f", 0.001, 1000
+    ),
+    "G": Kind(
+        "MPa",
+        True,
+        NamePart.REGION,
+        False,
+        "shear modulus, where it does not follow E_f",
+        1e-06,
+        10000,
+    ),
+    "field": Kind(
+        "",
+        False,
+        NamePart.MODE,
+        False,
+        "coefficient of a mode of log E_f within a leaflet",
+        -10,
+        10,
+    ),
+    "pressure_scale": Kind("", True, NamePart.NONE, True, "factor on the pressure", 0, 100),
+    "chord_stiffness": Kind(
+        "", True, NamePart.CHORDS, True, "factor on the axial stiffness", 0, 100
+    ),
+    "chord_rest_length": Kind("", True, NamePart.CHORDS, True, "factor on the rest length", 0, 100),
+    "damping": Kind(
+        "s", True, NamePart.NONE, True, "stiffness-proportional part of the damping", 0, 1000
+    ),
+    "c0": Kind("MPa", True, NamePart.REGION, False, "scale of the exponential law", 1e-06, 10000),
+    "c1": Kind(
+        "", True, NamePart.REGION, False, "its exponent of the isochoric deformation", 0, 100000
+    ),
+    "c2": Kind("", True, NamePart.REGION, False, "its exponent of the fibres' stretch", 0, 100000),
+    "mu": Kind("MPa", True, NamePart.REGION, False, "its shear modulus at rest", 1e-06, 10000),
+    "kappa": Kind("MPa", True, NamePart.REGION, False, "its bulk modulus", 1e-06, 10000),
     "stiffening": Kind(
-        "", True, NamePart.REGION, False, "share of the exponential law over that of the linear one"
+        "",
+        True,
+        NamePart.REGION,
+        False,
+        "share of the exponential law over that of the linear one",
+        0,
+        1e06,
     ),
     "prestretch": Kind(
-        "", True, NamePart.REGION, False, "length of the open leaflet over that free of stress"
+        "",
+        True,
+        NamePart.REGION,
+        False,
+        "length of the open leaflet over that free of stress",
+        0,
+        5,
     ),
 }
 

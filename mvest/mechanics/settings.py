@@ -11,6 +11,25 @@ from scipy.interpolate import PchipInterpolator
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
+from mvest.quantities import (
+    BeatTime,
+    Count,
+    Density,
+    Factor,
+    LawExponent,
+    Length,
+    Logarithm,
+    Modulus,
+    Place,
+    PoissonRatio,
+    Pressure,
+    Ratio,
+    Stiffening,
+    Stiffness,
+    Stretch,
+    Thicknesses,
+    TimeStep,
+)
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -56,12 +75,12 @@ class ExponentialTissue:
         If a coefficient is not positive (c1, c2 and viscous may be zero).
     """
 
-    c0: float
-    c1: float
-    c2: float
-    mu: float = 0.02
-    kappa: float = 5.0
-    viscous: float = 2.0
+    c0: Modulus
+    c1: LawExponent
+    c2: LawExponent
+    mu: Modulus = 0.02
+    kappa: Modulus = 5.0
+    viscous: Modulus = 2.0
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -106,13 +125,13 @@ class TissueSettings:
         law.
     """
 
-    ratio: float
-    nu: float = 0.488
+    ratio: Ratio
+    nu: PoissonRatio = 0.488
     reading: str = "A"
     law: str = "biot"
     exponential: ExponentialTissue | None = None
-    stiffening: float = 0.0
-    prestretch: float = 1.0
+    stiffening: Stiffening = 0.0
+    prestretch: Stretch = 1.0
 
     def __post_init__(self) -> None:
         if self.law not in ("biot", "corotational", "exponential", "stiffening"):
@@ -185,9 +204,9 @@ class ModulusField:
         How many modes are kept.
     """
 
-    correlation_length_mm: float
-    std_log: float
-    modes: int
+    correlation_length_mm: Length
+    std_log: Logarithm
+    modes: Count
 
     def __post_init__(self) -> None:
         for name in ("correlation_length_mm", "std_log"):
@@ -216,9 +235,9 @@ class StiffPatch:
     """
 
     region: str
-    centre: tuple[float, ...]
-    radius_mm: float
-    factor: float
+    centre: tuple[Place, ...]
+    radius_mm: Length
+    factor: Factor
 
     def __post_init__(self) -> None:
         if len(self.centre) != 3 or not np.all(np.isfinite(self.centre)):
@@ -259,13 +278,13 @@ class ClosureProtocol:
         outside; empty where it rises with the motion of the boundary.
     """
 
-    pressure_mmHg: float = 120.0
-    ramp: float = 0.3
-    dt: float = 0.3
-    growth: float = 1.5
-    end: float = 0.5
+    pressure_mmHg: Pressure = 120.0
+    ramp: BeatTime = 0.3
+    dt: TimeStep = 0.3
+    growth: Factor = 1.5
+    end: BeatTime = 0.5
     equilibrium: bool = True
-    curve: tuple[tuple[float, ...], ...] = ()
+    curve: tuple[tuple[Count, ...], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.dt > 0:
@@ -323,9 +342,9 @@ class ContactSettings:
         Without contact leaflets go through each other, as if they did not see each other.
     """
 
-    reference_pressure: float = 0.016
-    reference_distance: float = 1.2
-    activation_distance: float = 2.0
+    reference_pressure: Modulus = 0.016
+    reference_distance: Thicknesses = 1.2
+    activation_distance: Thicknesses = 2.0
     active: bool = True
 
     def __post_init__(self) -> None:
@@ -369,10 +388,10 @@ class MechanicsSettings:
     damping: Damping = field(default_factory=Damping)
     newton: NewtonSettings = field(default_factory=NewtonSettings)
     contact: ContactSettings = field(default_factory=ContactSettings)
-    density: float = 1.04e-9
+    density: Density = 1.04e-9
     support: str = "hinge"
-    support_stiffness: float = 50.0
-    patch_radius: float = 2.0
+    support_stiffness: Stiffness = 50.0
+    patch_radius: Length = 2.0
     solver: str = "auto"
     fields: dict[str, ModulusField] = field(default_factory=dict)
     patches: dict[str, StiffPatch] = field(default_factory=dict)

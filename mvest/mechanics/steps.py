@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mvest.errors import InputError
+from mvest.quantities import Count, DampingRate, Halvings, Length, Tolerance
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -39,8 +40,8 @@ class Damping:
         s, stiffness-proportional; applied to the strain rate (see :mod:`mvest.mechanics.law.biot`).
     """
 
-    alpha: float = 0.1
-    beta: float = 0.1
+    alpha: DampingRate = 0.1
+    beta: DampingRate = 0.1
 
     def __post_init__(self) -> None:
         if not (self.alpha >= 0 and self.beta >= 0):
@@ -70,13 +71,13 @@ class NewtonSettings:
         mm; a correction this small is round-off and counts as converged.
     """
 
-    tolerance: float = 1e-9
-    path_tolerance: float = 1e-1
-    max_iterations: int = 60
-    max_halvings: int = 8
+    tolerance: Tolerance = 1e-9
+    path_tolerance: Tolerance = 1e-1
+    max_iterations: Count = 60
+    max_halvings: Halvings = 8
     single_solve: bool = False
-    largest_move: float = 4.0
-    smallest_move: float = 1e-10
+    largest_move: Length = 4.0
+    smallest_move: Length = 1e-10
 
     def __post_init__(self) -> None:
         positive = self.tolerance > 0 and self.path_tolerance > 0

@@ -24,6 +24,7 @@ from mvest.estimation.noise_family import (
 )
 from mvest.observation.surfaces import SurfaceObservation
 from mvest.observation.vertices import Observation
+from mvest.quantities import Factor, Length, Share
 from mvest.typing import FloatArray
 
 __all__ = ["CURVES", "ROUGH", "ErrorBeliefs", "error_family"]
@@ -64,14 +65,14 @@ class ErrorBeliefs:
         images, and errors without any roughness have no end of detail from which to learn.
     """
 
-    std_factor: float = 2.0
-    length_factor: float = 2.0
-    length_mm: float = 10.0
-    deviation: float = 1.65
-    other_share: float = 0.2
-    other_factor: float = 3.0
-    frame_factor: float = 1.5
-    resolution_mm: float = 0.02
+    std_factor: Factor = 2.0
+    length_factor: Factor = 2.0
+    length_mm: Length = 10.0
+    deviation: Factor = 1.65
+    other_share: Share = 0.2
+    other_factor: Factor = 3.0
+    frame_factor: Factor = 1.5
+    resolution_mm: Length = 0.02
 
     def __post_init__(self) -> None:
         for name in ("std_factor", "length_factor", "deviation", "other_factor", "frame_factor"):

@@ -28,6 +28,7 @@ from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.valve_system import HeldState
 from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
+from mvest.quantities import Angle, Count, Factor, Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -105,19 +106,19 @@ class ConsideredGeometry:
         was seen. Each costs somewhat less than the estimate.
     """
 
-    shape_mm: float = 0.3
-    shape_length_mm: float = 10.0
-    annulus_mm: float = 0.5
-    annulus_length_mm: float = 20.0
-    tips_mm: float = 1.0
-    insertions_mm: float = 0.5
-    rest_lengths: float = 0.0
-    thickness: float = 0.1
-    fibre_degrees: float = 10.0
-    factor: float = 2.0
-    samples_mm: float = 0.0
-    share: float = 0.9
-    renewals: int = 0
+    shape_mm: Length = 0.3
+    shape_length_mm: Length = 10.0
+    annulus_mm: Length = 0.5
+    annulus_length_mm: Length = 20.0
+    tips_mm: Length = 1.0
+    insertions_mm: Length = 0.5
+    rest_lengths: Share = 0.0
+    thickness: Thickness = 0.1
+    fibre_degrees: Angle = 10.0
+    factor: Factor = 2.0
+    samples_mm: Length = 0.0
+    share: Share = 0.9
+    renewals: Count = 0
 
     def __post_init__(self) -> None:
         for name in _SCALES:

@@ -16,6 +16,16 @@ from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.problem.registration import REGISTRATION
+from mvest.quantities import (
+    CellsAlong,
+    CellsAround,
+    Count,
+    EdgeLength,
+    PointsAlong,
+    PointsAround,
+    PressureError,
+    Value,
+)
 
 __all__ = [
     "CaseMesh",
@@ -95,8 +105,8 @@ class PressureErrors:
         Whether they only widen the intervals, instead of being estimated.
     """
 
-    offset_mmHg: float = 5.0
-    each_mmHg: float = 5.0
+    offset_mmHg: PressureError = 5.0
+    each_mmHg: PressureError = 5.0
     considered: bool = False
 
     def __post_init__(self) -> None:
@@ -133,13 +143,13 @@ class CaseMesh:
     """
 
     source: str = "structured"
-    columns: int = 40
-    rows: int = 5
-    guide_columns: int = 24
-    guide_rows: int = 3
-    edge_length: float = 2.5
-    contact_columns: int = 144
-    contact_rows: int = 32
+    columns: CellsAround = 40
+    rows: CellsAlong = 5
+    guide_columns: CellsAround = 24
+    guide_rows: CellsAlong = 3
+    edge_length: EdgeLength = 2.5
+    contact_columns: PointsAround = 144
+    contact_rows: PointsAlong = 32
 
     def __post_init__(self) -> None:
         if self.source not in ("structured", "tetwild"):
@@ -157,10 +167,10 @@ class PaperSettings:
     max_iterations : int
     """
 
-    P0: float = 0.01
-    Q: float = 0.01
-    R: float = 0.01
-    max_iterations: int = 12
+    P0: Value = 0.01
+    Q: Value = 0.01
+    R: Value = 0.01
+    max_iterations: Count = 12
 
 
 @dataclass(frozen=True, slots=True)

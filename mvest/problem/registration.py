@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from mvest.closure.frames import FramesModel, is_frame_pressure
@@ -18,9 +19,10 @@ from mvest.closure.model import ClosedState, ClosureModel
 from mvest.errors import InputError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.parameters import KINDS
+from mvest.quantities import within
 from mvest.typing import FloatArray
 
-__all__ = ["REGISTRATION", "RegisteredModel", "displace", "registration_of", "unit_of"]
+__all__ = ["REGISTRATION", "RegisteredModel", "displace", "range_of", "registration_of", "unit_of"]
 
 REGISTRATION = ("shift.x", "shift.y", "shift.z", "turn.x", "turn.y", "turn.z")
 """Parameters of a displacement: shifts in mm, and a rotation vector in degrees."""
@@ -40,6 +42,18 @@ def unit_of(name: str) -> str:
         return "mmHg"
     kind = KINDS.get(name.partition(".")[0])
     return "" if kind is None else kind.unit
+
+
+def range_of(name: str) -> FieldInfo | None:
+    """The admissible range of a parameter of a closure or of a displacement; None for others."""
+    if name in REGISTRATION:
+        return (
+            within(-1000, 1000, "mm", "")
+            if name.startswith("shift")
+            else within(-360, 360, "degrees", "")
+        )
+    kind = KINDS.get(name.partition(".")[0])
+    return None if kind is None else within(kind.low, kind.high, kind.unit, kind.description)
 
 
 def displace(points: FloatArray, registration: FloatArray, centre: FloatArray) -> FloatArray:

@@ -82,9 +82,9 @@ VIEWS = (ATRIUM, SIDE)
 def iterates_figure(
     title: str,
     parameters: Sequence[str],
-    iterates: Sequence[Sequence[float]] | None,
-    std: Sequence[Sequence[float]] | None,
-    truth: Sequence[float] | None = None,
+    iterates: Sequence[Sequence[float | None]],
+    std: Sequence[Sequence[float | None]],
+    truth: Sequence[float | None] | None = None,
 ) -> Figure:
     """Each parameter against the iteration, with its band of two standard deviations and the truth.
 
@@ -103,7 +103,7 @@ def iterates_figure(
     """
     if not iterates:
         raise InputError(f"{title}: a run without iterates has nothing to draw")
-    m, s = np.array(iterates), np.array(std)
+    m, s = (np.array(values, dtype=np.float64) for values in (iterates, std))
     figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.subplots()
     rounds = np.arange(len(m))
@@ -112,8 +112,9 @@ def iterates_figure(
         low, high = (m[:, k] + side * 2 * s[:, k] for side in (-1, 1))
         axes.fill_between(rounds, low, high, color=colour, alpha=0.2, linewidth=0)
         axes.plot(rounds, m[:, k], color=colour, marker=MARKERS[k % len(MARKERS)], label=name)
-        if truth is not None:
-            axes.axhline(truth[k], color=colour, linestyle="--", linewidth=1)
+        known = None if truth is None else truth[k]
+        if known is not None:
+            axes.axhline(known, color=colour, linestyle="--", linewidth=1)
     axes.set_xlabel("iteration")
     units = {"MPa" for name in parameters if name.startswith("E_f.")}
     axes.set_ylabel(f"modulus [{units.pop()}]" if units else "parameter")

@@ -260,10 +260,9 @@ def _column(spec: Column | str) -> Column:
 
 
 def _plain_rows(rows: Iterable[Any] | DataFrame) -> list[dict[str, Any]]:
-    if hasattr(rows, "to_dict"):
-        rows = rows.to_dict("records")
+    given: Iterable[Any] = rows.to_dict("records") if hasattr(rows, "to_dict") else rows
     found = []
-    for row in rows:
+    for row in given:
         values = asdict(row) if is_dataclass(row) and not isinstance(row, type) else dict(row)
         found.append({str(name): _plain(value) for name, value in values.items()})
     return found

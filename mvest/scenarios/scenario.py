@@ -13,6 +13,7 @@ import scipy
 from mvest.closure.model import ClosureModel
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.forces.ties import TiedPoints
+from mvest.quantities import Length, Percent, Place, Pressure, Stiffness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Motion, Valve
 from mvest.valve.geometry.proximity import plane_section
@@ -39,8 +40,8 @@ class Annuloplasty:
         By how much the anteroposterior diameter becomes smaller; one of the two is 0.
     """
 
-    percent: float = 0.0
-    mm: float = 0.0
+    percent: Percent = 0.0
+    mm: Length = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.percent) and np.isfinite(self.mm)):
@@ -86,11 +87,11 @@ class Clip:
         N/mm of each pair.
     """
 
-    position_mm: float = 0.0
-    width_mm: float = 5.0
-    grasp_mm: float = 4.0
-    distance_mm: float | None = None
-    stiffness: float = 100.0
+    position_mm: Place = 0.0
+    width_mm: Length = 5.0
+    grasp_mm: Length = 4.0
+    distance_mm: Length | None = None
+    stiffness: Stiffness = 100.0
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.position_mm):
@@ -118,7 +119,7 @@ class Scenario:
     """
 
     title: str
-    pressure_mmHg: float | None = None
+    pressure_mmHg: Pressure | None = None
     annuloplasty: Annuloplasty | None = None
     clip: Clip | None = None
 

@@ -21,6 +21,20 @@ from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.errors import WhiteNoise
 from mvest.problem.registration import REGISTRATION, displace
+from mvest.quantities import (
+    Angle,
+    CellsAlong,
+    CellsAround,
+    Factor,
+    Length,
+    Logarithm,
+    Place,
+    PointsAlong,
+    PointsAround,
+    Pressure,
+    PressureError,
+    Share,
+)
 from mvest.simulation.world import World
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template
@@ -66,13 +80,13 @@ class Deviations:
         Of each component.
     """
 
-    pressure: float = 0.10
-    chord_rest_length: float = 0.02
-    chord_stiffness: float = 0.20
-    shift_mm: float = 1.0
-    turn_degrees: float = 2.0
-    pressure_offset_mmHg: float = 5.0
-    pressure_each_mmHg: float = 5.0
+    pressure: Logarithm = 0.10
+    chord_rest_length: Factor = 0.02
+    chord_stiffness: Factor = 0.20
+    shift_mm: Length = 1.0
+    turn_degrees: Angle = 2.0
+    pressure_offset_mmHg: PressureError = 5.0
+    pressure_each_mmHg: PressureError = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,22 +150,22 @@ class PatientSimulation:
     """
 
     element: str = "hex18"
-    columns: int = 72
-    rows: int = 8
-    dt_factor: float = 0.5
-    contact_columns: int = 168
-    contact_rows: int = 38
-    seen_columns: int = 80
-    seen_rows: int = 21
-    std_mm: float = 0.6
-    correlation_length_mm: float = 10.0
-    rough_std_mm: float = 0.0
-    rest_std_mm: float = 0.0
-    fitted_pressure_mmHg: tuple[float, ...] = ()
-    fitted_relaxation: tuple[float, ...] = ()
-    held_pressure_mmHg: tuple[float, ...] = (100.0, 80.0, 60.0)
-    held_relaxation: tuple[float, ...] = (0.15, 0.3, 0.45)
-    held_tips: tuple[float, float, float] = (0.0, 0.0, 2.0)
+    columns: CellsAround = 72
+    rows: CellsAlong = 8
+    dt_factor: Factor = 0.5
+    contact_columns: PointsAround = 168
+    contact_rows: PointsAlong = 38
+    seen_columns: PointsAround = 80
+    seen_rows: PointsAlong = 21
+    std_mm: Length = 0.6
+    correlation_length_mm: Length = 10.0
+    rough_std_mm: Length = 0.0
+    rest_std_mm: Length = 0.0
+    fitted_pressure_mmHg: tuple[Pressure, ...] = ()
+    fitted_relaxation: tuple[Share, ...] = ()
+    held_pressure_mmHg: tuple[Pressure, ...] = (100.0, 80.0, 60.0)
+    held_relaxation: tuple[Share, ...] = (0.15, 0.3, 0.45)
+    held_tips: tuple[Place, Place, Place] = (0.0, 0.0, 2.0)
     world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:

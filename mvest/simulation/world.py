@@ -20,6 +20,7 @@ from mvest.errors import InputError
 from mvest.mechanics.law.equivalent import as_stiff
 from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
+from mvest.quantities import Factor, Length, Share, Stretch
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -68,16 +69,16 @@ class World:
     """
 
     kernel: str = "matern"
-    length_factor: float = 1.0
-    annulus_mm: float = 0.0
-    tips_mm: float = 0.0
-    pressure_off: float = 0.0
-    thickness_off: float = 0.0
-    missing: float = 0.0
-    outliers: float = 0.0
-    outlier_mm: float = 4.0
+    length_factor: Factor = 1.0
+    annulus_mm: Length = 0.0
+    tips_mm: Length = 0.0
+    pressure_off: Share = 0.0
+    thickness_off: Share = 0.0
+    missing: Share = 0.0
+    outliers: Share = 0.0
+    outlier_mm: Length = 4.0
     exponential: Mapping[str, ExponentialTissue] = field(default_factory=dict)
-    prestretch: float = 1.0
+    prestretch: Stretch = 1.0
 
     def __post_init__(self) -> None:
         if self.kernel not in ("matern", *KERNELS):

@@ -6,16 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from experiments.common.schema import build, contents
+from experiments.common.schema import NOT_HASHED, build, contents
 from mvest.cases.folder import read_case
 from mvest.cases.paths import files_of_case
 from mvest.closure.model import ClosureModel
 from mvest.errors import ConfigurationError
 from mvest.provenance import config_hash
+from mvest.quantities import Share
 from mvest.scenarios.scenario import narrowed, plane_of
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template, TemplateParameters
@@ -28,7 +29,7 @@ from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
 __all__ = [
     "Anatomy",
-    "ValveFolderConfig",
+    "ValveFolder",
     "anatomy_of",
     "build_mesh",
     "folder_hash",
@@ -47,15 +48,15 @@ UNSTRUCTURED_SURFACE = (112, 29)
 """Vertices of the surface that an unstructured mesh fills, whatever is observed."""
 
 
-@dataclass
-class ValveFolderConfig:
+@dataclass(frozen=True, kw_only=True)
+class ValveFolder:
     """A case whose anatomy is taken instead of the template's."""
 
-    folder: str | None = None  # with case.yaml
+    folder: Annotated[str | None, NOT_HASHED] = None  # with case.yaml
     folder_sha256: str | None = "${valve_folder:}"  # of what lies there
     # Shortening of the anteroposterior diameter while the valve closes, of a case without a closed
     # frame; the papillary tips stay.
-    annulus_contraction: float = 0.0
+    annulus_contraction: Share = 0.0
 
 
 def folder_hash(folder: str | None) -> str | None:

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from experiments.common.schema import build
 from mvest.errors import ConfigurationError, InputError
 from mvest.estimation.estimate import Filter
-from mvest.estimation.filters.ensemble import EnsembleFilter
-from mvest.estimation.filters.extended import ExtendedFilter
-from mvest.estimation.filters.importance import ImportanceFilter
-from mvest.estimation.filters.iterated import IteratedFilter
-from mvest.estimation.filters.monte_carlo import MonteCarloFilter
-from mvest.estimation.filters.paper import PaperFilter
-from mvest.estimation.filters.unscented import UnscentedFilter
 from mvest.estimation.gaussian import Gaussian
 from mvest.estimation.transform import Identity, Log, Transform
 from mvest.mechanics.parameters import is_positive
+from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
 __all__ = ["as_numbers", "build_filter", "filter_of", "require_one_each"]
 
 Values = Mapping[str, Any]
-
-
-MODES = ("paper", "extended", "iterated", "unscented", "ensemble", "monte_carlo", "importance")
-"""Filters that a configuration can name."""
 
 
 def build_filter(
@@ -51,32 +40,26 @@ def build_filter(
         )
     transform = transforms[settings["transform"]]
     transform.forward(mean)
-    return filter_of(settings, mean), transform, prior
+    return filter_of(settings["method"]), transform, prior
 
 
-def filter_of(settings: Values, mean: FloatArray) -> Filter:
-    """The filter of the configured mode, for parameters with a prior mean ``(p,)``."""
-    tolerance, most = settings["tolerance"], settings["max_iterations"]
-    check = settings.get("check_runs", 0)
-    Q = _gaussian("filter.Q", mean, settings["Q"]).covariance
-    match settings["mode"]:
-        case "paper":
-            return PaperFilter(Q, tolerance, most, check_runs=check)
-        case "extended":
-            return ExtendedFilter(check_runs=check)
-        case "iterated":
-            return IteratedFilter(tolerance, max_iterations=most, check_runs=check)
-        case "unscented":
-            return UnscentedFilter(tolerance, most, settings["spread"], check_runs=check)
-        case "ensemble":
-            return build(EnsembleFilter, settings["ensemble"])
-        case "monte_carlo":
-            return build(MonteCarloFilter, settings["monte_carlo"])
-        case "importance":
-            return ImportanceFilter()
-    raise ConfigurationError(
-        f"filter.mode = {settings['mode']!r}, expected one of {', '.join(MODES)}"
-    )
+def filter_of(method: Values) -> Filter:
+    """The filter that ``_target_`` names, with its settings.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such filter, or a setting is none of its or inadmissible.
+    """
+    from hydra.utils import instantiate
+
+    if not str(method.get("_target_", "")).startswith("mvest."):
+        raise ConfigurationError("filter.method._target_: expected a filter of mvest")
+    try:
+        return cast(Filter, instantiate(dict(method), _convert_="all"))
+    except Exception as error:
+        # Hydra's own error, whose cause says what is wrong.
+        raise ConfigurationError(f"filter.method: {one_line(error.__cause__ or error)}") from error
 
 
 def require_one_each(name: str, values: FloatArray, parameters: tuple[str, ...]) -> None:

@@ -11,8 +11,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from experiments.common.config import NOT_THE_RESULT, hash_of, plain
-from experiments.common.ranges import require_in_range
+from experiments.common.config import hash_of, is_hashed, plain, require_in_range
 
 __all__ = ["Request", "as_published", "publish_as"]
 
@@ -35,7 +34,7 @@ class Request:
     Raises
     ------
     ConfigurationError
-        If a setting is outside its range (`experiments.common.ranges`).
+        If a setting is outside its range.
     """
 
     values: dict[str, Any]
@@ -87,15 +86,21 @@ def publish_as(
         What the experiment itself varies (empty: nothing), if this is one run of several.
     """
     # A sweep is published as a whole.
-    if not values["publish"] or values["sweep"] or not as_published(overrides, swept):
+    if (
+        not values["publish"]
+        or values["sweep"]
+        or not as_published(overrides, swept, values["study"])
+    ):
         return None
     if swept is None:
         return str(values["name"])
     return re.sub(r"[^a-z0-9]+", "-", f"{values['name']} {values['row']}".lower()).strip("-")
 
 
-def as_published(overrides: Sequence[str], swept: Mapping[str, Any] | None) -> bool:
+def as_published(
+    overrides: Sequence[str], swept: Mapping[str, Any] | None, study: str | None
+) -> bool:
     """Whether a run is its experiment as configured: nothing overridden that changes the result."""
-    allowed = {"experiment", *NOT_THE_RESULT, *(swept or {})}
+    allowed = {"experiment", "hydra", *(swept or {})}
     keys = (override.lstrip("+~").partition("=")[0] for override in overrides)
-    return all(key in allowed or key.partition(".")[0] in allowed for key in keys)
+    return all({key, key.partition(".")[0]} & allowed or not is_hashed(key, study) for key in keys)

@@ -204,7 +204,7 @@ def _as_configured(config: DictConfig) -> bool:
     task = config.hydra.overrides.task
     changed = [line for line in task if line.startswith("sweep.")]
     sized = all(line.startswith("sweep.size=") for line in changed)
-    return sized and as_published(task, None)
+    return sized and as_published(task, None, config.study)
 
 
 def _planned(request: Request, overrides: Sequence[str]) -> PlannedJob:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from experiments.common.ranges import range_of
+from experiments.common.schema import require_within
 from experiments.runner.jobs.interruption import raised
 from experiments.runner.planning.plan import PLAN
 from experiments.runner.tracking.store import open_store
@@ -30,6 +30,7 @@ from experiments.runner.tracking.summary import IS_SWEEP
 from experiments.runner.tracking.sync import jobs_in
 from mvest.errors import InputError, MvestError
 from mvest.processes import Program
+from mvest.quantities import within
 from mvest.reading.json_file import read_mapping
 
 __all__ = ["Comparison", "allowed_hosts", "last_comparison", "main", "serving"]
@@ -98,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--port", default=5000, type=int)
     given = parser.parse_args(arguments)
     try:
-        range_of("port").require("--port", given.port)
+        require_within("--port", given.port, within(0, 65_535, "", "ports; 0: a free one"))
         comparison = last_comparison(given.outputs)
         with raised(), serving(comparison.place, given.outputs, given.port) as (address, server):
             page = comparison.page(address)

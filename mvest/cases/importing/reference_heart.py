@@ -16,6 +16,7 @@ from mvest.cases.frames import MM_PER
 from mvest.cases.importing.papillary import HEAD_MM, papillary_tip
 from mvest.cases.surface_files import part_of
 from mvest.errors import InputError
+from mvest.quantities import Length, Share, Thickness
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
@@ -77,10 +78,10 @@ class ReferenceHeartOptions:
         enough.
     """
 
-    smoothing_mm: float = 4.0
-    min_thickness_mm: float = 0.3
-    max_thickness_mm: float = 3.0
-    closed_depth: float = 0.5
+    smoothing_mm: Length = 4.0
+    min_thickness_mm: Thickness = 0.3
+    max_thickness_mm: Thickness = 3.0
+    closed_depth: Share = 0.5
 
     def __post_init__(self) -> None:
         if not 0 <= self.smoothing_mm <= 10:

@@ -9,6 +9,7 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.mechanics.settings import smooth_step
 from mvest.mechanics.steps import Step
+from mvest.quantities import BeatTime, Pressure, TimeStep
 
 __all__ = ["CycleProtocol"]
 
@@ -38,12 +39,12 @@ class CycleProtocol:
         s at which the valve is looked at, strictly increasing from >= 0; the run ends at the last.
     """
 
-    pressure_mmHg: float = 120.0
-    rise: float = 0.3
-    hold: float = 0.2
-    fall: float = 0.3
-    dt: float = 0.00625
-    times: tuple[float, ...] = field(default=DEFAULT_TIMES)
+    pressure_mmHg: Pressure = 120.0
+    rise: BeatTime = 0.3
+    hold: BeatTime = 0.2
+    fall: BeatTime = 0.3
+    dt: TimeStep = 0.00625
+    times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.dt) and self.dt > 0):

@@ -17,6 +17,7 @@ from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import landmark_vertices
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
+from mvest.quantities import Count, Length, Weight
 from mvest.typing import FloatArray, IntArray
 
 __all__ = [
@@ -56,11 +57,11 @@ class FitSettings:
         Of the free displacement at the end, see :func:`mvest.imaging.detection.fit.relax`.
     """
 
-    modes: tuple[int, ...] = (14, 25, 40)
-    reach_mm: tuple[float, ...] = (6.0, 4.0, 3.0)
-    alike: float = 8.0
-    stiffness: float = 4.0
-    hold: float = 0.3
+    modes: tuple[Count, ...] = (14, 25, 40)
+    reach_mm: tuple[Length, ...] = (6.0, 4.0, 3.0)
+    alike: Weight = 8.0
+    stiffness: Weight = 4.0
+    hold: Weight = 0.3
 
 
 CANDIDATES = 40

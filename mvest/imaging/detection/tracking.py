@@ -35,6 +35,7 @@ from mvest.imaging.detection.trained_model import DetectionModel
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE, ValveSequence
 from mvest.imaging.volume import VolumeSequence
+from mvest.quantities import BeatTime, Count, Length, Share, Speed
 from mvest.typing import BoolArray, FloatArray
 
 __all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve"]
@@ -74,13 +75,13 @@ class TrackingSettings:
     fit : FitSettings
     """
 
-    hypotheses: int = 3
-    shared: int = 3
-    speed_mm_s: float = 60.0
-    still_mm: float = 2.0
-    smoothing_s: tuple[float, float, float] = (0.06, 0.015, 0.06)
-    min_confidence: float = MIN_CONFIDENCE
-    lost_by: float = 0.2
+    hypotheses: Count = 3
+    shared: Count = 3
+    speed_mm_s: Speed = 60.0
+    still_mm: Length = 2.0
+    smoothing_s: tuple[BeatTime, BeatTime, BeatTime] = (0.06, 0.015, 0.06)
+    min_confidence: Share = MIN_CONFIDENCE
+    lost_by: Share = 0.2
     fit: FitSettings = field(default_factory=FitSettings)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mvest.errors import InputError
 from mvest.imaging.learning.tree_text import checked_trees
+from mvest.quantities import Count, Processes, Share
 from mvest.typing import FloatArray
 
 __all__ = ["BoostSettings", "Boosters", "train_boosters"]
@@ -33,13 +34,13 @@ class BoostSettings:
     threads : int
     """
 
-    trees: int = 80
-    leaves: int = 24
-    rate: float = 0.12
-    min_leaf_samples: int = 40
-    share_features: float = 0.25
-    share_rows: float = 0.7
-    threads: int = 1
+    trees: Count = 80
+    leaves: Count = 24
+    rate: Share = 0.12
+    min_leaf_samples: Count = 40
+    share_features: Share = 0.25
+    share_rows: Share = 0.7
+    threads: Processes = 1
 
     def parameters(self, objective: str, seed: int) -> dict[str, Any]:
         """LightGBM's names for them."""

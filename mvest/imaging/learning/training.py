@@ -42,6 +42,7 @@ from mvest.imaging.simulator.probe import draw_probe
 from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
 from mvest.imaging.volume import VolumeSequence
 from mvest.processes import side_by_side
+from mvest.quantities import Count
 from mvest.typing import FloatArray
 
 __all__ = [
@@ -73,14 +74,14 @@ Samples: TypeAlias = Mapping[str, tuple[NDArray[np.float32], NDArray[np.float32]
 class SampleCounts:
     """Samples taken of one volume for each stage."""
 
-    position: int = 160
-    pose_rating: int = 120
-    pose_refinement: int = 70
-    shape: int = 60
-    landmark: int = 50
-    rim: int = 240
-    boundary: int = 720
-    mistaken: int = 30
+    position: Count = 160
+    pose_rating: Count = 120
+    pose_refinement: Count = 70
+    shape: Count = 60
+    landmark: Count = 50
+    rim: Count = 240
+    boundary: Count = 720
+    mistaken: Count = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +106,12 @@ class TrainingSettings:
         About which the renderings vary.
     """
 
-    modes: int = 40
+    modes: Count = 40
     samples: SampleCounts = field(default_factory=SampleCounts)
     boosting: BoostSettings = field(default_factory=BoostSettings)
-    many_trees: int = 130
-    volumes: int = 480
-    draft_volumes: int = 60
+    many_trees: Count = 130
+    volumes: Count = 480
+    draft_volumes: Count = 60
     acquisition: Acquisition = field(default_factory=Acquisition)
 
 

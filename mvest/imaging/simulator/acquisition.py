@@ -10,6 +10,17 @@ import math
 from dataclasses import dataclass, fields
 
 from mvest.errors import InputError
+from mvest.quantities import (
+    Angle,
+    AxisCount,
+    Count,
+    Decibel,
+    Factor,
+    Frequency,
+    Length,
+    Share,
+    Weight,
+)
 
 __all__ = ["SMALL", "SPEED_OF_SOUND", "Acquisition"]
 
@@ -76,41 +87,41 @@ class Acquisition:
         If a setting is not finite or has no meaning.
     """
 
-    frequency_mhz: float = 5.0
-    axial_mm: float = 0.9
-    lateral_deg: float = 1.9
-    elevation_deg: float = 2.4
-    side_lobe_db: float = -28.0
-    azimuth_deg: float = 84.0
-    elevation_span_deg: float = 76.0
-    depth_mm: tuple[float, float] = (4.0, 116.0)
-    dynamic_range_db: float = 50.0
-    gain_db: float = 0.0
-    attenuation_db_per_cm_mhz: float = 0.5
-    blood_attenuation_db_per_cm_mhz: float = 0.15
-    compensation_db_per_cm_mhz: float = 0.17
-    shadow_db_per_cm: float = 20.0
-    angle_exponent: float = 1.5
-    angle_floor_db: float = -22.0
-    dropout: float = 0.1
-    dropout_db: float = -20.0
-    blood_db: float = -49.0
-    electronics_db: float = -63.0
-    haze_db: float = -22.0
-    haze_mm: float = 7.0
-    contact_db: float = 2.0
-    wall_db: float = -17.0
-    leaflet_db: float = -3.0
-    annulus_db: float = -3.0
-    chord_db: float = -9.0
-    papillary_db: float = -18.0
-    vessel_db: float = -10.0
-    beats: int = 4
-    beat_shift_mm: float = 0.4
-    beat_turn_deg: float = 0.5
-    scatterers_per_cell: float = 10.0
-    voxel_mm: float = 0.7
-    shape: tuple[int, int, int] = (160, 128, 160)
+    frequency_mhz: Frequency = 5.0
+    axial_mm: Length = 0.9
+    lateral_deg: Angle = 1.9
+    elevation_deg: Angle = 2.4
+    side_lobe_db: Decibel = -28.0
+    azimuth_deg: Angle = 84.0
+    elevation_span_deg: Angle = 76.0
+    depth_mm: tuple[Length, Length] = (4.0, 116.0)
+    dynamic_range_db: Decibel = 50.0
+    gain_db: Decibel = 0.0
+    attenuation_db_per_cm_mhz: Decibel = 0.5
+    blood_attenuation_db_per_cm_mhz: Decibel = 0.15
+    compensation_db_per_cm_mhz: Decibel = 0.17
+    shadow_db_per_cm: Decibel = 20.0
+    angle_exponent: Factor = 1.5
+    angle_floor_db: Decibel = -22.0
+    dropout: Share = 0.1
+    dropout_db: Decibel = -20.0
+    blood_db: Decibel = -49.0
+    electronics_db: Decibel = -63.0
+    haze_db: Decibel = -22.0
+    haze_mm: Length = 7.0
+    contact_db: Decibel = 2.0
+    wall_db: Decibel = -17.0
+    leaflet_db: Decibel = -3.0
+    annulus_db: Decibel = -3.0
+    chord_db: Decibel = -9.0
+    papillary_db: Decibel = -18.0
+    vessel_db: Decibel = -10.0
+    beats: Count = 4
+    beat_shift_mm: Length = 0.4
+    beat_turn_deg: Angle = 0.5
+    scatterers_per_cell: Weight = 10.0
+    voxel_mm: Length = 0.7
+    shape: tuple[AxisCount, AxisCount, AxisCount] = (160, 128, 160)
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -21,6 +21,16 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.valve_system import HeldState
+from mvest.quantities import (
+    BeatTime,
+    CellsAlong,
+    CellsAround,
+    Count,
+    PointsAlong,
+    PointsAround,
+    Share,
+    Tolerance,
+)
 from mvest.simulation.motion.refusal import MotionLimits, Refusal, RefusedError, check_motion
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.template import Template
@@ -70,19 +80,19 @@ class MotionSettings:
     limits : MotionLimits
     """
 
-    columns: int = 64
-    rows: int = 15
+    columns: PointsAround = 64
+    rows: PointsAlong = 15
     element: str = "hex18"
-    mesh_columns: int = 24
-    mesh_rows: int = 3
-    contact_columns: int = 72
-    contact_rows: int = 16
-    steps: int = 24
-    tolerance: float = 1e-2
-    frames: int = 8
-    held_pressure: tuple[float, ...] = (0.8, 0.55, 0.35)
-    held_relaxation: tuple[float, ...] = (0.15, 0.35, 0.55)
-    duration: float = 0.35
+    mesh_columns: CellsAround = 24
+    mesh_rows: CellsAlong = 3
+    contact_columns: PointsAround = 72
+    contact_rows: PointsAlong = 16
+    steps: Count = 24
+    tolerance: Tolerance = 1e-2
+    frames: Count = 8
+    held_pressure: tuple[Share, ...] = (0.8, 0.55, 0.35)
+    held_relaxation: tuple[Share, ...] = (0.15, 0.35, 0.55)
+    duration: BeatTime = 0.35
     limits: MotionLimits = field(default_factory=MotionLimits)
 
     def __post_init__(self) -> None:

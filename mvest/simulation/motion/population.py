@@ -18,6 +18,7 @@ from mvest.imaging.moving_valve import MovingValve
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.processes import side_by_side
 from mvest.provenance import config_hash
+from mvest.quantities import Factor, Length, Logarithm
 from mvest.simulation.motion.closing import MotionSettings, close_in_motion
 from mvest.simulation.motion.refusal import RefusedError
 from mvest.typing import FloatArray
@@ -57,15 +58,15 @@ class PopulationSettings:
     """
 
     motion: MotionSettings = field(default_factory=MotionSettings)
-    scale: tuple[float, float] = (1.0, 1.5)
+    scale: tuple[Factor, Factor] = (1.0, 1.5)
     moduli: Mapping[str, float] = field(
         default_factory=lambda: {"E_f.anterior": 6.23, "E_f.posterior": 2.09}
     )
-    moduli_spread: float = 0.35
-    pressure_spread: float = 0.12
-    chord_rest_length_spread: float = 0.015
-    duration_spread: float = 0.15
-    tip_motion: tuple[float, float] = (1.0, 3.0)
+    moduli_spread: Logarithm = 0.35
+    pressure_spread: Logarithm = 0.12
+    chord_rest_length_spread: Logarithm = 0.015
+    duration_spread: Logarithm = 0.15
+    tip_motion: tuple[Length, Length] = (1.0, 3.0)
 
     def __post_init__(self) -> None:
         for name in ("scale", "tip_motion"):

@@ -9,6 +9,7 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.imaging.moving_valve import MovingValve
+from mvest.quantities import Count, Factor, Place
 from mvest.valve.geometry.proximity import intersecting_triangles
 from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.annulus import annulus_plane
@@ -64,11 +65,11 @@ class MotionLimits:
         Pairs of intersecting triangles in any frame. The layout is finer than contact is sampled.
     """
 
-    orifice: float = 0.15
-    edge_gap: float = 7.0
-    edge_height: float = 0.0
-    stretch: float = 1.6
-    crossings: int = 4
+    orifice: Factor = 0.15
+    edge_gap: Place = 7.0
+    edge_height: Place = 0.0
+    stretch: Factor = 1.6
+    crossings: Count = 4
 
     def __post_init__(self) -> None:
         if not (

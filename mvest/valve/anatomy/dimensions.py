@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from mvest.errors import InputError
+from mvest.quantities import Angle, Factor, Length, Place, Share, Stiffness, Thickness
 
 __all__ = [
     "AnnulusDimensions",
@@ -45,13 +46,13 @@ class AnnulusDimensions:
         Shares by which the annulus shrinks until the valve is closed.
     """
 
-    commissural_half_axis: float = 18.0
-    anteroposterior_half_axis: float = 14.0
-    saddle_height: float = 6.5
-    anterior_flattening: float = 0.08
-    commissure_angle: float = 19.6
-    commissural_contraction: float = 0.008
-    anteroposterior_contraction: float = 0.064
+    commissural_half_axis: Length = 18.0
+    anteroposterior_half_axis: Length = 14.0
+    saddle_height: Place = 6.5
+    anterior_flattening: Share = 0.08
+    commissure_angle: Angle = 19.6
+    commissural_contraction: Share = 0.008
+    anteroposterior_contraction: Share = 0.064
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +69,9 @@ class LeafletDimensions:
         Power of the sine with which the length falls off towards the commissures.
     """
 
-    length: float
-    thickness: float
-    length_exponent: float = 1.2
+    length: Length
+    thickness: Thickness
+    length_exponent: Factor = 1.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +94,10 @@ class LeafletPair:
 
     anterior: LeafletDimensions = LeafletDimensions(24.0, 1.32)
     posterior: LeafletDimensions = LeafletDimensions(18.8, 1.26)
-    commissural_length: float = 11.0
-    belly_depth: float = 0.04
-    edge_thinning: float = 0.75
-    fibre_turn: float = 0.23
+    commissural_length: Length = 11.0
+    belly_depth: Share = 0.04
+    edge_thinning: Share = 0.75
+    fibre_turn: Angle = 0.23
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +116,11 @@ class FreeEdge:
         1 gives half ellipses, 2 parabolas that meet at an angle.
     """
 
-    half_width: float = 15.5
-    commissural_y: float = 1.83
-    anterior_depth: float = 6.5
-    posterior_depth: float = 10.5
-    exponent: float = 2.0
+    half_width: Length = 15.5
+    commissural_y: Place = 1.83
+    anterior_depth: Place = 6.5
+    posterior_depth: Place = 10.5
+    exponent: Factor = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +135,10 @@ class ClosedEdge:
     half_width, sag, middle_z, drop : float
     """
 
-    half_width: float = 13.0
-    sag: float = 7.19
-    middle_z: float = -10.9
-    drop: float = 3.4
+    half_width: Length = 13.0
+    sag: Place = 7.19
+    middle_z: Place = -10.9
+    drop: Place = 3.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +155,8 @@ class PapillaryPlace:
         they are only never taut in the open valve.
     """
 
-    tip: tuple[float, float, float] = (16.0, -0.24, -25.0)
-    displacement: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tip: tuple[Place, Place, Place] = (16.0, -0.24, -25.0)
+    displacement: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,17 +189,17 @@ class ChordLayout:
         If there is no chord, a place is incomplete, a range is empty or a factor not positive.
     """
 
-    marginal_phi: tuple[float, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
-    basal: tuple[tuple[float, float], ...] = ((-60.0, 0.5), (50.0, 0.55), (75.0, 0.55))
-    marginal_s: float = 0.97
-    marginal_stiffness: float = 20.0
-    basal_stiffness: float = 16.0
-    marginal_slack: float = 0.985
-    basal_slack: float = 1.03
-    open_slack: float = 1.035
-    toe_strain: float = 0.015
-    elongated: tuple[tuple[float, float, float], ...] = ()
-    absent: tuple[tuple[float, float], ...] = ()
+    marginal_phi: tuple[Angle, ...] = tuple(np.linspace(-87.0, 88.0, 14).round(3).tolist())
+    basal: tuple[tuple[Angle, Angle], ...] = ((-60.0, 0.5), (50.0, 0.55), (75.0, 0.55))
+    marginal_s: Share = 0.97
+    marginal_stiffness: Stiffness = 20.0
+    basal_stiffness: Stiffness = 16.0
+    marginal_slack: Factor = 0.985
+    basal_slack: Factor = 1.03
+    open_slack: Factor = 1.035
+    toe_strain: Share = 0.015
+    elongated: tuple[tuple[Angle, Angle, Angle], ...] = ()
+    absent: tuple[tuple[Angle, Angle], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.marginal_phi and not self.basal:

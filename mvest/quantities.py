@@ -1,0 +1,88 @@
+"""Types of settings: each is a number with its unit and its admissible range.
+
+A setting states its range where it is declared, by its type: ``length: Length = 20.0``. pydantic
+and `experiments.common.schema` read it there; to everything else the type is a float or an int.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import Field
+
+
+def within(low: float, high: float, unit: str, why: str) -> Any:
+    """The range of a type of settings; both ends are admissible."""
+    return Field(ge=low, le=high, description=f"{unit}; {why}" if unit else why)
+
+
+# Meshes and points.
+PointsAround: TypeAlias = Annotated[int, within(3, 1000, "", "points around the valve")]
+PointsAlong: TypeAlias = Annotated[int, within(2, 500, "", "points from annulus to free edge")]
+CellsAround: TypeAlias = Annotated[int, within(1, 400, "", "cells around the valve")]
+CellsAlong: TypeAlias = Annotated[int, within(1, 60, "", "cells from annulus to free edge")]
+Layers: TypeAlias = Annotated[int, within(1, 16, "", "cells through the thickness")]
+AxisCount: TypeAlias = Annotated[int, within(1, 1000, "", "cells, points or voxels of an axis")]
+Refinement: TypeAlias = Annotated[
+    int, within(1, 4, "", "each doubling takes eight times the memory")
+]
+EdgeLength: TypeAlias = Annotated[float, within(0.1, 20, "mm", "edges of cells of a leaflet")]
+
+# Geometry.
+Length: TypeAlias = Annotated[float, within(0, 1000, "mm", "sizes and distances in a body")]
+Place: TypeAlias = Annotated[float, within(-1000, 1000, "mm", "coordinates in a body")]
+Thickness: TypeAlias = Annotated[float, within(0.01, 10, "mm", "no leaflet is thicker")]
+Thicknesses: TypeAlias = Annotated[float, within(0, 20, "", "multiples of the thickness")]
+Angle: TypeAlias = Annotated[float, within(-360, 360, "degrees", "once around")]
+Speed: TypeAlias = Annotated[float, within(0, 10_000, "mm/s", "no leaflet is faster")]
+
+# Loads and times.
+Pressure: TypeAlias = Annotated[
+    float, within(-100, 500, "mmHg", "no heart makes more; a negative one opens the valve")
+]
+PressureError: TypeAlias = Annotated[float, within(0, 100, "mmHg", "errors of pressures")]
+BeatTime: TypeAlias = Annotated[float, within(0, 60, "s", "times within heartbeats")]
+TimeStep: TypeAlias = Annotated[float, within(1e-5, 10, "s", "time steps of a beat")]
+
+# Tissue and forces.
+Modulus: TypeAlias = Annotated[
+    float, within(1e-6, 10_000, "MPa", "from 1 Pa, softer than any gel, to what bone has")
+]
+LawExponent: TypeAlias = Annotated[
+    float, within(0, 100_000, "", "exponents of the exponential law, in a list with its scale")
+]
+Ratio: TypeAlias = Annotated[float, within(0.001, 1000, "", "one modulus over another")]
+Stiffening: TypeAlias = Annotated[float, within(0, 1e6, "", "one law over another")]
+Stretch: TypeAlias = Annotated[float, within(0, 5, "", "no leaflet is stretched to five times")]
+PoissonRatio: TypeAlias = Annotated[float, within(-1, 0.4999, "", "stable and compressible")]
+Stiffness: TypeAlias = Annotated[
+    float, within(0, 100_000, "N, N/mm or N/mm²", "far stiffer than what it holds")
+]
+Density: TypeAlias = Annotated[float, within(1e-12, 1e-7, "t/mm³", "water has 1e-9")]
+DampingRate: TypeAlias = Annotated[float, within(0, 1000, "1/s or s", "more stops all motion")]
+
+# Statistics and numerics.
+Share: TypeAlias = Annotated[float, within(0, 1, "", "shares of a whole")]
+Percent: TypeAlias = Annotated[float, within(0, 1000, "%", "shares of a whole, and their errors")]
+Factor: TypeAlias = Annotated[float, within(0, 100, "", "factors and exponents")]
+Weight: TypeAlias = Annotated[float, within(0, 1000, "", "weights and densities")]
+Logarithm: TypeAlias = Annotated[
+    float, within(-10, 10, "", "logarithms and standard normal numbers")
+]
+Tolerance: TypeAlias = Annotated[float, within(1e-15, 1, "", "relative tolerances and steps")]
+Value: TypeAlias = Annotated[float, within(-1e12, 1e12, "", "in the units of any model")]
+Values: TypeAlias = Annotated[Any, within(-1e12, 1e12, "", "in the units of any model")]
+Count: TypeAlias = Annotated[int, within(0, 100_000, "", "things that each take their time")]
+Degree: TypeAlias = Annotated[int, within(0, 20, "", "of polynomials; beyond, all is round-off")]
+Halvings: TypeAlias = Annotated[int, within(0, 60, "", "of a step; then nothing is left of it")]
+Repeats: TypeAlias = Annotated[int, within(1, 100_000, "", "observations to estimate from")]
+Seed: TypeAlias = Annotated[int, within(0, 2**32 - 1, "", "what random generators take")]
+
+# The simulated scanner.
+Decibel: TypeAlias = Annotated[float, within(-200, 200, "dB", "levels, also per cm and MHz")]
+Frequency: TypeAlias = Annotated[float, within(0.1, 100, "MHz", "ultrasound")]
+
+# Machines.
+Processes: TypeAlias = Annotated[int, within(1, 1024, "", "processes of one machine")]
+TimeLimit: TypeAlias = Annotated[float, within(0.01, 2_592_000, "s", "up to 30 days")]
+Gigabytes: TypeAlias = Annotated[float, within(0.1, 100_000, "GB", "more than any machine has")]
