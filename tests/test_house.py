@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import mvest
+from experiments.common.study import study_names
 from tests.places import ROOT
 
 LEAVES = (
@@ -28,6 +29,7 @@ LEAVES = (
     "mvest.processes",
     "mvest.units",
     "mvest.typing",
+    "mvest.quantities",
     "mvest.elements",
     "mvest.source",
 )
@@ -49,6 +51,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "mvest._keeper": (),
     "mvest.units": LEAVES,
     "mvest.typing": LEAVES,
+    "mvest.quantities": LEAVES,
     "mvest.elements": LEAVES,
     "mvest.provenance": LEAVES,
     "mvest.source": LEAVES,
@@ -118,6 +121,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.imaging",
         "mvest.estimation",
         "mvest.problem.verdict",
+        "mvest.problem.record",
     ),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
@@ -125,6 +129,8 @@ NEVER_IN_EXPERIMENTS = ("tests",)
 STUDIES, IN_COMMON = "experiments.studies", "experiments.common"
 """A study's room imports of the experiments itself and what all have in common, no other study."""
 RUNNER = "experiments.runner"
+ORDINARY_WORDS = {"case", "volume", "closure", "external", "filters", "patient"}
+"""Names of studies that are also parts of a configuration, or words."""
 RUNNER_ROOMS = ("jobs", "planning", "collecting", "tracking", "execution")
 """In the runner a room imports none that comes after it; what lies in none of them comes last."""
 
@@ -277,10 +283,10 @@ def test_conf_is_data() -> None:
         ("mvest.problem.estimate", "import tests.test_house"),
         ("experiments.run", "from tests.valve import shapes"),
         # A study knows no other, nor what runs or publishes it.
-        ("experiments.studies.a.study", "from experiments.studies.ab.report import words"),
-        ("experiments.studies.a.study", "def f():\n    import experiments.runner.execution.job"),
-        ("experiments.studies.a.report", "from experiments.results.keep import publish"),
-        ("experiments.studies.a.report", "from experiments import studies"),
+        ("experiments.studies.a", "from experiments.studies.ab import STUDY"),
+        ("experiments.studies.a", "def f():\n    import experiments.runner.execution.job"),
+        ("experiments.studies.a", "from experiments.results.keep import publish"),
+        ("experiments.studies.a", "from experiments import studies"),
         # What a job is does not depend on how jobs are run or logged.
         ("experiments.runner.jobs.folder", "from experiments.runner.tracking import store"),
         ("experiments.runner.execution.job", "def f():\n    import experiments.runner.sweep"),
@@ -317,7 +323,7 @@ def test_a_wrong_import_is_seen(module: str, source: str) -> None:
         ("experiments.run", "import hydra, mlflow\nfrom mvest.problem.problem import Problem"),
         (
             "experiments.studies.a.study",
-            "from experiments.common.study import Study\nfrom experiments.studies.a import report",
+            "from experiments.common.study import Study\nfrom experiments.studies.a import part",
         ),
         ("experiments.runner.execution.job", "from experiments.runner.tracking import store"),
         # A name that only begins alike is another package.
@@ -384,6 +390,37 @@ def test_nothing_in_the_house_goes_through_a_lazy_face() -> None:
 )
 def test_a_name_from_a_face_is_seen(source: str, count: int) -> None:
     assert len(through_faces(source, "mvest.x", {"mvest.estimation": {"Gaussian"}})) == count
+
+
+def test_common_and_runner_name_no_study() -> None:
+    # A study is found by being there: what studies share and what runs them knows none by name.
+    names = study_names()
+    assert "twin" in names
+    found = [
+        f"{module}: {node.value!r}"
+        for module, path in modules("experiments")
+        if within(module, IN_COMMON) or within(module, RUNNER)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in set(names) - ORDINARY_WORDS
+    ]
+    assert found == []
+
+
+def test_what_table_1_needs_is_small() -> None:
+    """Lines of all modules that a run of the study of Table 1 loads, its figures included."""
+    code = (
+        "import sys\nimport experiments.run\nfrom experiments.runner.execution import job\n"
+        "from experiments.common.study import load_study\nload_study('twin')\n"
+        "import mvest.reporting.case.figures\n"
+        "print(*(m.__file__ for n, m in sorted(sys.modules.items())"
+        " if n.partition('.')[0] in ('mvest', 'experiments') and m.__file__), sep='\\n')"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    paths = [Path(line) for line in said.splitlines()]
+    assert ROOT / "experiments" / "studies" / "twin.py" in paths
+    assert sum(path.read_text(encoding="utf-8").count("\n") for path in paths) <= 25_000
 
 
 # --- names --------------------------------------------------------------------------------------
