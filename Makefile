@@ -75,7 +75,7 @@ bench: $(DEVELOP) ## how fast: kernels, closures, Table 1, other libraries (BENC
 	$(BIN)/python -m tests.benchmark.peers outputs/peers.json
 	$(BIN)/python -m tests.benchmark.profile outputs/profile.json
 	$(BIN)/python -m tests.benchmark.startup outputs/startup.json
-	$(BIN)/python -m experiments.results.benchmark outputs/benchmark.json outputs/benchmark_batch.json \
+	$(BIN)/python -m tests.benchmark.report outputs/benchmark.json outputs/benchmark_batch.json \
 		outputs/benchmark_2_threads.json outputs/peers.json outputs/profile.json \
 		outputs/startup.json
 

@@ -33,7 +33,6 @@ COMMANDS = {
     "export": "a case or a result for another program: export NAME SOURCE TARGET",
     "tables": "every table and figure of results/ anew, from the records that are kept there",
     "table": "all estimates of a folder as one table for statistics: table outputs estimates.csv",
-    "crate": "provenance of a folder of results as an RO-Crate, one JSON file in it",
     "worker": "a share of a planned sweep's jobs, under any scheduler: worker FOLDER --shard 2/8",
     "collect": "what became of the jobs of a sweep that others ran",
     "dashboard": "MLflow's pages, on the comparison of the last sweep",
@@ -83,8 +82,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return tables([parser.parse_args(rest).folder])
         case "table":
             return _table(rest)
-        case "crate":
-            return _crate(rest)
         case "worker":
             return _worker(rest)
         case "collect":
@@ -119,20 +116,6 @@ def _table(rest: list[str]) -> int:
     parsed = parser.parse_args(rest)
     try:
         print(*write_estimates(parsed.folder, parsed.target), sep="\n")
-    except MvestError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-def _crate(rest: list[str]) -> int:
-    """Describe what made the results in a folder."""
-    from experiments.runner.collecting.crate import write_crate
-
-    parser = Parser("mvest crate", description=COMMANDS["crate"])
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, or results/")
-    try:
-        print(write_crate(parser.parse_args(rest).folder))
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

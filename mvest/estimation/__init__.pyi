@@ -22,7 +22,6 @@ from .information.consistency import Consistency as Consistency
 from .information.consistency import ZTest as ZTest
 from .information.consistency import chi_square_band as chi_square_band
 from .information.consistency import consistency as consistency
-from .information.consistency import lag_one_autocorrelation as lag_one_autocorrelation
 from .information.consistency import moran as moran
 from .information.consistency import nees as nees
 from .information.consistency import zero_mean as zero_mean

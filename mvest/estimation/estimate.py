@@ -232,11 +232,6 @@ class Estimate:
         return _std(self.iterate_covariances)
 
     @property
-    def transformed_iterate_std(self) -> FloatArray:
-        """Standard deviations at each iterate in filter coordinates (k, p)."""
-        return _std(self.transformed_iterate_covariances)
-
-    @property
     def mean(self) -> FloatArray:
         """Estimated parameters (p,)."""
         return self.transform.inverse(self.transformed_iterates[-1])

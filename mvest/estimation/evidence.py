@@ -38,7 +38,7 @@ from mvest.estimation.noise_family import (
 )
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Evidence", "LearnedNoise", "LearnedQuantity", "NoiseLearner", "learn_noise"]
+__all__ = ["Evidence", "LearnedNoise", "LearnedQuantity", "NoiseLearner"]
 
 TOLERANCE = 1e-3
 """Slope of the evidence, per standard deviation of the prior, at which it is greatest."""
@@ -132,7 +132,15 @@ class NoiseLearner:
         self._posterior: _Posterior | None = None
 
     def learn(self, innovation: FloatArray, B: FloatArray) -> ObservationNoise:
-        """The noise at the mean of what is known of it; see `learn_noise`."""
+        """The noise at the mean of what is known of it.
+
+        Parameters
+        ----------
+        innovation : (n,)
+            e.
+        B : (n, p)
+            H L, with the prior's covariance P = L Lᵀ.
+        """
         self._evidence = Evidence.of(self.family, innovation, B)
         start = None if self._posterior is None else self._posterior.mode
         self._posterior = self._evidence.posterior(start)
@@ -159,26 +167,6 @@ class _Posterior:
     mean: FloatArray
     spread: FloatArray
     log_determinant: float
-
-
-def learn_noise(
-    family: NoiseFamily, innovation: FloatArray, B: FloatArray, L: FloatArray | None = None
-) -> LearnedNoise:
-    """The most probable noise of a linear model, and what is known of it.
-
-    Parameters
-    ----------
-    family : NoiseFamily
-    innovation : (n,)
-        e.
-    B : (n, p)
-        H L, with the prior's covariance P = L Lᵀ.
-    L : (p, p), optional
-        Default the unit matrix.
-    """
-    learner = NoiseLearner(family)
-    learner.learn(innovation, B)
-    return learner.learned(np.eye(B.shape[1]) if L is None else L)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +206,7 @@ class Evidence:
 
     @classmethod
     def of(cls, family: NoiseFamily, innovation: FloatArray, B: FloatArray) -> Evidence:
-        """Project an innovation ``(n,)`` and B ``(n, p)``, see `learn_noise`."""
+        """Project an innovation ``(n,)`` and B ``(n, p)``, see `NoiseLearner.learn`."""
         added, start = [], B.shape[1]
         for k, columns in enumerate(family.columns, len(family.names) - len(family.columns)):
             added.append((k, slice(start, start + columns.columns.shape[1])))
@@ -357,7 +345,7 @@ class Evidence:
         return e, B, root, scipy.linalg.cho_solve((root, True), B.T @ e, check_finite=False)
 
     def learned(self, posterior: _Posterior, L: FloatArray) -> LearnedNoise:
-        """What is known of the noise, in a reader's terms; L as in `learn_noise`."""
+        """What is known of the noise, in a reader's terms; L as in `NoiseLearner.learned`."""
         u, h, p = posterior.mean, self.prior.size, len(L)
         P = self.update(self.log(u), p)[1]
         more = np.zeros((p, p))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mvest.closure.batch import predict_many
-from tests.benchmark.valves import VALUES, model
+from mvest.processes import side_by_side
+from tests.benchmark.valves import VALUES, model, predictions
 
 CLOSURES = 8
 
@@ -15,11 +15,12 @@ def test_batch(measure, processes):
     values = VALUES * np.linspace(0.95, 1.05, CLOSURES)[:, None]
 
     def run():
-        return predict_many(valve, values, processes=processes)
+        calls = ((valve.fresh(), values[k::processes]) for k in range(processes))
+        return [p for share in side_by_side(predictions, calls, processes) for p in share]
 
     # The first round, not counted, starts the processes; a study does so once. Building the
     # mechanics in each process is part of a batch.
-    predictions = measure(
+    found = measure(
         run,
         rounds=1,
         warmup=1,
@@ -28,4 +29,4 @@ def test_batch(measure, processes):
         points=CLOSURES,
         threads=processes,
     )
-    assert all(p.converged for p in predictions)
+    assert all(p.converged for p in found)

@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments.common.building.anatomy import guide_of
 from mvest.closure.model import ClosureModel
+from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
@@ -131,3 +132,8 @@ def close(case: Closed, wanted: tuple[Parameter, ...]) -> Simulation:
     )
     assert simulation.converged, simulation.reason.value
     return simulation
+
+
+def predictions(valve: ClosureModel, values: FloatArray) -> list[Prediction]:
+    """One after another, each from where the one before ended."""
+    return [valve(m) for m in values]

@@ -9,12 +9,12 @@ import pytest
 
 import mvest.source
 from mvest.closure.anchors import Anchors, Kept, content_digest
-from mvest.closure.batch import predict_many
 from mvest.closure.coordinates import Coordinates
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.mechanics.settings import ModulusField
 from mvest.mechanics.steps import StepReason
+from mvest.processes import side_by_side
 from mvest.source import SOURCES, Sources
 from tests.closure.test_model import AT, CLOSING, GENTLE, MODULI, OPEN, TINY, model_of
 
@@ -240,7 +240,8 @@ def test_a_closure_that_fails_from_its_anchor_is_the_one_from_the_open_valve(tmp
 def test_processes_share_anchors(tmp_path):
     model = gentle(tmp_path)
     values = NEAR * np.linspace(0.95, 1.0, 4)[:, None]
-    shared = predict_many(model, values, processes=2)
+    calls = ((model.fresh(), m) for m in values)
+    shared = list(side_by_side(ClosureModel.__call__, calls, 2))
     assert len(files(tmp_path)) == 1
     for m, prediction in zip(values, shared, strict=True):
         plain = replace(model.fresh(), anchors=None)(m)

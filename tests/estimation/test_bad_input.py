@@ -15,7 +15,6 @@ from mvest.estimation import (
     consistency,
     cramer_rao_bound,
     identifiability,
-    lag_one_autocorrelation,
     moran,
     nees,
     observation_noise,
@@ -183,10 +182,6 @@ BAD = {
     "runs NaN": (lambda: consistency(np.array([np.nan]), 2), "values must be finite"),
     "two innovations": (lambda: zero_mean(np.array([1.0, 2.0])), "n at least 3"),
     "constant innovations": (lambda: zero_mean(np.ones(5)), "all 5 innovations equal 1"),
-    "no permutation": (
-        lambda: lag_one_autocorrelation(np.arange(3.0), np.array([0, 1, 1])),
-        "permutation of the 3",
-    ),
     "neighbours shape": (
         lambda: moran(np.arange(3.0), sparse.eye_array(4)),
         r"\(3, 3\); got \(4, 4\)",

@@ -35,9 +35,8 @@ def test_log_problem_with_a_known_answer():
     # The prior is reported as it was given, the iterates in both coordinates.
     assert estimate.prior.covariance[0, 0] == 0.25
     np.testing.assert_allclose(np.exp(estimate.transformed_iterates), estimate.iterates)
-    np.testing.assert_allclose(
-        estimate.iterate_std, estimate.iterates * estimate.transformed_iterate_std
-    )
+    in_logs = np.sqrt(estimate.transformed_iterate_covariances[:, 0])
+    np.testing.assert_allclose(estimate.iterate_std, estimate.iterates * in_logs)
     # The reported Jacobian is with respect to the parameter, not to its logarithm.
     assert estimate.prediction.jacobian[0, 0] == pytest.approx(1 / np.sqrt(30))
     low, high = estimate.interval(0.95)

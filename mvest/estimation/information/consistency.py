@@ -13,7 +13,7 @@ from mvest.errors import InputError
 from mvest.estimation.gaussian import checked_covariance
 from mvest.estimation.noise import SparseMatrix, csc
 from mvest.estimation.prediction import require_finite
-from mvest.typing import FloatArray, IntArray
+from mvest.typing import FloatArray
 
 
 def chi_square_band(degrees_of_freedom: float, level: float = 0.95) -> tuple[float, float]:
@@ -136,35 +136,6 @@ def zero_mean(innovation: FloatArray) -> ZTest:
     """
     w = _series(innovation)
     return ZTest(float(w.mean()), 0.0, float(w.std(ddof=1) / np.sqrt(w.size)))
-
-
-def lag_one_autocorrelation(innovation: FloatArray, order: IntArray | None = None) -> ZTest:
-    """Test that neighbours in an ordering (along a curve, in time) are uncorrelated.
-
-    Parameters
-    ----------
-    innovation : (n,)
-        Standardised innovations.
-    order : (n,) permutation or None
-        Innovation k of the ordering is `innovation[order[k]]`; None takes them as they are.
-
-    Returns
-    -------
-    ZTest
-        First sample autocorrelation r₁, of expectation −1/n and variance (n − 2)²/(n²(n − 1)) under
-        independence (Dufour and Roy, J. Econometrics 29 (1985) 257-273, for exchangeable normal
-        numbers; 1/n in the limit for any independent ones).
-    """
-    w = _series(innovation)
-    n = w.size
-    if order is not None:
-        order = np.asarray(order)
-        if not np.array_equal(np.sort(order), np.arange(n)):
-            raise InputError(f"an order must be a permutation of the {n} innovations")
-        w = w[order]
-    w = w - w.mean()
-    r1 = float(w[1:] @ w[:-1] / (w @ w))
-    return ZTest(r1, -1.0 / n, (n - 2) / (n * np.sqrt(n - 1)))
 
 
 def moran(innovation: FloatArray, neighbours: SparseMatrix) -> ZTest:

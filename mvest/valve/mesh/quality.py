@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.elements import Element, element
-from mvest.errors import GeometryError, InputError
+from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import jacobian_determinants
 
@@ -51,15 +51,6 @@ class QualityReport:
     max_aspect: float
     mean_aspect: float
     worst: tuple[int, ...]
-
-    def require_positive(self) -> None:
-        """Raise a `GeometryError` with element numbers unless every Jacobian is positive."""
-        if self.non_positive_at_points or self.non_positive_at_nodes:
-            raise GeometryError(
-                f"{max(self.non_positive_at_points, self.non_positive_at_nodes)} of "
-                f"{self.n_elements} elements have a Jacobian that is not positive, the worst are "
-                f"{list(self.worst)} (smallest {self.min_jacobian:.3g} mm^3); expected none"
-            )
 
     def __str__(self) -> str:
         return (

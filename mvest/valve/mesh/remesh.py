@@ -22,7 +22,7 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.triangles import areas, directed_edges
 
-__all__ = ["Remeshed", "remesh", "triangle_quality"]
+__all__ = ["Remeshed", "remesh"]
 
 LLOYD_ITERATIONS = 40
 """Cap of the iteration; on the valves tried it stops earlier or moves no vertex visibly."""
@@ -48,13 +48,6 @@ class Remeshed:
     free_edge: IntArray
     triangle: IntArray
     weights: FloatArray
-
-
-def triangle_quality(vertices: FloatArray, triangles: IntArray) -> FloatArray:
-    """Shape ``(m,)`` of triangles: ``4 sqrt(3) area / sum of squared edges``, 1 if equilateral."""
-    corner = vertices[triangles]
-    squared = ((corner - np.roll(corner, 1, axis=1)) ** 2).sum(axis=(1, 2))
-    return 4 * np.sqrt(3) * areas(vertices, triangles) / squared
 
 
 def remesh(

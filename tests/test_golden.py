@@ -1,0 +1,167 @@
+"""Numbers that no refactoring may change: estimates and standard deviations of whole runs.
+
+Every run goes through the public command into an empty folder. ``golden.json`` holds, for each, the
+command, the commit that made the values, and the estimate and standard deviation of every unknown.
+A number may differ by `TOLERANCE` of its size, or of its standard deviation where that is larger
+(a displacement may be zero). After an intended change of an estimator, renew the values, all or
+those of some runs, and state why in the commit::
+
+    python -m tests.test_golden [NAME ...]
+
+How much the machine itself changes is said at `TOLERANCE`. The runs named ``*_coarse`` are coarse
+meshes without relinearising, for seconds: they guard the same code as the full ones, which are
+``slow``; their numbers mean nothing.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.places import ROOT
+
+GOLDEN = Path(__file__).with_name("golden.json")
+TOLERANCE = 1e-6
+"""Relative. On one machine, two runs with the same number of threads agree to the last digit."""
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+Values = dict[str, dict[str, list[float]]]
+"""By run or job, and by unknown: estimate and standard deviation."""
+
+
+def read_values(outputs: Path) -> Values:
+    """What a command wrote of its estimates. Nothing else here knows how a record is laid out."""
+
+    def pairs(parameters: list[str], run: dict) -> dict[str, list[float]]:
+        both = zip(run["estimate"], run["std"], strict=True)
+        return {name: list(pair) for name, pair in zip(parameters, both, strict=True)}
+
+    def rows(unknowns: list[dict]) -> dict[str, list[float]]:
+        return {row["name"]: [row["estimate"], row["std"]] for row in unknowns}
+
+    sweeps = list(outputs.glob("*/sweep.json"))
+    if sweeps:
+        record = json.loads(sweeps[0].read_text(encoding="utf-8"))
+        return {job["row"]: pairs(record["parameters"], job["runs"][0]) for job in record["jobs"]}
+    (file,) = outputs.glob("*/*/result.json")
+    record = json.loads(file.read_text(encoding="utf-8"))
+    case = record["findings"].get("case")
+    if case is None:
+        return {"estimate": pairs(record["parameters"], record["findings"]["repeats"][0])}
+    found = {"estimate": rows(case["unknowns"])}
+    for other in ("without_nuisances", "as_in_the_paper"):
+        if case[other] is not None:
+            found[other] = rows(case[other]["parameters"])
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One command; ``slow`` where it takes more than about 15 seconds of CPU."""
+
+    overrides: tuple[str, ...]
+    slow: bool = False
+
+    @property
+    def command(self) -> str:
+        """As it is typed."""
+        return " ".join(("python -m experiments.run", *self.overrides))
+
+
+COARSE = (
+    "personal.mesh.source=structured",
+    "personal.mesh.columns=16",
+    "personal.mesh.rows=2",
+    "personal.mesh.guide_columns=12",
+    "personal.mesh.guide_rows=2",
+    "personal.mesh.contact_columns=60",
+    "personal.mesh.contact_rows=16",
+    "personal.confirm=false",
+)
+OWN = ("experiment=own_valve", "case=examples/case")
+# An unstructured mesh, this experiment's default, is made by a mesher that is not deterministic.
+STRUCTURED = "personal.mesh.source=structured"
+
+RUNS = {
+    # Neither confirming nor measuring the closed valve changes an estimate.
+    "table1": Run(("experiment=table1", "confirm=false", "measure=false")),
+    "table1_independent": Run(
+        ("experiment=table1_independent", "confirm=false", "measure=false"), slow=True
+    ),
+    "sweep": Run(
+        (
+            "sweep=debug",
+            "filter.initial=[5,3],[4,2]",
+            "seed=1,2,3,4",
+            "observation.noise_mm=0.05",
+        )
+    ),
+    "own_valve_coarse": Run((*OWN, "personal=carried", *COARSE)),
+    "own_valve": Run((*OWN, STRUCTURED), slow=True),
+}
+
+
+def run(name: str, outputs: Path) -> Values:
+    """Run a command of `RUNS` into an empty folder and read what it found."""
+    settings = (f"paths.outputs={outputs}", f"paths.results={outputs}/published")
+    quiet = ("tracking.enabled=false", "figures=false")
+    subprocess.run(
+        [sys.executable, "-m", "experiments.run", *RUNS[name].overrides, *settings, *quiet],
+        cwd=ROOT,
+        env={**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": str(ROOT)},
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    return read_values(outputs)
+
+
+def differences(found: Values, expected: Values) -> list[str]:
+    """One line for every number that is not as expected."""
+    lines = []
+    for row in sorted(found.keys() | expected.keys()):
+        here, there = found.get(row, {}), expected.get(row, {})
+        for name in sorted(here.keys() | there.keys()):
+            if name not in here or name not in there:
+                lines.append(f"{row}, {name}: found {here.get(name)}, expected {there.get(name)}")
+                continue
+            (a, a_std), (b, b_std) = here[name], there[name]
+            if not abs(a - b) <= TOLERANCE * max(abs(b), b_std):
+                lines.append(f"{row}, {name}: found {a!r}, expected {b!r}")
+            if not abs(a_std - b_std) <= TOLERANCE * b_std:
+                lines.append(f"{row}, {name}, std: found {a_std!r}, expected {b_std!r}")
+    return lines
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] if one.slow else []) for n, one in RUNS.items()],
+)
+def test_estimates_are_what_they_were(name, tmp_path):
+    golden = json.loads(GOLDEN.read_text(encoding="utf-8"))[name]
+    assert golden["command"] == RUNS[name].command, "renew golden.json"
+    found = differences(run(name, tmp_path), golden["values"])
+    assert not found, "\n".join([f"not as at {golden['commit'][:7]}:", *found])
+
+
+def renew(names: list[str]) -> None:
+    """Run these again and write what they find into ``golden.json``."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.strip()
+    for name in names:
+        with tempfile.TemporaryDirectory() as folder:
+            values = run(name, Path(folder))
+        known = json.loads(GOLDEN.read_text(encoding="utf-8")) if GOLDEN.is_file() else {}
+        known[name] = {"command": RUNS[name].command, "commit": commit, "values": values}
+        ordered = {key: known[key] for key in RUNS if key in known}
+        GOLDEN.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    renew(sys.argv[1:] or list(RUNS))
