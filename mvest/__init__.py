@@ -10,9 +10,10 @@ and all the rest, is in the rooms.
   (`PaperFilter`, `ExtendedFilter`, `IteratedFilter`, `UnscentedFilter`, `EnsembleFilter`,
   `MonteCarloFilter`) from a `Gaussian` prior, in coordinates `Identity` or `Log`, for any model
   that returns a `Prediction`; `identifiability`.
-* A patient: `read_case`, `write_case`, `ValveCase`; `personalise_case` with `PersonaliseSettings`
-  and every `Unknown`.
-* Images: `read_volume` with its `Modality`, `detect_valve` with the `default_model`.
+* A patient: `read_case`, `write_case`, `ValveCase`; `personalise` estimates its moduli, by
+  `default_settings` or `PersonaliseSettings` with every `Prior`, and `report` writes the page.
+* Images: `detect_in_volume` with `ImagedSettings` makes a case of a volume; `read_volume` with its
+  `Modality`, `detect_valve` with the `default_model`.
 * Mechanics without a valve: `simulate_body`, `TransverselyIsotropic`.
 * `MvestError`, the family of all errors that a user can cause; `units`.
 

@@ -17,7 +17,7 @@ from mvest.closure.frames import ERROR, OFFSET
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.valve_system import HeldState
-from mvest.personalisation import CaseMesh, PersonaliseSettings, Treatment, Unknown
+from mvest.personalisation import CaseMesh, PersonaliseSettings, Prior, Treatment
 from mvest.problem.registration import REGISTRATION, displace
 from mvest.valve.anatomy.template import Template
 from mvest.valve.mesh.structured import structured_mesh
@@ -54,10 +54,10 @@ PRIORS = {
 }
 
 
-def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tuple[Unknown, ...]:
+def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tuple[Prior, ...]:
     """The moduli estimated, everything else treated in one way."""
     return tuple(
-        Unknown(
+        Prior(
             name,
             means.get(name, mean),
             std,
@@ -67,7 +67,7 @@ def unknowns(treatment: Treatment = Treatment.ESTIMATED, **means: float) -> tupl
     )
 
 
-def settings(*given: Unknown, **changes: Any) -> PersonaliseSettings:
+def settings(*given: Prior, **changes: Any) -> PersonaliseSettings:
     """Settings with some unknowns, all of them estimated if none are given; errors as stated."""
     return PersonaliseSettings(
         given or unknowns(), MECHANICS, CaseMesh(), **{"errors": None} | changes

@@ -65,11 +65,11 @@ def test_moduli_of_an_own_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert isinstance(case, mvest.ValveCase)
     settings = mvest.PersonaliseSettings(
         tuple(
-            mvest.Unknown(name, mean, 2.0) for name, mean in ((MODULI[0], 6.23), (MODULI[1], 2.09))
+            mvest.Prior(name, mean, 2.0) for name, mean in ((MODULI[0], 6.23), (MODULI[1], 2.09))
         ),
         mvest.MechanicsSettings(TISSUE),
     )
-    found = mvest.personalise_case(case, settings)
+    found = mvest.personalise(case, settings)
     assert found.result.converged
     assert found.result.estimate is not None
     assert found.result.estimate.shape == (2,)

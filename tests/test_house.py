@@ -120,8 +120,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
         "mvest.valve",
         "mvest.imaging",
         "mvest.estimation",
-        "mvest.problem.verdict",
-        "mvest.problem.record",
+        "mvest.problem",
+        "mvest.cases",
+        "mvest.personalisation.record",
+        "mvest.personalisation.result",
     ),
 }
 NEVER_IN_MVEST = ("hydra", "hydra_plugins", "omegaconf", "mlflow", "experiments", "conf", "tests")
@@ -129,7 +131,7 @@ NEVER_IN_EXPERIMENTS = ("tests",)
 STUDIES, IN_COMMON = "experiments.studies", "experiments.common"
 """A study's room imports of the experiments itself and what all have in common, no other study."""
 RUNNER = "experiments.runner"
-ORDINARY_WORDS = {"case", "volume", "closure", "external", "filters", "patient"}
+ORDINARY_WORDS = {"case", "volume", "gate", "closure", "external", "filters", "patient"}
 """Names of studies that are also parts of a configuration, or words."""
 RUNNER_ROOMS = ("jobs", "planning", "collecting", "tracking", "execution")
 """In the runner a room imports none that comes after it; what lies in none of them comes last."""

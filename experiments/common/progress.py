@@ -161,7 +161,7 @@ class PartBar:
     ----------
     title : str
     total : int
-        Pieces.
+        Pieces; 0 where only the first one that is done says how many there are.
     unit : str
     """
 
@@ -179,9 +179,11 @@ class PartBar:
         if kind is None:
             say(f"{self._title}: done in {duration(time.monotonic() - self._began)}")
 
-    def step(self) -> None:
-        """One more piece is done."""
+    def step(self, total: int | None = None) -> None:
+        """One more piece is done, of as many as are there if ``total`` says so."""
         self._done += 1
+        if total is not None:
+            self._total = self._bar.total = total
         self._bar.update(1)
         now = time.monotonic()
         if self._bar.disable and now - self._said > SAY:

@@ -27,8 +27,8 @@ from .information.consistency import nees as nees
 from .information.consistency import zero_mean as zero_mean
 from .information.design import Design as Design
 from .information.design import together as together
-from .information.identifiability import Confounded as Confounded
 from .information.identifiability import Identifiability as Identifiability
+from .information.identifiability import TradeOff as TradeOff
 from .information.identifiability import cramer_rao_bound as cramer_rao_bound
 from .information.identifiability import identifiability as identifiability
 from .information.model_error import shift_by_model_error as shift_by_model_error

@@ -16,18 +16,19 @@ from mvest.personalisation.comparison import (
     largest_difference_anew,
     predicted_frames,
 )
+from mvest.personalisation.defaults import default_settings
 from mvest.personalisation.estimation import CaseEstimation, OnStep
 from mvest.personalisation.expected import geometry_shifts, law_share
 from mvest.personalisation.result import Personalised
 from mvest.personalisation.settings import PersonaliseSettings
 from mvest.typing import FloatArray
 
-__all__ = ["personalise_case"]
+__all__ = ["personalise"]
 
 
-def personalise_case(
+def personalise(
     case: ValveCase,
-    settings: PersonaliseSettings,
+    settings: PersonaliseSettings | None = None,
     *,
     store: Path | None = None,
     on_step: OnStep | None = None,
@@ -40,14 +41,16 @@ def personalise_case(
     Parameters
     ----------
     case : ValveCase
-    settings : PersonaliseSettings
+    settings : PersonaliseSettings, optional
+        By default as `default_settings` has them.
     store : Path, optional
-        Where an unstructured mesh is kept.
+        Where an unstructured mesh and closed states are kept.
     on_step : callable, optional
         Progress, see :class:`mvest.closure.model.ClosureModel`.
     on_iterate : callable, optional
         Called after each iterate of every filter.
     """
+    settings = default_settings(case) if settings is None else settings
     estimation = CaseEstimation(case, settings, store, on_step, on_iterate)
     started = time.perf_counter()
     # Not the prior's mean, which may differ from where filters start by its last bit.

@@ -13,7 +13,7 @@ from mvest.closure.frames import FramesModel, is_frame_pressure
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics.valve_system import HeldState, check_parameters
-from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Treatment, Unknown
+from mvest.personalisation.settings import CaseMesh, PersonaliseSettings, Prior, Treatment
 from mvest.problem.registration import REGISTRATION
 from mvest.valve.anatomy.band import Band
 from mvest.valve.mesh.given import GivenValve
@@ -129,7 +129,7 @@ def build_coarse(
     )
 
 
-def _mechanical(settings: PersonaliseSettings) -> list[Unknown]:
+def _mechanical(settings: PersonaliseSettings) -> list[Prior]:
     return [
         u for u in settings.unknowns if not (u.name in REGISTRATION or is_frame_pressure(u.name))
     ]

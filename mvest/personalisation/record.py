@@ -22,7 +22,7 @@ budget         part, modulus, without, alone: `mvest.personalisation.error_budge
 measurements   frame, shape (observed, generic or personalised), and one column for each of
                `mvest.valve.measure.clinical.clinical_measurements`
 seconds        part, seconds: wall-clock time
-image_step     (one row), image_frames, pictures: `mvest.cases.from_images.image_step`
+image_step     with image_frames and pictures: `mvest.cases.from_images.image_step`
 ============== ==================================================================================
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -32,9 +32,13 @@ __all__ = [
     "PaperSettings",
     "PersonaliseSettings",
     "PressureErrors",
+    "Prior",
     "Treatment",
-    "Unknown",
+    "with_stiffening",
 ]
+
+STIFFENS = "stiffening."
+"""How the names of unknowns begin that say how far a leaflet's tissue stiffens."""
 
 
 class Treatment(Enum):
@@ -46,8 +50,8 @@ class Treatment(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Unknown:
-    """One quantity that is not known of a case.
+class Prior:
+    """What is known beforehand of one unknown of a case, and what becomes of it.
 
     Attributes
     ----------
@@ -55,7 +59,7 @@ class Unknown:
         One of the mechanics' (:data:`mvest.mechanics.parameters.KINDS`): ``E_f.REGION`` (MPa),
         ``pressure_scale`` (a factor) ..., or ``shift.x`` ... (mm) or ``turn.x`` ... (degrees).
     mean, std : float
-        Prior in the same unit.
+        In the same unit.
     treatment : Treatment
     """
 
@@ -115,12 +119,12 @@ class PressureErrors:
             if not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"pressures {name} = {value}, expected >= 0")
 
-    def unknowns(self, frames: Iterable[str]) -> tuple[Unknown, ...]:
+    def unknowns(self, frames: Iterable[str]) -> tuple[Prior, ...]:
         """What is not known of the pressures of these frames."""
         stds = {OFFSET: self.offset_mmHg}
         stds |= {f"{ERROR}.{frame}": self.each_mmHg for frame in frames}
         treatment = Treatment.CONSIDERED if self.considered else Treatment.ESTIMATED
-        return tuple(Unknown(name, 0.0, std, treatment) for name, std in stds.items() if std)
+        return tuple(Prior(name, 0.0, std, treatment) for name, std in stds.items() if std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +183,7 @@ class PersonaliseSettings:
 
     Attributes
     ----------
-    unknowns : tuple of Unknown
+    unknowns : tuple of Prior
         The means of the moduli are the generic ones.
     mechanics : MechanicsSettings
         The pressure of its protocol is replaced by that of the closed frame.
@@ -212,7 +216,7 @@ class PersonaliseSettings:
         them but for the common factor, if that is an unknown.
     """
 
-    unknowns: tuple[Unknown, ...]
+    unknowns: tuple[Prior, ...]
     mechanics: MechanicsSettings
     mesh: CaseMesh = field(default_factory=CaseMesh)
     tolerance: float = 2e-3
@@ -243,3 +247,33 @@ class PersonaliseSettings:
                 f"unknowns {', '.join(names) or '(none)'}: expected at least one modulus "
                 "E_f.REGION that is estimated"
             )
+
+
+def with_stiffening(settings: PersonaliseSettings) -> PersonaliseSettings:
+    """The settings where tissue whose stiffening is an unknown is on its way to another law.
+
+    That law is the one that would be considered otherwise (`PersonaliseSettings.considered_law`).
+
+    Raises
+    ------
+    InputError
+        If there is no such leaflet or no such law, or its tissue is not linear.
+    """
+    tissue, laws = dict(settings.mechanics.tissue), dict(settings.considered_law)
+    for unknown in settings.unknowns:
+        if not unknown.name.startswith(STIFFENS):
+            continue
+        region = unknown.name.removeprefix(STIFFENS)
+        if region not in tissue or tissue[region].law != "biot":
+            own = f"follows the {tissue[region].law} law" if region in tissue else "has no tissue"
+            raise InputError(
+                f"unknown {unknown.name}: {region} {own}, expected the linear one (biot)"
+            )
+        if region not in laws:
+            raise InputError(
+                f"unknown {unknown.name}: considered_law.{region} is missing, the law that the "
+                "tissue is on its way to"
+            )
+        tissue[region] = replace(tissue[region], law="stiffening", exponential=laws.pop(region))
+    mechanics = replace(settings.mechanics, tissue=tissue)
+    return replace(settings, mechanics=mechanics, considered_law=laws)

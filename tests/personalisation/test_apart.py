@@ -10,7 +10,7 @@ from mvest.cases.case import Role, Uncertainty
 from mvest.cases.folder import read_case
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation import CaseMesh, PersonaliseSettings, personalise_case
+from mvest.personalisation import CaseMesh, PersonaliseSettings, personalise
 from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.personalisation.model import build_model
 from mvest.valve.mesh.given import GivenValve
@@ -48,7 +48,7 @@ def test_moduli_come_back_from_a_true_surface_with_other_vertices():
         corresponds=False,
     )
     apart = replace(case, frames=(case.frames[0], closed), uncertainty=Uncertainty(0.5, 10.0))
-    result = personalise_case(apart, SETTINGS).result
+    result = personalise(apart, SETTINGS).result
     assert result.converged, str(result)
     # Of facets it was 1.9 after 15 iterations, which did not end.
     assert result.filtered.check.holds

@@ -21,7 +21,7 @@ from mvest.estimation.transform import Log, to_filter
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import Treatment, personalise_case
+from mvest.personalisation import Treatment, personalise
 from mvest.personalisation.considered_geometry import (
     ConsideredGeometry,
     GeometryColumns,
@@ -217,8 +217,8 @@ def test_a_geometry_that_is_not_known_widens_the_intervals(monkeypatch):
 
     monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
     for errors in (None, settings().errors):
-        known = personalise_case(case, settings(errors=errors))
-        doubtful = personalise_case(
+        known = personalise(case, settings(errors=errors))
+        doubtful = personalise(
             case, settings(errors=errors, considered_geometry=ConsideredGeometry())
         )
         anterior = doubtful.names.index("E_f.anterior")
@@ -325,7 +325,7 @@ def test_renewed_linearisations_end_at_the_mode_of_moduli_and_geometry_together(
     errors = []
     for renewals in (0, 1, 2, 12):
         steps.clear()
-        fit = personalise_case(
+        fit = personalise(
             case,
             settings(
                 *free,
@@ -360,7 +360,7 @@ def test_a_place_that_is_the_mode_is_no_doubt(monkeypatch):
         return found
 
     monkeypatch.setattr(CaseEstimation, "_nearer", followed)
-    fit = personalise_case(
+    fit = personalise(
         case,
         settings(
             *unknowns(Treatment.FIXED, **known),
@@ -388,9 +388,9 @@ def test_steps_that_are_estimated_roughly_end_where_others_do(monkeypatch):
         considered_geometry=ConsideredGeometry(renewals=6),
         tolerance=1e-9,
     )
-    rough = personalise_case(case, given).result.filtered.transformed
+    rough = personalise(case, given).result.filtered.transformed
     monkeypatch.setattr("mvest.personalisation.estimation.ROUGH", 0.0)
-    exact = personalise_case(case, given).result.filtered.transformed
+    exact = personalise(case, given).result.filtered.transformed
     np.testing.assert_allclose(rough.mean, exact.mean, atol=0.02 * exact.std.min())
     np.testing.assert_allclose(rough.std, exact.std, rtol=0.02)
 
@@ -402,7 +402,7 @@ def test_a_parameter_that_is_considered_stays_what_it_is_on_the_way(monkeypatch)
     found = {}
     for treatment in (Treatment.ESTIMATED, Treatment.CONSIDERED):
         others = [u for u in unknowns(Treatment.FIXED, **known) if u.name != pressure.name]
-        found[treatment] = personalise_case(
+        found[treatment] = personalise(
             case,
             settings(
                 replace(pressure, treatment=treatment),
@@ -503,7 +503,7 @@ def test_a_displaced_valve_that_does_not_close_leaves_the_estimate_and_a_doubt(m
     monkeypatch.setattr("mvest.personalisation.places.RestGeometry", Torn)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
     plain, torn = (
-        personalise_case(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))
+        personalise(case, settings(considered_geometry=ConsideredGeometry(renewals=renewals)))
         for renewals in (0, 2)
     )
     np.testing.assert_array_equal(torn.result.estimate, plain.result.estimate)
@@ -526,7 +526,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
 
     monkeypatch.setattr(BentGeometry, "displaced", displaced)
     plain, stuck = (
-        personalise_case(
+        personalise(
             case,
             settings(
                 *unknowns(Treatment.FIXED, **known),
@@ -544,7 +544,7 @@ def test_a_valve_that_closes_only_where_it_was_tried_leaves_the_estimate(
 def test_what_was_not_considered_before_stays_a_doubt(monkeypatch):
     case, known = bent_case(monkeypatch, curve=1.0, std=0.5)
     monkeypatch.setattr("mvest.personalisation.observation_errors.law_columns", lambda *_: "no law")
-    fit = personalise_case(
+    fit = personalise(
         case,
         settings(
             *unknowns(Treatment.FIXED, **known),

@@ -13,7 +13,7 @@ from mvest.mechanics.settings import ExponentialTissue
 from mvest.mechanics.steps import StepReason
 from mvest.mechanics.valve_system import HeldState
 from mvest.observation.vertices import Observation
-from mvest.personalisation import personalise_case
+from mvest.personalisation import personalise
 from mvest.personalisation.considered_law import law_change, law_columns
 from mvest.personalisation.indications import indications_of
 from mvest.problem.registration import RegisteredModel
@@ -85,8 +85,8 @@ def test_a_law_that_is_not_known_widens_the_intervals_but_not_those_of_moduli_al
         "mvest.personalisation.observation_errors.law_columns",
         lambda *_: (ErrorColumns("law", column),),
     )
-    known = personalise_case(case, settings(moduli_only=True))
-    doubtful = personalise_case(case, settings(moduli_only=True, considered_law=STIFFENING))
+    known = personalise(case, settings(moduli_only=True))
+    doubtful = personalise(case, settings(moduli_only=True, considered_law=STIFFENING))
     anterior = doubtful.names.index("E_f.anterior")
     assert doubtful.result.std[anterior] > 1.3 * known.result.std[anterior]
     assert doubtful.narrower["now"][0] > 1.3 * doubtful.narrower["law known exactly"][0]
@@ -100,7 +100,7 @@ def test_what_could_not_be_considered_makes_the_estimate_doubtful(monkeypatch):
     monkeypatch.setattr(
         "mvest.personalisation.observation_errors.law_columns", lambda *_: "it did not close"
     )
-    fit = personalise_case(case, settings(considered_law=STIFFENING))
+    fit = personalise(case, settings(considered_law=STIFFENING))
     assert fit.unconsidered == ("it did not close",)
     grounds = [g.text for g in judge(indications_of(fit)).grounds if g.check == "case"]
     assert any(text.endswith("is not in the intervals: it did not close") for text in grounds)

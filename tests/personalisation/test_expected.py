@@ -9,7 +9,7 @@ from mvest.cases.case import Role
 from mvest.estimation.noise_family import ErrorColumns
 from mvest.estimation.transform import to_filter
 from mvest.mechanics.settings import ExponentialTissue
-from mvest.personalisation import personalise_case
+from mvest.personalisation import personalise
 from mvest.personalisation.considered_geometry import (
     ConsideredGeometry,
     GeometryColumns,
@@ -62,7 +62,7 @@ def stiffening(monkeypatch):
 
     def run(share):
         moved = share * OTHER.sum(axis=1).reshape(-1, 3)
-        return personalise_case(seen_with(2, moved), settings(considered_law=CURVES))
+        return personalise(seen_with(2, moved), settings(considered_law=CURVES))
 
     return run
 
@@ -82,7 +82,7 @@ def test_the_law_is_told_from_what_was_seen(stiffening, share):
 
 def test_nothing_is_told_of_a_law_that_is_not_considered(monkeypatch):
     use(monkeypatch)
-    fit = personalise_case(made_up_case(STD), settings())
+    fit = personalise(made_up_case(STD), settings())
     assert fit.law_share is None
     assert fit.expected_geometry == ()
     assert "law" in judge(indications_of(fit)).missing
@@ -107,7 +107,7 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
     monkeypatch.setattr("mvest.personalisation.observation_errors.geometry_columns", columns)
     sizes = (2.0, -1.0, 0.5, 0.0, -2.8)
     moved = sum(q * r for q, r in zip(sizes, np.hstack(rows).T, strict=True)).reshape(-1, 3)
-    fit = personalise_case(
+    fit = personalise(
         seen_with(2, moved), settings(considered_geometry=ConsideredGeometry(renewals=0))
     )
     e, S = dense(fit.result)
@@ -133,7 +133,7 @@ def test_a_geometry_that_is_off_is_told_by_kind(monkeypatch):
 
 def test_a_geometry_of_which_nothing_is_in_doubt_is_not_told(monkeypatch):
     use(monkeypatch)
-    fit = personalise_case(
+    fit = personalise(
         made_up_case(STD), settings(considered_geometry=ConsideredGeometry(renewals=1))
     )
     assert fit.expected_geometry == ()

@@ -9,7 +9,7 @@ from mvest.cases.case import ErrorSamples, Role
 from mvest.closure.frames import ERROR, OFFSET
 from mvest.errors import InputError
 from mvest.observation.learned import ErrorBeliefs
-from mvest.personalisation import PressureErrors, expect_case, personalise_case
+from mvest.personalisation import PressureErrors, expect_case, personalise
 from mvest.problem.registration import REGISTRATION, displace
 from tests.made_up_closure import (
     CLOSED_ANNULUS,
@@ -60,7 +60,7 @@ def test_the_frames_are_met_with_the_errors_of_their_pressures(monkeypatch):
     case = with_fitted(
         made_up_case(std_mm=1e-4), early=(60.0, 67.0), closed=(PRESSURE, PRESSURE + 1.0)
     )
-    found = personalise_case(case, replace(wanted, unknowns=tuple(scale)))
+    found = personalise(case, replace(wanted, unknowns=tuple(scale)))
     assert found.result.converged
     at = dict(zip(found.names, found.result.estimate, strict=True))
     for name in ("E_f.anterior", "E_f.posterior", "chord_stiffness", *REGISTRATION):
@@ -85,15 +85,15 @@ def test_equal_frames_with_independent_errors_are_one_with_less_variance(monkeyp
         closed=(PRESSURE, PRESSURE),
     )
     one = with_fitted(made_up_case(std_mm=std / np.sqrt(count)), closed=(PRESSURE, PRESSURE))
-    a, b = (personalise_case(case, settings(tolerance=1e-10)).result for case in (many, one))
+    a, b = (personalise(case, settings(tolerance=1e-10)).result for case in (many, one))
     np.testing.assert_allclose(a.estimate, b.estimate, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(a.filtered.covariance, b.filtered.covariance, rtol=1e-6, atol=1e-10)
 
 
 def test_without_a_further_frame_nothing_is_added(monkeypatch):
     use(monkeypatch)
-    plain = personalise_case(made_up_case(), settings())
-    same = personalise_case(made_up_case(), settings(pressures=PRESSURES))
+    plain = personalise(made_up_case(), settings())
+    same = personalise(made_up_case(), settings(pressures=PRESSURES))
     assert same.names == plain.names
     np.testing.assert_array_equal(same.result.estimate, plain.result.estimate)
 
@@ -123,7 +123,7 @@ def test_errors_of_each_frame_are_learned(monkeypatch):
         else f
         for f in case.frames
     ]
-    found = personalise_case(replace(case, frames=tuple(frames)), settings(errors=ErrorBeliefs()))
+    found = personalise(replace(case, frames=tuple(frames)), settings(errors=ErrorBeliefs()))
     learned = {q.name: q.learned.median for q in found.result.filtered.learned.quantities}
     assert learned["frame early"] == pytest.approx(2.5, rel=0.1)
 
@@ -133,11 +133,11 @@ def test_what_cannot_be_is_refused(monkeypatch):
     case = with_fitted(made_up_case(), early=(60.0, 60.0), closed=(PRESSURE, PRESSURE))
     moduli = tuple(u for u in unknowns() if u.name.startswith("E_f."))
     with pytest.raises(InputError, match="need pressure_scale"):
-        personalise_case(case, settings(*moduli, pressures=PRESSURES))
+        personalise(case, settings(*moduli, pressures=PRESSURES))
     n, f = len(case.surface.vertices), len(case.frames)
     tips = len(case.valve.papillary_tips)
     samples = ErrorSamples(np.zeros((4, f, n, 3)), np.zeros((4, f, tips, 3)))
     with pytest.raises(InputError, match="error samples and several fitted frames"):
-        personalise_case(replace(case, error_samples=samples), settings())
+        personalise(replace(case, error_samples=samples), settings())
     with pytest.raises(InputError, match="pressures each_mmHg = -1"):
         PressureErrors(each_mmHg=-1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from mvest.cases.case import Role, Uncertainty
 from mvest.observation.errors import SpatialCorrelation
-from mvest.personalisation import personalise_case
+from mvest.personalisation import personalise
 from mvest.personalisation.estimation import CaseEstimation
 from mvest.personalisation.indications import _alike, indications_of
 from mvest.problem.verdict import NONE, TRUSTWORTHY, judge
@@ -23,7 +23,7 @@ def fit(monkeypatch):
 
     def run(stated=INDEPENDENT, **changes):
         case = made_up_case(0.3, noise=np.random.default_rng(3))
-        return personalise_case(replace(case, uncertainty=stated), settings(**changes))
+        return personalise(replace(case, uncertainty=stated), settings(**changes))
 
     return run
 
@@ -68,7 +68,7 @@ def test_smooth_errors_that_are_stated_as_independent_show_as_a_pattern(monkeypa
         replace(f, vertices=f.vertices + smooth) if f.role is Role.CLOSED else f
         for f in case.frames
     )
-    alike = indications_of(personalise_case(replace(case, frames=frames), settings())).alike
+    alike = indications_of(personalise(replace(case, frames=frames), settings())).alike
     assert alike > 0.4 if pattern else alike < 0.15
 
 
@@ -97,7 +97,7 @@ def test_of_several_surfaces_the_last_is_looked_at(monkeypatch, smooth):
 
 def test_without_an_estimate_there_is_its_reason(monkeypatch):
     use(monkeypatch, fails_above=1.0)
-    found = personalise_case(made_up_case(0.3), settings())
+    found = personalise(made_up_case(0.3), settings())
     seen = indications_of(found)
     assert not seen.estimated
     assert found.result.reason in seen.ended

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from mvest.cases.case import Role
 from mvest.errors import GeometryError
-from mvest.personalisation import observation_errors, personalise_case
+from mvest.personalisation import observation_errors, personalise
 from mvest.personalisation.estimation import CaseEstimation
 from mvest.personalisation.geometry_errors import localised_samples
 from tests.made_up_closure import made_up_case, settings
@@ -72,9 +72,7 @@ def test_over_the_whole_valve_the_estimate_is_that_of_the_samples_as_they_are(mo
 
     def estimated(length):
         geometry = replace(NONE, samples_mm=length)
-        return personalise_case(
-            case, settings(*right_nuisances(), considered_geometry=geometry)
-        ).result
+        return personalise(case, settings(*right_nuisances(), considered_geometry=geometry)).result
 
     plain, everywhere, near = (estimated(length) for length in (0.0, 1e6, LENGTH))
     np.testing.assert_allclose(everywhere.estimate, plain.estimate, rtol=1e-6)
@@ -94,4 +92,4 @@ def test_localised_samples_that_cannot_be_told_are_an_error(monkeypatch):
     monkeypatch.setattr(observation_errors, "sample_geometry", fails)
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     with pytest.raises(GeometryError, match="localised samples do: no equilibrium"):
-        personalise_case(case, settings(*right_nuisances(), considered_geometry=LOCALISED))
+        personalise(case, settings(*right_nuisances(), considered_geometry=LOCALISED))

@@ -18,10 +18,10 @@ from mvest.personalisation import (
     CaseMesh,
     PaperSettings,
     PersonaliseSettings,
+    Prior,
     Treatment,
-    Unknown,
     build_model,
-    personalise_case,
+    personalise,
 )
 from mvest.personalisation.error_budget import EVERYTHING, IMAGES, MOTION
 from mvest.personalisation.estimation import CaseEstimation
@@ -64,7 +64,7 @@ def std_of(found, name):
 
 def test_a_twin_without_noise_gives_back_the_moduli_and_what_was_hidden(monkeypatch):
     use(monkeypatch)
-    found = personalise_case(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
+    found = personalise(made_up_case(std_mm=1e-4), settings(tolerance=1e-6))
     assert found.result.converged
     assert found.names == tuple(PRIORS)
     np.testing.assert_allclose(found.result.estimate, true_of(found), rtol=1e-4, atol=1e-4)
@@ -93,7 +93,7 @@ def test_noise_is_covered_by_the_intervals(monkeypatch):
     squares = []
     for _ in range(12):
         case = made_up_case(std_mm=0.3, noise=rng, displaced=False)
-        found = personalise_case(case, settings(*right_nuisances()))
+        found = personalise(case, settings(*right_nuisances()))
         error = np.log(found.result.estimate / true_of(found))
         squares.append((error / found.result.filtered.transformed.std) ** 2)
     assert 0.38 < np.mean(squares) < 1.95
@@ -102,8 +102,8 @@ def test_noise_is_covered_by_the_intervals(monkeypatch):
 def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    whole = personalise_case(case, settings(moduli_only=True))
-    fixed = personalise_case(case, settings(*unknowns(Treatment.FIXED)))
+    whole = personalise(case, settings(moduli_only=True))
+    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
     assert fixed.names == MODULI
     assert whole.moduli_only.parameters == MODULI
     np.testing.assert_array_equal(fixed.result.estimate, whole.moduli_only.estimate)
@@ -113,15 +113,15 @@ def test_without_nuisances_it_is_the_estimation_of_the_moduli_alone(monkeypatch)
 def test_doubt_that_is_considered_widens_the_interval_and_moves_nothing_else(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, 8.0, np.random.default_rng(1))
-    fixed = personalise_case(case, settings(*unknowns(Treatment.FIXED)))
-    considered = personalise_case(case, settings(*unknowns(Treatment.CONSIDERED)))
+    fixed = personalise(case, settings(*unknowns(Treatment.FIXED)))
+    considered = personalise(case, settings(*unknowns(Treatment.CONSIDERED)))
     assert considered.result.converged
     for name in MODULI:
         assert std_of(considered, name) > 1.2 * std_of(fixed, name)
     own = np.isin(considered.names, NUISANCES)
     np.testing.assert_allclose(considered.result.estimate[own], considered.prior.mean[own])
     # To first order considering is estimating: one step of the linear model is the same.
-    estimated = personalise_case(case, settings())
+    estimated = personalise(case, settings())
     for name in MODULI:
         assert std_of(considered, name) == pytest.approx(std_of(estimated, name), rel=0.35)
 
@@ -133,7 +133,7 @@ def test_a_considered_mean_need_not_survive_its_logarithm(monkeypatch):
         replace(u, treatment=Treatment.CONSIDERED) if u.name == "E_f.anterior" else u
         for u in unknowns(Treatment.FIXED)
     ]
-    found = personalise_case(made_up_case(0.3, displaced=False), settings(*given))
+    found = personalise(made_up_case(0.3, displaced=False), settings(*given))
     assert found.result.estimate[0] == pytest.approx(6.23, rel=1e-14)
     assert found.result.fitted is not None
     assert len(found.distances) == 2
@@ -142,7 +142,7 @@ def test_a_considered_mean_need_not_survive_its_logarithm(monkeypatch):
 def test_the_generic_valve_is_closed_once(monkeypatch):
     # The estimation begins where the generic valve was closed, and that is the longest closure.
     built = use(monkeypatch)
-    personalise_case(made_up_case(0.3), settings(moduli_only=True))
+    personalise(made_up_case(0.3), settings(moduli_only=True))
     calls = np.array(built[0].calls)
     start = [6.23, 2.09, 1.0, 1.0, 1.0]
     assert np.all(np.isclose(calls, start, rtol=1e-12), axis=1).sum() == 1
@@ -151,9 +151,9 @@ def test_the_generic_valve_is_closed_once(monkeypatch):
 def test_unknowns_may_come_in_any_order(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3)
-    one = personalise_case(case, settings())
+    one = personalise(case, settings())
     order = [*unknowns()[::-1]]
-    other = personalise_case(case, settings(*order))
+    other = personalise(case, settings(*order))
     assert set(other.names[-6:]) == set(REGISTRATION)
     at = [other.names.index(name) for name in one.names]
     np.testing.assert_allclose(other.result.estimate[at], one.result.estimate, rtol=1e-6, atol=1e-9)
@@ -219,7 +219,7 @@ def test_a_deviation_of_each_vertex_is_that_of_its_coordinates(monkeypatch, corr
 def test_the_registered_valve_is_the_rigid_motion_of_least_squares(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, noise=np.random.default_rng(2))
-    found = personalise_case(case, settings())
+    found = personalise(case, settings())
     seen = case.frame(Role.CLOSED).vertices
     generic, registered = found.generic["closed"], found.registered["closed"]
     # Rigid: distances among vertices are kept, and so is the side.
@@ -243,7 +243,7 @@ def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
     case = made_up_case(0.3)
     late = case.held_out[0]
     later = replace(late, name="later", time=0.5)
-    personalise_case(replace(case, frames=(*case.frames, later)), settings())
+    personalise(replace(case, frames=(*case.frames, later)), settings())
     states = built[0].states
     assert len(states) == 4
     # All of one valve and then all of the other: changing between them is to close anew.
@@ -257,7 +257,7 @@ def test_held_out_frames_have_the_loads_of_the_case(monkeypatch):
 def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
     built = use(monkeypatch)
     monkeypatch.setattr("tests.made_up_closure.MadeUpClosure.held", lambda *arguments: [None])
-    found = personalise_case(made_up_case(0.3), settings())
+    found = personalise(made_up_case(0.3), settings())
     assert built
     assert [d.frame for d in found.distances] == ["closed"]
     assert "late" not in found.fitted
@@ -266,7 +266,7 @@ def test_a_frame_without_an_equilibrium_is_left_out(monkeypatch):
 def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
     use(monkeypatch)
     case = made_up_case(0.3, noise=np.random.default_rng(2))
-    found = personalise_case(case, settings())
+    found = personalise(case, settings())
     narrower, filtered = found.narrower, found.result.filtered
     now = narrower["now"]
     # P+ = (P^-1 + H^T H / s^2)^-1 in logarithms; a known unknown is a column less.
@@ -314,7 +314,7 @@ def test_what_would_narrow_is_the_linear_update_by_hand(monkeypatch):
 def test_nothing_is_said_of_unknowns_that_a_case_does_not_have(monkeypatch):
     use(monkeypatch)
     given = [u for u in unknowns() if u.name in (*MODULI, "pressure_scale")]
-    found = personalise_case(made_up_case(0.3), settings(*given))
+    found = personalise(made_up_case(0.3), settings(*given))
     assert not [words for words in found.narrower if "annulus" in words or "chordae" in words]
     np.testing.assert_array_equal(
         found.narrower["all of these measured 5 times as well"],
@@ -326,7 +326,7 @@ def test_the_paper_s_filter_sees_the_moduli_and_independent_errors(monkeypatch):
     use(monkeypatch)
     paper = PaperSettings(P0=1.0, Q=0.01, R=1e-4, max_iterations=30)
     case = made_up_case(0.3, 8.0, displaced=False)
-    found = personalise_case(case, settings(*right_nuisances(), paper=paper))
+    found = personalise(case, settings(*right_nuisances(), paper=paper))
     assert found.paper.parameters == MODULI
     assert found.paper.observation.correlation is None
     assert found.paper.observation.variance == pytest.approx(1e-4)
@@ -339,8 +339,8 @@ def test_the_paper_s_filter_sees_the_moduli_and_independent_errors(monkeypatch):
 def test_surfaces_are_compared_where_vertices_are_not_known_again(monkeypatch, length, corresponds):
     use(monkeypatch)
     case = made_up_case(0.02, length, corresponds=corresponds, displaced=False)
-    given = [*right_nuisances(), Unknown("shift.z", 0.0, 1.0)]
-    found = personalise_case(
+    given = [*right_nuisances(), Prior("shift.z", 0.0, 1.0)]
+    found = personalise(
         case,
         settings(
             *given,
@@ -381,7 +381,7 @@ def test_very_many_vertices_are_thinned_evenly():
 
 def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
     use(monkeypatch, fails_above=4.0)
-    found = personalise_case(
+    found = personalise(
         made_up_case(0.3),
         settings(moduli_only=True, paper=PaperSettings(), confirm=True),
     )
@@ -397,7 +397,7 @@ def test_a_valve_that_does_not_close_is_a_result_with_its_reason(monkeypatch):
 
 def test_the_fitted_valve_is_closed_anew(monkeypatch):
     use(monkeypatch)
-    found = personalise_case(made_up_case(0.3), settings(confirm=True))
+    found = personalise(made_up_case(0.3), settings(confirm=True))
     assert found.confirmed_mm == 0.0
     # One that closes otherwise from the open valve is told.
     first = MadeUpClosure.__call__
@@ -411,14 +411,14 @@ def test_the_fitted_valve_is_closed_anew(monkeypatch):
         return Prediction(y, found.jacobian)
 
     monkeypatch.setattr(MadeUpClosure, "__call__", other)
-    again = personalise_case(made_up_case(0.3), settings(confirm=True))
+    again = personalise(made_up_case(0.3), settings(confirm=True))
     assert again.confirmed_mm == pytest.approx(0.25)
 
 
 BAD = [
     ((), "at least one modulus"),
-    ((Unknown("E_f.anterior", 6.0, 3.0, Treatment.FIXED),), "at least one modulus"),
-    ((Unknown("E_f.anterior", 6.0, 3.0),) * 2, "not all different"),
+    ((Prior("E_f.anterior", 6.0, 3.0, Treatment.FIXED),), "at least one modulus"),
+    ((Prior("E_f.anterior", 6.0, 3.0),) * 2, "not all different"),
 ]
 
 
@@ -440,14 +440,14 @@ def test_settings_that_estimate_nothing_are_refused(given, message):
 )
 def test_priors_that_are_none_are_refused(name, mean, std):
     with pytest.raises(InputError, match=f"prior of {name}"):
-        Unknown(name, mean, std)
+        Prior(name, mean, std)
 
 
 def test_the_moduli_must_be_those_of_the_case():
     case = made_up_case()
     for given in (
         unknowns()[:1],
-        (*unknowns()[:2], Unknown("E_f.septal", 1.0, 0.5)),
+        (*unknowns()[:2], Prior("E_f.septal", 1.0, 0.5)),
     ):
         with pytest.raises(InputError, match=r"has the leaflets anterior, posterior"):
             build_model(case, settings(*given))
@@ -457,13 +457,13 @@ def test_the_moduli_must_be_those_of_the_case():
 def test_unknown_unknowns_are_refused_before_anything_is_closed(name):
     # Once a closure is under way a misspelt name has cost minutes.
     with pytest.raises(InputError, match=name):
-        build_model(made_up_case(), settings(*unknowns()[:2], Unknown(name, 1.0, 0.5)))
+        build_model(made_up_case(), settings(*unknowns()[:2], Prior(name, 1.0, 0.5)))
 
 
 @pytest.mark.parametrize("name", ["shift.x", "turn.z"])
 def test_a_displacement_that_is_fixed_elsewhere_is_not_passed_over(name):
     with pytest.raises(InputError, match=f"{name} is fixed at 1.0"):
-        settings(*unknowns()[:2], Unknown(name, 1.0, 0.5, Treatment.FIXED))
+        settings(*unknowns()[:2], Prior(name, 1.0, 0.5, Treatment.FIXED))
 
 
 def test_a_structured_mesh_is_of_two_leaflets():
@@ -473,7 +473,7 @@ def test_a_structured_mesh_is_of_two_leaflets():
     three = LeafletSurface(
         s.vertices, s.triangles, region, (*s.region_names, "septal"), s.fibre, s.thickness
     )
-    given = (*unknowns()[:2], Unknown("E_f.septal", 2.0, 1.0))
+    given = (*unknowns()[:2], Prior("E_f.septal", 2.0, 1.0))
     with pytest.raises(InputError, match="two leaflets; expected mesh source tetwild"):
         build_model(replace(case, surface=three), settings(*given))
     with pytest.raises(InputError, match="mesh source 'voxels'"):
@@ -487,7 +487,7 @@ SMALL = CaseMesh(
 
 def test_the_model_has_the_pressure_and_the_boundary_of_the_case():
     case = made_up_case()
-    given = (*unknowns()[:2], Unknown("pressure_scale", 1.3, 0.1, Treatment.FIXED), *unknowns()[4:])
+    given = (*unknowns()[:2], Prior("pressure_scale", 1.3, 0.1, Treatment.FIXED), *unknowns()[4:])
     wanted = replace(settings(*given), mesh=SMALL)
     model = build_model(case, wanted)
     assert model.settings.protocol.pressure_mmHg == 100.0
@@ -528,9 +528,9 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
     names = (*MODULI, "shift.z")
     true = np.array([5.4, 3.8, 0.5])
     given = [
-        Unknown("E_f.anterior", 6.0, 3.0),
-        Unknown("E_f.posterior", 4.2, 2.0),
-        Unknown("shift.z", 0.0, 1.0),
+        Prior("E_f.anterior", 6.0, 3.0),
+        Prior("E_f.posterior", 4.2, 2.0),
+        Prior("shift.z", 0.0, 1.0),
     ]
     protocol = ClosureProtocol(ramp=0.2, dt=0.04, growth=2.0, end=0.4)
     wanted = PersonaliseSettings(tuple(given), replace(MECHANICS, protocol=protocol), TWIN, 1e-5)
@@ -547,7 +547,7 @@ def test_a_real_twin_on_the_smallest_mesh_gives_back_its_moduli():
     }
     frames = [replace(f, vertices=seen.get(f.name, f.vertices)) for f in case.frames]
     frames[2] = replace(frames[2], pressure_mmHg=95.0)
-    result = personalise_case(replace(case, frames=tuple(frames)), wanted)
+    result = personalise(replace(case, frames=tuple(frames)), wanted)
     assert result.result.converged
     np.testing.assert_allclose(result.result.estimate, true, rtol=1e-4)
     assert [d.frame for d in result.distances] == ["closed", "late"]
@@ -588,8 +588,8 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
     use_geometry(monkeypatch)
     case = made_up_case(std, 8.0, np.random.default_rng(1), displaced=False)
     wanted = settings(*right_nuisances(), correspondence=correspondence)
-    plain = personalise_case(case, wanted)
-    told = personalise_case(seen_in_error(case, std=4 * std), wanted)
+    plain = personalise(case, wanted)
+    told = personalise(seen_in_error(case, std=4 * std), wanted)
     assert plain.image_share is None
     assert plain.geometry is None
     assert told.result.converged
@@ -607,7 +607,7 @@ def test_errors_of_the_geometry_widen_the_intervals(monkeypatch, correspondence,
 def test_without_nuisances_moduli_alone_have_the_errors_of_the_frames_too(monkeypatch):
     use_geometry(monkeypatch)
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
-    found = personalise_case(case, settings(*right_nuisances(), moduli_only=True))
+    found = personalise(case, settings(*right_nuisances(), moduli_only=True))
     np.testing.assert_allclose(found.moduli_only.estimate, found.result.estimate, rtol=1e-6)
     np.testing.assert_allclose(found.moduli_only.std, found.result.std, rtol=1e-6)
 
@@ -622,9 +622,9 @@ def test_a_law_that_is_not_known_is_not_averaged_away_beside_error_samples(monke
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
     law = {"anterior": ExponentialTissue(0.06, 4.325, 1446.5)}
     given = settings(*right_nuisances(), considered_law=law)
-    told = personalise_case(case, given)
-    alone = personalise_case(replace(case, error_samples=None), given)
-    known = personalise_case(case, settings(*right_nuisances()))
+    told = personalise(case, given)
+    alone = personalise(replace(case, error_samples=None), given)
+    known = personalise(case, settings(*right_nuisances()))
     assert told.result.std[0] > 1.05 * known.result.std[0]
     # Of the linear model at another estimate.
     averaged = [one.narrower["any number of beats averaged"][0] for one in (told, alone)]
@@ -652,13 +652,13 @@ def test_errors_of_frames_that_cannot_be_told_are_an_error(monkeypatch):
     )
     case = seen_in_error(made_up_case(0.3, 8.0, displaced=False))
     with pytest.raises(GeometryError, match="error samples do: no equilibrium"):
-        personalise_case(case, settings(*right_nuisances()))
+        personalise(case, settings(*right_nuisances()))
 
 
 def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
     use_geometry(monkeypatch)
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1), displaced=False))
-    found = personalise_case(case, settings(*right_nuisances()))
+    found = personalise(case, settings(*right_nuisances()))
     of = {(row.part, row.modulus): row for row in found.budget}
     for modulus in MODULI:
         everything, images = of[EVERYTHING, modulus], of[IMAGES, modulus]
@@ -668,7 +668,7 @@ def test_a_budget_says_what_the_errors_of_the_frames_cost(monkeypatch):
         assert of[MOTION, modulus].without == pytest.approx(everything.without, rel=1e-9)
         assert of[MOTION, modulus].alone < 0.01 * images.alone
     plain = replace(case, error_samples=None)
-    assert personalise_case(plain, settings(*right_nuisances())).budget == ()
+    assert personalise(plain, settings(*right_nuisances())).budget == ()
 
 
 def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
@@ -676,9 +676,9 @@ def test_doubt_of_the_geometry_goes_with_what_is_considered(monkeypatch):
     case = seen_in_error(made_up_case(0.3, 8.0, np.random.default_rng(1)))
     given = [
         replace(u, treatment=Treatment.CONSIDERED) if u.name == "shift.z" else u
-        for u in (*right_nuisances(), Unknown("shift.z", 0.0, 1.0))
+        for u in (*right_nuisances(), Prior("shift.z", 0.0, 1.0))
     ]
-    found = personalise_case(case, settings(*given, moduli_only=True))
+    found = personalise(case, settings(*given, moduli_only=True))
     assert std_of(found, "shift.z") == pytest.approx(1.0)
     assert found.result.estimate[2] == 0.0
     assert found.moduli_only.parameters == MODULI
@@ -705,8 +705,8 @@ def test_errors_rougher_than_stated_are_learned(monkeypatch, correspondence):
     use(monkeypatch)
     case = rougher(made_up_case(0.3, 8.0, np.random.default_rng(5)), 0.2)
     wanted = settings(correspondence=correspondence)
-    as_stated = personalise_case(case, wanted).result.filtered
-    found = personalise_case(case, replace(wanted, errors=ErrorBeliefs()))
+    as_stated = personalise(case, wanted).result.filtered
+    found = personalise(case, replace(wanted, errors=ErrorBeliefs()))
     learned = found.result.filtered
     assert as_stated.learned is None
     assert as_stated.innovation.nis > 5.0 * as_stated.innovation.size
@@ -727,8 +727,8 @@ def test_learned_errors_and_error_samples_widen_together(monkeypatch):
     use_geometry(monkeypatch)
     case = rougher(made_up_case(0.3, 0.0, np.random.default_rng(1), displaced=False), 0.3)
     wanted = settings(*right_nuisances(), errors=ErrorBeliefs())
-    plain = personalise_case(case, wanted)
-    told = personalise_case(seen_in_error(case, std=1.2), wanted)
+    plain = personalise(case, wanted)
+    told = personalise(seen_in_error(case, std=1.2), wanted)
     assert told.result.filtered.learned.names[-1] == "geometry"
     assert np.all(told.result.std > 1.5 * plain.result.std)
     np.testing.assert_allclose(told.narrower["now"], told.result.filtered.transformed.std)

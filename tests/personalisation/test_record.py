@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mvest.personalisation import PaperSettings, personalise_case
+from mvest.personalisation import PaperSettings, personalise
 from mvest.personalisation.record import arrays_of_case, label_of, record_of_case
 from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import ONE_STATE
@@ -17,7 +17,7 @@ def personalised(fails_above=np.inf, corresponds=True, **changes):
     with pytest.MonkeyPatch.context() as patch:
         use(patch, fails_above=fails_above)
         case = made_up_case(0.3, 8.0, np.random.default_rng(1), corresponds=corresponds)
-        return personalise_case(case, settings(**changes))
+        return personalise(case, settings(**changes))
 
 
 @pytest.fixture(scope="module")

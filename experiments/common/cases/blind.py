@@ -14,24 +14,26 @@ import os
 import resource
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from subprocess import DEVNULL, PIPE
 from typing import Any
 
-from pydantic import TypeAdapter
+import numpy as np
 
 import experiments
-from experiments.common.cases.findings import Findings
-from experiments.common.cases.own_case import read_configured, run_case
-from experiments.common.cases.settings import ImagedSettings, PersonalSettings
-from experiments.common.cases.volume import run_volume
-from experiments.common.records.record import NOT_GATED, Outcome
+from experiments.common.cases.own_case import case_result, read_configured, run_case, run_volume
+from experiments.common.cases.settings import ImagedInput, PersonalSettings
+from experiments.common.records.record import FIELDS, NOT_GATED, Mesh, Model
 from experiments.common.schema import build
+from experiments.common.study import Result
 from mvest.errors import InputError, MvestError
+from mvest.files import write_atomically
+from mvest.problem.record import EstimateRecord
 from mvest.processes import run
 from mvest.provenance import THREAD_VARIABLES, write_json
 from mvest.reading.json_file import read_mapping
+from mvest.reading.npz import read_npz
 
 __all__ = [
     "ESTIMATE",
@@ -41,6 +43,7 @@ __all__ = [
     "main",
     "read_estimate",
     "seal",
+    "write_estimate",
 ]
 
 ESTIMATE = "estimate.json"
@@ -75,7 +78,7 @@ def seal(folder: Path) -> None:
 
 def estimate_blindly(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path, gate: str = NOT_GATED
-) -> Outcome[Findings]:
+) -> Result:
     """Personalise a case, or the valve in a volume, in a process apart.
 
     Parameters
@@ -94,7 +97,7 @@ def estimate_blindly(
     Raises
     ------
     InputError
-        If the process left no outcome; the message ends with its last words.
+        If the process left no result; the message ends with its last words.
     """
     given = {"volume": str(case)} if case.is_file() else {"case": str(case)}
     request = {
@@ -104,7 +107,8 @@ def estimate_blindly(
         "gate": gate,
     }
     path = folder / ESTIMATE
-    path.unlink(missing_ok=True)
+    for left in (path, folder / FIELDS):
+        left.unlink(missing_ok=True)
     places = [
         str(Path(experiments.__file__).resolve().parents[1]),
         os.environ.get("PYTHONPATH", ""),
@@ -128,7 +132,7 @@ def estimate_blindly(
 
 def estimated_or_reason(
     values: Mapping[str, Any], folder: Path, case: Path, sealed: Path
-) -> Outcome[Findings] | str:
+) -> Result | str:
     """What the estimation left, or why it left nothing; as `estimate_blindly` is asked."""
     try:
         return estimate_blindly(values, folder, case, sealed)
@@ -136,7 +140,7 @@ def estimated_or_reason(
         return str(fault)
 
 
-def read_estimate(folder: Path) -> Outcome[Findings]:
+def read_estimate(folder: Path) -> Result:
     """What the process left in the output folder.
 
     Raises
@@ -144,7 +148,26 @@ def read_estimate(folder: Path) -> Outcome[Findings]:
     InputError
         If it left nothing.
     """
-    return TypeAdapter(Outcome[Findings]).validate_python(read_mapping(folder / ESTIMATE))
+    left, arrays = read_mapping(folder / ESTIMATE), folder / FIELDS
+    return case_result(
+        EstimateRecord.model_validate(left["estimate"]),
+        Mesh.model_validate(left["mesh"]),
+        Model.model_validate(left["model"]),
+        left["gate"],
+        read_npz(arrays) if arrays.is_file() else {},
+    )
+
+
+def write_estimate(folder: Path, result: Result) -> None:
+    """Leave the result of a case for `read_estimate`."""
+    if result.arrays:
+        arrays: dict[str, Any] = dict(result.arrays)
+        write_atomically(folder / FIELDS, partial(np.savez_compressed, **arrays))
+    assert result.mesh is not None
+    assert result.model is not None
+    left = {"estimate": result.estimates[0], "mesh": result.mesh, "model": result.model}
+    plain = {name: part.model_dump(mode="json") for name, part in left.items()}
+    write_json(folder / ESTIMATE, {**plain, "gate": result.gate})
 
 
 def main() -> int:
@@ -159,12 +182,12 @@ def main() -> int:
         if values.get("volume") is None:
             case = read_configured(values["case"])
             personal = build(PersonalSettings, values["personal"])
-            outcome = run_case(values, personal, case, folder, gate=request["gate"])
+            result = run_case(values, personal, case, gate=request["gate"])
         else:
             personal = build(PersonalSettings, values["personal"])
-            imaged = build(ImagedSettings, values["imaged"])
-            outcome = run_volume(values, values["volume"], imaged, personal, folder)
-        write_json(folder / ESTIMATE, asdict(outcome))
+            imaged = build(ImagedInput, values["imaged"])
+            result = run_volume(values, values["volume"], imaged, personal, folder)
+        write_estimate(folder, result)
     except MvestError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

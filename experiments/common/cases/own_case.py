@@ -1,44 +1,65 @@
-"""A case from its folder to its moduli."""
+"""A configured case, or the valve in a configured volume, from its files to the result of a run."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments.common.building.closure import mechanics_of, mesh_store
-from experiments.common.cases.findings import Findings, fields_of, outcome_of_case
-from experiments.common.cases.settings import PersonalSettings
+from experiments.common.cases.settings import ImagedInput, PersonalSettings
 from experiments.common.expectation import noise_words
-from experiments.common.progress import SolveBar
-from experiments.common.records.record import NOT_GATED, Outcome
+from experiments.common.progress import PartBar, SolveBar
+from experiments.common.records.record import (
+    FIELDS,
+    NOT_GATED,
+    Mesh,
+    Model,
+    Record,
+    has_passed,
+)
 from experiments.common.schema import build
+from experiments.common.study import Result
 from mvest.cases.case import ValveCase
 from mvest.cases.folder import read_case
+from mvest.cases.from_images.detected import (
+    CASE,
+    DetectedValve,
+    detect_in_volume,
+    read_for_case,
+)
 from mvest.cases.plausibility import doubts
 from mvest.errors import ConfigurationError
-from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
-from mvest.personalisation.chain import personalise_case
+from mvest.imaging.detection.detect import NoValveError
+from mvest.personalisation.chain import personalise
 from mvest.personalisation.design import design_case, design_text, expect_case
 from mvest.personalisation.model import build_model, with_pressures
-from mvest.personalisation.settings import PersonaliseSettings, Treatment, Unknown
+from mvest.personalisation.record import arrays_of_case, record_of_case
+from mvest.personalisation.settings import (
+    PersonaliseSettings,
+    Prior,
+    Treatment,
+    with_stiffening,
+)
+from mvest.problem.record import EstimateRecord, Row
 from mvest.problem.registration import REGISTRATION
-from mvest.reporting.case.findings import ImageStep
+from mvest.reporting.case.tables import estimate_text, frame_table, unknown_table
 from mvest.reporting.expectation import expectation_text
 
-__all__ = ["FIELDS", "expect_own", "read_configured", "run_case", "settings_of"]
+__all__ = [
+    "case_result",
+    "case_words",
+    "expect_own",
+    "find_valve",
+    "read_configured",
+    "run_case",
+    "run_volume",
+    "settings_of",
+    "write_report",
+]
 
 Values = Mapping[str, Any]
-
-FIELDS = "fields.npz"
-"""Arrays of the report, in the folder of a run."""
-
-STIFFENS = "stiffening."
-"""How the unknowns begin that say how far a leaflet's tissue stiffens."""
 
 TYPICAL_SOLVES = 8
 """Forward solves of one case; only the progress bar's first guess."""
@@ -60,50 +81,25 @@ def settings_of(values: Values, personal: PersonalSettings) -> PersonaliseSettin
                 f"personal.unknowns.{name}.treatment = {about.treatment!r}, expected one of "
                 f"{', '.join(known)}"
             )
-        unknowns.append(Unknown(name, about.mean, about.std, Treatment(about.treatment)))
-    stiffens = {name.partition(".")[2] for name in personal.unknowns if name.startswith(STIFFENS)}
-    curves = personal.considered_law
-    return PersonaliseSettings(
-        tuple(unknowns),
-        _stiffening(mechanics_of(values), {r: curves.get(r) for r in sorted(stiffens)}),
-        personal.mesh,
-        personal.tolerance,
-        personal.max_iterations,
-        personal.largest_change,
-        personal.paper,
-        personal.moduli_only,
-        personal.confirm,
-        personal.correspondence,
-        personal.errors,
-        considered_geometry=personal.considered_geometry,
-        considered_law={r: curve for r, curve in curves.items() if r not in stiffens},
-        pressures=personal.pressures,
+        unknowns.append(Prior(name, about.mean, about.std, Treatment(about.treatment)))
+    return with_stiffening(
+        PersonaliseSettings(
+            tuple(unknowns),
+            mechanics_of(values),
+            personal.mesh,
+            personal.tolerance,
+            personal.max_iterations,
+            personal.largest_change,
+            personal.paper,
+            personal.moduli_only,
+            personal.confirm,
+            personal.correspondence,
+            personal.errors,
+            considered_geometry=personal.considered_geometry,
+            considered_law=personal.considered_law,
+            pressures=personal.pressures,
+        )
     )
-
-
-def _stiffening(
-    mechanics: MechanicsSettings, curves: Mapping[str, ExponentialTissue | None]
-) -> MechanicsSettings:
-    """The mechanics where linear tissue of some leaflets is on its way to a curve.
-
-    Raises
-    ------
-    ConfigurationError
-        If there is no such leaflet or no curve, or its tissue follows another law.
-    """
-    tissue = dict(mechanics.tissue)
-    for region, curve in curves.items():
-        unknown = f"personal.unknowns.{STIFFENS}{region}"
-        if region not in tissue or tissue[region].law != "biot":
-            own = f"follows the {tissue[region].law} law" if region in tissue else "has no tissue"
-            raise ConfigurationError(f"{unknown}: {region} {own}, expected the linear one (biot)")
-        if curve is None:
-            raise ConfigurationError(
-                f"{unknown}: personal.considered_law.{region} is missing, the law that the tissue "
-                "is on its way to"
-            )
-        tissue[region] = replace(tissue[region], law="stiffening", exponential=curve)
-    return replace(mechanics, tissue=tissue)
 
 
 def read_configured(place: str | None) -> ValveCase:
@@ -114,6 +110,133 @@ def read_configured(place: str | None) -> ValveCase:
             "mvest/cases/README.md says what it holds"
         )
     return read_case(Path(place))
+
+
+def run_case(
+    values: Values,
+    personal: PersonalSettings,
+    case: ValveCase,
+    images: Mapping[str, tuple[Row, ...]] | None = None,
+    gate: str = NOT_GATED,
+) -> Result:
+    """Personalise a case; ``gate`` is what the gate said of its anatomy."""
+    for sentence in () if images else case.derived:
+        print(f"derived: {sentence}", file=sys.stderr)
+    for doubt in doubts(case):
+        print(f"doubtful: {doubt}", file=sys.stderr)
+    settings = with_pressures(case, settings_of(values, personal))
+    steps = len(settings.mechanics.protocol.steps())
+    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
+    # As they are estimated: those of the closure first.
+    names = sorted(free, key=lambda name: name in REGISTRATION)
+    with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
+        fit = personalise(
+            case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
+        )
+    grid, noise = settings.mesh, case.uncertainty.typical_mm
+    return case_result(
+        record_of_case(fit, gate=has_passed(gate), images=images),
+        Mesh.of(fit.mesh),
+        Model(
+            element=fit.mesh.element_type,
+            cells=(grid.columns, grid.rows, 1),
+            source=grid.source,
+            filter="iterated",
+            noise_mm=noise,
+        ),
+        gate,
+        arrays_of_case(fit),
+    )
+
+
+def run_volume(
+    values: Values,
+    file: str | None,
+    imaged: ImagedInput,
+    personal: PersonalSettings,
+    folder: Path,
+) -> Result:
+    """Find the valve in the configured volume, write it, and personalise the case it makes."""
+    from mvest.reporting.images.step import write_image_step
+
+    detected = find_valve(file, imaged, folder)
+    for sentence in detected.sentences:
+        print(sentence, file=sys.stderr)
+    images = write_image_step(detected, folder)
+    return run_case(values, personal, read_case(folder / CASE), images)
+
+
+def find_valve(
+    file: str | None, imaged: ImagedInput, folder: Path, *, estimate: bool = True
+) -> DetectedValve:
+    """The valve in the configured volume; a candidate that is not accepted is drawn.
+
+    Raises
+    ------
+    MvestError
+        As `detect_in_volume`, and if no file is configured.
+    """
+    if file is None:
+        raise ConfigurationError("volume is not given; expected volume=FILE, a volume over time")
+    with PartBar("valve in the frames", 0, "frame") as bar:
+        try:
+            return detect_in_volume(
+                file, imaged, estimate=estimate, progress=lambda _, count: bar.step(count)
+            )
+        except NoValveError as nothing:
+            if nothing.candidate is None:
+                raise
+            from mvest.reporting.images.step import draw_candidate
+
+            volume, low = read_for_case(Path(file), imaged), imaged.min_confidence
+            drawn = draw_candidate(volume, nothing.candidate, low, folder)
+            raise NoValveError(
+                f"{nothing}; the best candidate, not accepted, is drawn in {drawn}",
+                nothing.candidate,
+            ) from nothing
+
+
+def case_result(
+    estimate: EstimateRecord,
+    mesh: Mesh,
+    model: Model,
+    gate: str | None,
+    arrays: Mapping[str, Any],
+) -> Result:
+    """The result of a run that estimated one case."""
+    return Result(
+        tables={"": unknown_table(estimate.unknowns), "frames": frame_table(estimate.frames)},
+        estimates=(estimate,),
+        arrays=arrays,
+        status=estimate.status,
+        reason=estimate.reason,
+        detail=estimate.detail,
+        mesh=mesh,
+        forward_solves=estimate.forward_solves or 0,
+        row=estimate.case,
+        parameters=tuple(modulus.name for modulus in estimate.moduli),
+        model=model,
+        gate=gate,
+    )
+
+
+def case_words(record: Record) -> str:
+    """What a finished case says on the terminal: the verdict first."""
+    return estimate_text(record.estimates[0])
+
+
+def write_report(folder: Path, record: Record) -> list[Path]:
+    """The report of a run's first estimate, and its arrays drawn in it."""
+    from mvest.reporting.case.report import report
+
+    fields = folder / FIELDS
+    return report(
+        record.estimates[0],
+        folder,
+        arrays=fields if fields.is_file() else None,
+        line=record.line,
+        provenance=record.provenance.model_dump(),
+    )
 
 
 def expect_own(values: Values, _folder: Path | None = None) -> str:
@@ -141,34 +264,3 @@ def expect_own(values: Values, _folder: Path | None = None) -> str:
         else design_text(case.name, designs)
     )
     return f"{expectation_text(case.name, expected, noise)}\n{further}"
-
-
-def run_case(
-    values: Values,
-    personal: PersonalSettings,
-    case: ValveCase,
-    folder: Path,
-    image_step: ImageStep | None = None,
-    gate: str = NOT_GATED,
-) -> Outcome[Findings]:
-    """Personalise a case, of whose anatomy the gate said so; its arrays go to ``folder``."""
-    fields = folder / FIELDS
-    # Of an earlier run: there are none where no estimate is reached now.
-    fields.unlink(missing_ok=True)
-    for sentence in case.derived:
-        print(f"derived: {sentence}", file=sys.stderr)
-    for doubt in doubts(case):
-        print(f"doubtful: {doubt}", file=sys.stderr)
-    settings = with_pressures(case, settings_of(values, personal))
-    steps = len(settings.mechanics.protocol.steps())
-    free = [u.name for u in settings.unknowns if u.treatment is not Treatment.FIXED]
-    # As they are estimated: those of the closure first.
-    names = sorted(free, key=lambda name: name in REGISTRATION)
-    with SolveBar(case.name, steps, TYPICAL_SOLVES, names) as bar:
-        fit = personalise_case(
-            case, settings, store=mesh_store(values), on_step=bar.step, on_iterate=bar.iterate
-        )
-    if fit.distances:
-        np.savez_compressed(fields, **fields_of(fit))
-    shown = {key: dict(values[key]) for key in ("personal", "mechanics")}
-    return outcome_of_case(fit, shown, image_step, gate)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from experiments.common.schema import InputFile, Reads, contents
-from mvest.imaging.valve_sequence import MIN_CONFIDENCE
+from mvest.cases.from_images.settings import ImagedSettings
 from mvest.mechanics.settings import ExponentialTissue
 from mvest.observation.learned import ErrorBeliefs
 from mvest.personalisation.considered_geometry import ConsideredGeometry
 from mvest.personalisation.settings import CaseMesh, PaperSettings, PressureErrors
 
-__all__ = ["CaseInput", "ImagedSettings", "PersonalSettings", "UnknownSettings", "VolumeInput"]
+__all__ = ["CaseInput", "ImagedInput", "PersonalSettings", "UnknownSettings", "VolumeInput"]
 
 
 def _case(value: str, _beside: Mapping[str, Any]) -> Any:
@@ -66,27 +66,10 @@ class PersonalSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImagedSettings:
-    """From a volume over time to a case: what the file does not say."""
+class ImagedInput(ImagedSettings):
+    """From a volume to a case; what the settings name is read for the hash."""
 
-    model: InputFile = None  # file of the detection model; null: the one for ultrasound
-    package_model: str | None = "${package_model:}"  # SHA-256 of that one
-    modality: str | None = None  # ultrasound, ct or mr, where the file does not say
-    frame_interval_s: float | None = None  # where the file states no times
-    time_unit: str | None = None  # s or ms, where the file states times without a unit
-    # [frame, .mrk.json] with landmarks placed by hand, where the automatic ones fail.
+    model: InputFile = None
+    package_model: str | None = "${package_model:}"  # SHA-256 of the one for ultrasound
     landmarks: Annotated[tuple[Any, ...], Reads(contents)] = ()
-    open_frame: int | None = None  # null: the one with the largest orifice
-    closed_frame: int | None = None  # null: the one whose leaflets touch most
-    pressure_mmHg: float | None = None  # transmitral, in the closed frame
-    pressure_curve: InputFile = None  # .csv time,pressure (s, mmHg, the times of the volume)
-    held_out: tuple[Any, ...] = ()  # [frame, mmHg]: closed frames not shown
-    thickness_mm: tuple[float, ...] = ()  # anterior, posterior; empty: generic
-    # Of the best frame, below which there is no valve, and of the frames that are chosen.
-    min_confidence: float = MIN_CONFIDENCE
-    error_samples: int = 200  # at most, of held-out volumes, each also as seen in a mirror
-    name: str | None = None  # null: the name of the file
-    description: str = ""
-    source: str = ""
-    licence: str = ""
-    simulated: bool = False  # does the volume come from a simulation
+    pressure_curve: InputFile = None

@@ -121,6 +121,7 @@ def compute(request: Request) -> None:
             # Nobody can say of which content it is the result.
             reason = "a file or folder that the settings name was changed before the job ended"
             result = replace(result, status="failed", reason=reason)
+        (folder / FIELDS).unlink(missing_ok=True)  # of an earlier run
         if result.arrays:
             write_atomically(folder / FIELDS, partial(np.savez_compressed, **result.arrays))
         record = stamp(values, request.config_hash, result, started)

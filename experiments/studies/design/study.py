@@ -21,7 +21,7 @@ from experiments.studies.design.findings import Findings, Left, Tried
 from experiments.studies.design.report import design_answer, design_words, write_design
 from experiments.studies.design.settings import Corner, Settings
 from mvest.errors import ConfigurationError, GeometryError
-from mvest.personalisation.chain import personalise_case
+from mvest.personalisation.chain import personalise
 from mvest.personalisation.design import ERRORS_MMHG, GROUPS, KINDS, FrameDesigns, StatedErrors
 from mvest.personalisation.expectation import design_case
 from mvest.personalisation.model import build_coarse
@@ -151,7 +151,7 @@ def _tried(
     )
     pressures = PressureErrors(corner.offset_mmHg, corner.each_mmHg)
     patient = _patient(job, corner)
-    fit = personalise_case(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
+    fit = personalise(patient.case, replace(wanted, unknowns=unknowns, pressures=pressures))
     result, truth = fit.result, patient.hidden.values
     prior = {u.name: u for u in wanted.unknowns}
     for modulus, share in predicted.items():

@@ -1,5 +1,9 @@
 from .build import CaseTexts as CaseTexts
 from .build import case_of_sequence as case_of_sequence
+from .detected import DetectedValve as DetectedValve
+from .detected import detect_in_volume as detect_in_volume
+from .detected import image_step as image_step
+from .detected import write_detected as write_detected
 from .errors_in_world import samples_in_world as samples_in_world
 from .errors_in_world import valve_axes as valve_axes
 from .errors_in_world import without_expected_error as without_expected_error
@@ -15,3 +19,4 @@ from .measures import contact_distance as contact_distance
 from .measures import measure_meaning as measure_meaning
 from .measures import measure_sequence as measure_sequence
 from .measures import write_measures as write_measures
+from .settings import ImagedSettings as ImagedSettings

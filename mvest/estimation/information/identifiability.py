@@ -21,7 +21,7 @@ UNDETERMINED = ("not determined at all", "known to no better than its own size")
 
 
 @dataclass(frozen=True, slots=True)
-class Confounded:
+class TradeOff:
     """Parameters that make up for each other in the data.
 
     Attributes
@@ -125,7 +125,7 @@ class Identifiability:
         s, V = _singular(np.vstack([rows, more]))
         return np.sqrt(np.diagonal(_bound(self.scale, s, V)))
 
-    def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[Confounded, ...]:
+    def confounded(self, limit: float = 0.9, width: float = 0.05) -> tuple[TradeOff, ...]:
         """Groups of parameters that the data hardly tell apart, the largest group first.
 
         Two belong to one group if the size of their correlation at the bound is at least `limit`,
@@ -149,7 +149,7 @@ class Identifiability:
             exchange = scaled / scaled[first]
             order = [int(first), *others]
             groups.append(
-                Confounded(
+                TradeOff(
                     tuple(self.names[i] for i in order),
                     tuple(float(exchange[i]) for i in order),
                     float(size[first, others].min()),

@@ -18,7 +18,7 @@ from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["CaseFields", "read_case_fields", "turn_of"]
+__all__ = ["CaseFields", "case_fields", "read_case_fields", "turn_of"]
 
 POINTS = "observed_points_"
 SHAPES = ("rest", "observed", "generic", "registered", "fitted", "truth", "tips")
@@ -123,28 +123,48 @@ class CaseFields:
 
 
 def read_case_fields(path: Path, *, turned: bool = True) -> CaseFields:
-    """Read ``fields.npz`` and turn it: z to the atrium, the first leaflet towards positive y.
-
-    Parameters
-    ----------
-    path : Path
-        An ``.npz`` file with at least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames``
-        and ``seen``; the others as in `CaseFields`, and ``observed_points_<frame>``.
-    turned : bool
-        Otherwise it is left in the axes of the case.
+    """Read ``fields.npz``; see `case_fields`.
 
     Raises
     ------
     InputError
-        If the file cannot be read, lacks one of those, or arrays do not fit each other.
+        If the file cannot be read, or as `case_fields` does.
     """
     try:
         arrays = read_npz(path, where=path.name)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise InputError(f"{path}: no fields of a case ({one_line(error, 200)})") from error
+    return case_fields(arrays, turned=turned, where=str(path))
+
+
+def case_fields(
+    arrays: Mapping[str, Any] | Path, *, turned: bool = True, where: str = "arrays"
+) -> CaseFields:
+    """The fields of a case, turned: z to the atrium, the first leaflet towards positive y.
+
+    Parameters
+    ----------
+    arrays : mapping or Path
+        At least ``triangles``, ``region``, ``rest``, ``annulus``, ``frames`` and ``seen``; the
+        others as in `CaseFields`, and ``observed_points_<frame>``; or the ``.npz`` file of them.
+    turned : bool
+        Otherwise it is left in the axes of the case.
+    where : str
+        Names the arrays in an error.
+
+    Raises
+    ------
+    InputError
+        If one of those is missing, or arrays do not fit each other.
+    """
+    if isinstance(arrays, Path):
+        return read_case_fields(arrays, turned=turned)
+    try:
         points = {k.removeprefix(POINTS): v for k, v in arrays.items() if k.startswith(POINTS)}
         fields = _fields(arrays, points)
         return _turned(fields) if turned else fields
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise InputError(f"{path}: no fields of a case ({one_line(error, 200)})") from error
+        raise InputError(f"{where}: no fields of a case ({one_line(error, 200)})") from error
 
 
 def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> CaseFields:

@@ -1,4 +1,4 @@
-"""Pictures of one case on the valve itself: shapes, distances, information and innovation."""
+"""Figures of one case: shapes, distances, intervals, and what would narrow them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, PowerNorm
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
+from mvest.cases.case import Role, ValveCase
 from mvest.errors import InputError
+from mvest.problem.record import EstimateRecord, Row, Spread, Unknown
 from mvest.reporting.case.drawing import (
     ATRIUM,
     SIDE,
@@ -23,24 +26,27 @@ from mvest.reporting.case.drawing import (
     paint_leak,
     same_scale,
 )
-from mvest.reporting.case.fields import CaseFields, read_case_fields
-from mvest.reporting.case.information import Information
-from mvest.reporting.figures import DISTANCE_MAP
-from mvest.reporting.findings import Spread
+from mvest.reporting.case.fields import CaseFields, read_case_fields, turn_of
+from mvest.reporting.figures import COLOURS, DISTANCE_MAP
 from mvest.typing import FloatArray, IntArray
+from mvest.valve.geometry.surface_coordinates import boundary_loops
 
 __all__ = [
     "case_figure",
+    "corner_colours",
     "distance_top",
+    "estimates_figure",
     "figure3_caption",
-    "information_figure",
-    "innovation_map_figure",
+    "fitted_figure",
+    "frames_figure",
+    "narrower_figure",
     "shapes_figure",
-    "views_figure",
 ]
 
-INFORMATION_MAP = "YlOrRd"
 HIGH_QUANTILE = 0.99
+PRIOR, POSTERIOR, WITHOUT = "0.75", COLOURS[0], COLOURS[1]
+TWO_SIDED = 1.96
+"""Standard deviations within which 95 % of a normal distribution lie."""
 
 
 def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
@@ -53,10 +59,10 @@ def shapes_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
         shapes.append(("closed, personalised model", fields.fitted[k], k + 1))
     elif fields.generic is not None:
         shapes.append(("closed, generic model", fields.generic[k], k + 1))
-    return views_figure([(title, fields, points, frame) for title, points, frame in shapes], names)
+    return _views_figure([(title, fields, points, frame) for title, points, frame in shapes], names)
 
 
-def views_figure(
+def _views_figure(
     shapes: Sequence[tuple[str, CaseFields, FloatArray, int]], names: Sequence[str]
 ) -> Figure:
     """Shapes of valves from two sides: title, valve, positions ``(n, 3)`` mm and whose tips."""
@@ -78,6 +84,47 @@ def views_figure(
         same_scale(grid[row], reach, view)
         _say_view(grid[row, 0], f"seen {view.name}")
     return figure
+
+
+def frames_figure(case: ValveCase, reach_mm: float) -> Figure:
+    """The frames of a case as they were given, from two sides.
+
+    Parameters
+    ----------
+    case : ValveCase
+    reach_mm : float
+        Distance of midsurfaces within which leaflets touch: the gap of the closed frame is drawn.
+    """
+    surface, chordae = case.surface, case.chordae
+    tips = case.frame(Role.REFERENCE).papillary_tips
+    middle, axes = turn_of(surface.vertices, case.annulus, surface.triangles, surface.region, tips)
+    shapes, none = [], np.zeros(0, dtype=np.int64)
+    for frame in case.frames:
+        at_rest, shut = frame.role is Role.REFERENCE, frame.role is Role.CLOSED
+        vertices, annulus = ((x - middle) @ axes for x in (frame.vertices, frame.annulus))
+        ring = cKDTree(annulus)
+        gaps = [(np.mean(ring.query(vertices[loop])[0]), loop) for loop in
+                boundary_loops(frame.triangles)]  # fmt: skip
+        loops = [loop for _, loop in sorted(gaps, key=lambda one: float(one[0]))]
+        insertion = (chordae.insertion - middle) @ axes
+        fields = CaseFields(
+            frame.triangles,
+            frame.region,
+            vertices,
+            loops[0],
+            loops[-1],
+            (frame.name,),
+            np.array([True]),
+            np.stack([(frame.papillary_tips - middle) @ axes] * 2),
+            chordae.tip if at_rest else none,
+            np.asarray(cKDTree(vertices).query(insertion)[1]) if at_rest else none,
+            {},
+            reach_mm=reach_mm if shut else None,
+        )
+        title = f"{frame.name} ({frame.role.value})\n{frame.time:g} s, {frame.pressure_mmHg:g} mmHg"
+        # Of a closed one the gap is drawn, as of a frame that is not the reference.
+        shapes.append((title, fields, vertices, int(shut)))
+    return _views_figure(shapes, surface.region_names)
 
 
 def case_figure(fields: CaseFields | Path, names: Sequence[str] = ()) -> Figure:
@@ -206,64 +253,6 @@ def distance_top(*distances: FloatArray) -> float:
     return float(step * np.ceil(top / step - 1e-9))
 
 
-def information_figure(fields: CaseFields, informations: Sequence[Information]) -> Figure:
-    """Where on the closed valve each modulus shows: alone (top), and beyond nuisances (bottom).
-
-    Parameters
-    ----------
-    fields : CaseFields
-        With the fitted shape.
-    informations : sequence of Information
-        One for each modulus; the two maps of one share its colour scale.
-    """
-    if not informations:
-        raise InputError("the run stored no sensitivities that fit its parameters")
-    points = _closed_shape(fields)
-    figure = Figure(figsize=(max(3.1 * len(informations), 4.6), 6.0), layout="constrained")
-    grid = figure.subplots(2, len(informations), squeeze=False)
-    for column, information in enumerate(informations):
-        top = max(float(np.nanmax(information.raw)), 1e-12)
-        scale = ScalarMappable(PowerNorm(0.5, 0.0, top), INFORMATION_MAP)
-        for row, field in enumerate((information.raw, information.beyond)):
-            axes = grid[row, column]
-            colours = corner_colours(scale, field, fields.triangles)
-            draw_valve(axes, fields, points, colours, ATRIUM, fields.closed + 1, strength=0.2)
-            paint_leak(axes, fields, points, fields.closed + 1)
-            share = "" if row == 0 else f"{100 * information.kept:.0f} % remains"
-            axes.set_title(information.label if row == 0 else share, fontsize=10)
-        bar = figure.colorbar(scale, ax=grid[:, column], orientation="horizontal", shrink=0.85)
-        bar.set_label("information per point", fontsize=8)
-        bar.ax.tick_params(labelsize=7)
-        bar.set_ticks([0.0, 0.25 * top, top], labels=["0", f"{0.25 * top:.2g}", f"{top:.2g}"])
-    for row, text in enumerate(("the modulus alone", "beyond what the nuisances explain")):
-        same_scale(grid[row], [points], ATRIUM)
-        _say_view(grid[row, 0], text)
-    return figure
-
-
-def innovation_map_figure(fields: CaseFields, names: Sequence[str]) -> Figure:
-    """Size of the standardised innovation on the closed valve, rms of the three coordinates."""
-    if fields.innovation is None:
-        raise InputError("a map of the innovation needs the innovation")
-    size = np.sqrt((fields.innovation**2).mean(axis=1))
-    points = _closed_shape(fields)
-    top = max(2.0, distance_top(size))
-    scale = ScalarMappable(Normalize(0.0, top), "cividis")
-    figure = Figure(figsize=(8.6, 3.6), layout="constrained")
-    grid = figure.subplots(1, 2, width_ratios=[1.0, 1.1])
-    for axes, view in zip(grid, VIEWS, strict=True):
-        colours = corner_colours(scale, size, fields.triangles)
-        draw_valve(axes, fields, points, colours, view, fields.closed + 1, strength=0.2)
-        same_scale([axes], [points], view)
-        axes.set_title(f"seen {view.name}", fontsize=10, pad=14)
-    paint_leak(grid[0], fields, points, fields.closed + 1)
-    name_leaflets(grid[0], fields, names)
-    beyond = np.nanmax(size) > top
-    bar = figure.colorbar(scale, ax=grid, shrink=0.85, extend="max" if beyond else "neither")
-    bar.set_label("innovation over its predicted SD\n(about 1 where the model fits)")
-    return figure
-
-
 def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArray) -> FloatArray:
     """Colours ``(m, 3, 3)`` of the corners of triangles from a field ``(n,)``.
 
@@ -275,14 +264,112 @@ def corner_colours(scale: ScalarMappable, values: FloatArray, triangles: IntArra
     return np.where(whole[:, None, None], colours[triangles], UNSEEN)
 
 
-def _closed_shape(fields: CaseFields) -> FloatArray:
-    for shape in (fields.fitted, fields.generic, fields.observed):
-        if shape is not None:
-            return shape[fields.closed]
-    return fields.rest
-
-
 def _say_view(axes: Any, text: str) -> None:
     axes.text(
         -0.03, 0.5, text, transform=axes.transAxes, rotation=90, ha="right", va="center", fontsize=9
     )
+
+
+def estimates_figure(record: EstimateRecord) -> Figure:
+    """Each unknown with its 95 % intervals: prior, estimate, and the truth if it is known.
+
+    Moduli are in their units, nuisances in standard deviations of the prior from its mean.
+
+    Raises
+    ------
+    InputError
+        If there is no unknown.
+    """
+    nuisances = [one for one in record.unknowns if one.kind == "nuisance"]
+    groups = [group for group in (list(record.moduli), nuisances) if group]
+    if not groups:
+        raise InputError("a case without free parameters has no intervals to draw")
+    alone = record.alternatives.get("moduli_only")
+    without = {} if alone is None else {one.name: one for one in alone.moduli}
+    rows = [len(group) + 0.6 for group in groups]
+    figure = Figure(figsize=(8.2, 1.5 + 0.62 * sum(rows)), layout="constrained")
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=rows)[:, 0]
+    for axes, group in zip(panels, groups, strict=True):
+        in_sd = group is nuisances
+        for row, unknown in enumerate(group):
+            _intervals(axes, row, unknown, without.get(unknown.name), in_sd)
+        axes.set_yticks(range(len(group)), [p.label for p in group])
+        axes.set_ylim(len(group) - 0.45, -0.55)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        axes.grid(axis="x", alpha=0.3)
+        if in_sd:
+            axes.axvline(0.0, color="0.6", linewidth=0.8)
+            axes.set_xlabel("nuisances: prior standard deviations from the prior mean")
+        else:
+            units = dict.fromkeys(p.unit for p in group)
+            axes.set_xlabel(f"modulus [{', '.join(units)}]")
+            axes.set_xlim(left=0.0)
+    handles: dict[str, Any] = {}
+    for axes in panels:
+        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside upper center", ncols=2, frameon=False,
+        fontsize=8,
+    )  # fmt: skip
+    return figure
+
+
+def _intervals(axes: Any, row: int, unknown: Unknown, without: Unknown | None, in_sd: bool) -> None:
+    mean, std = unknown.prior_mean or 0.0, unknown.prior_std or 0.0
+    shift, scale = (mean, std or 1.0) if in_sd else (0.0, 1.0)
+
+    def place(*values: Any) -> Any:
+        return (np.array(values, dtype=float) - shift) / scale
+
+    ends = place(mean - TWO_SIDED * std, mean + TWO_SIDED * std)
+    axes.plot(ends, [row, row], color=PRIOR, linewidth=11, solid_capstyle="butt",
+              label="prior, 95 %")  # fmt: skip
+    shown: tuple[tuple[Unknown | None, str, float, str, str], ...] = (
+        (unknown, POSTERIOR, -0.09, "o", "estimate with its 95 % interval"),
+        (without, WITHOUT, 0.17, "s", "estimate if the nuisances were taken as known"),
+    )
+    for source, colour, offset, marker, label in shown:
+        # A marginalised nuisance keeps its prior.
+        if source is None or source.estimate is None or source.treatment == "considered":
+            continue
+        if source.low is not None and source.high is not None:
+            axes.plot(place(source.low, source.high), [row + offset] * 2, color=colour,
+                      linewidth=2.2, solid_capstyle="butt")  # fmt: skip
+        axes.plot(place(source.estimate), [row + offset], marker, color=colour, markersize=6,
+                  label=label)  # fmt: skip
+    if unknown.truth is not None:
+        axes.plot(place(unknown.truth), [row], "x", color="black", markersize=9,
+                  markeredgewidth=2, label="truth of the simulation", zorder=5)  # fmt: skip
+
+
+def narrower_figure(rows: Sequence[Row]) -> Figure:
+    """By how much the standard deviation of a modulus would fall if more were measured.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        ``what``, ``std_now`` and ``std_if_known`` (see `mvest.personalisation.record`).
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if not rows:
+        raise InputError("the run did not compute what else would narrow the intervals")
+    share = {row["what"]: 100 * row["std_if_known"] / row["std_now"] for row in rows}
+    share = dict(sorted(share.items(), key=lambda one: -one[1]))
+    figure = Figure(figsize=(7.6, 1.1 + 0.42 * len(share)), layout="constrained")
+    axes = figure.subplots()
+    axes.barh(range(len(share)), list(share.values()), color=COLOURS[0], height=0.62)
+    for row, value in enumerate(share.values()):
+        axes.annotate(f"{value:.0f} %", (value, row), xytext=(3, 0), textcoords="offset points",
+                      va="center", fontsize=8)  # fmt: skip
+    axes.axvline(100.0, color="0.4", linewidth=1, linestyle="--")
+    axes.set_yticks(range(len(share)), list(share))
+    axes.set_xlim(0.0, max(112.0, *(1.08 * value for value in share.values())))
+    axes.set_xlabel("width of the interval if this were measured, % of its width now")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    return figure

@@ -1,7 +1,7 @@
 """``report.html`` of one case: what was estimated, how far to trust it, and what it rests on.
 
 The page opens from disk and loads nothing: pictures and the script of the turnable valve are in
-it, and its content policy forbids every request. Text of the findings is escaped by the template.
+it, and its content policy forbids every request. Text of the record is escaped by the template.
 """
 
 from __future__ import annotations
@@ -9,106 +9,144 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
+from mvest.cases.from_images.detected import DetectedValve
 from mvest.errors import InputError, cannot_write
 from mvest.files import write_atomically
-from mvest.reporting.case import words
-from mvest.reporting.case.fields import CaseFields, read_case_fields
+from mvest.personalisation.record import arrays_of_case, record_of_case
+from mvest.personalisation.result import Personalised
+from mvest.problem.record import EstimateRecord
+from mvest.reporting.case.fields import CaseFields, case_fields
 from mvest.reporting.case.figures import (
     MIDSURFACES,
     case_figure,
+    estimates_figure,
     figure3_caption,
-    information_figure,
-    innovation_map_figure,
+    narrower_figure,
     shapes_figure,
 )
-from mvest.reporting.case.findings import CaseFindings
-from mvest.reporting.case.information import Information, information, where_words
-from mvest.reporting.case.plots import (
-    distances_figure,
-    estimates_figure,
-    innovation_figure,
-    iterations_figure,
-    narrow_figure,
-)
+from mvest.reporting.case.tables import report_tables, unknown_table
 from mvest.reporting.case.view import case_view
+from mvest.reporting.expectation import alike_words
 from mvest.reporting.figures import save_figure_with
+from mvest.reporting.images.step import write_image_step
+from mvest.reporting.markup import ended, number
 from mvest.reporting.page import TEMPLATES, rendered
 from mvest.reporting.pictures import embedded
 
-__all__ = ["REPORT", "write_case_report"]
+__all__ = ["REPORT", "UNKNOWNS", "report"]
 
-REPORT = "report.html"
+REPORT, UNKNOWNS = "report.html", "unknowns.csv"
 SCRIPT = TEMPLATES / "case_report.js"
 FULL_WIDTH_INCHES = 8.6
 """Of a picture as wide as the page; print is equally large in narrower ones."""
-FLAT_SHARE = 0.25
-"""A modulus of whose information less than this remains is said to hide behind the nuisances."""
+HASH_DIGITS = 12
 
 
-def write_case_report(
-    folder: Path,
-    case: CaseFindings,
-    fields: Path,
+def report(
+    result: Personalised | EstimateRecord,
+    folder: Path | str,
+    *,
+    arrays: Mapping[str, Any] | Path | None = None,
+    images: DetectedValve | None = None,
     line: str = "",
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the page of a case and its pictures (PNG and PDF); returns their paths.
+    """Write ``unknowns.csv`` and, of an estimate, ``report.html`` with its figures.
 
     Parameters
     ----------
+    result : Personalised or EstimateRecord
     folder : Path
         Made if it does not exist.
-    case : CaseFindings
-        Whatever is missing is left out of the page, with a sentence in its place.
-    fields : Path
-        The ``.npz`` file of `mvest.reporting.case.fields.read_case_fields`.
+    arrays : mapping or Path, optional
+        Of a record: those of `mvest.personalisation.record.arrays_of_case`, or the ``.npz`` file
+        that holds them. Without them there is no page.
+    images : DetectedValve, optional
+        The valve in a volume that the case was made of; its measures and files are written, too.
     line : str
-        Where the findings came from, for the foot of each picture.
+        Where the record came from, for the foot of each picture.
     provenance : mapping, optional
         The same in full, for the end of the page.
+
+    Returns
+    -------
+    list of Path
+        The files, ``unknowns.csv`` first.
 
     Raises
     ------
     InputError
-        If the fields cannot be read, do not fit the findings, or a file cannot be written.
+        If arrays cannot be read, do not fit the record, or a file cannot be written.
     """
-    shapes = read_case_fields(fields)
+    folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise cannot_write(folder, error) from error
-    names = words.leaflet_names(case, int(shapes.region.max()) + 1)
-    informations = information(shapes, case.unknowns, case.observation_std_mm)
-    note = words.provenance_note(case, line)
-    marked = " Simulated." if case.about.simulated else ""
+    step = None if images is None else write_image_step(images, folder)
+    if isinstance(result, Personalised):
+        record, arrays = record_of_case(result, images=step), arrays or arrays_of_case(result)
+    else:
+        record = result
+    written = [write_atomically(folder / UNKNOWNS, unknown_table(record.unknowns).csv())]
+    if not arrays:
+        return written
+    return [*written, *_write_page(folder, record, case_fields(arrays), line, provenance or {})]
+
+
+def _write_page(
+    folder: Path,
+    record: EstimateRecord,
+    shapes: CaseFields,
+    line: str,
+    provenance: Mapping[str, Any],
+) -> list[Path]:
+    """The page and its pictures."""
+    about = _first(record, "about")
+    regions, known = int(shapes.region.max()) + 1, about["regions"] or ()
+    names = known if len(known) == regions else [f"leaflet {k + 1}" for k in range(regions)]
+    sha256 = about["sha256"] or ""
+    note = ", ".join(
+        filter(
+            None,
+            (
+                about["description"] or record.case,
+                "simulated" if record.simulated else "",
+                f"case {sha256[:HASH_DIGITS]}" if sha256 else "",
+                line,
+            ),
+        )
+    )
+    marked = " Simulated." if record.simulated else ""
     written: list[Path] = []
     pictures: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
-    for name, make, caption in _figures(case, shapes, names, informations):
+    for name, make, caption in _figures(record, shapes, names):
         try:
-            figure = make()
+            figure, text = make(), caption()
         except InputError as error:
             missing[name] = f"Not shown: {error}."
             continue
         paths = save_figure_with(folder / name, figure, note)
         share = min(float(figure.get_figwidth()) / FULL_WIDTH_INCHES, 1.0)
-        pictures[name] = embedded(paths[0], (caption or figure3_caption(shapes)) + marked) | {
-            "percent": round(100 * share)
-        }
+        pictures[name] = embedded(paths[0], text + marked) | {"percent": round(100 * share)}
         written += paths
-    for name, shown in (case.image_step.pictures if case.image_step else {}).items():
+    for row in record.detail_rows("pictures"):
         # Drawn with the volume at hand, and kept beside the page.
         try:
-            pictures[name] = embedded(folder / shown.file, shown.caption) | {"percent": 100}
+            pictures[row["file"]] = embedded(folder / row["file"], row["caption"])
+            pictures[row["file"]]["percent"] = 100
         except InputError as error:
-            missing[name] = f"Not shown: {error}."
+            missing[row["file"]] = f"Not shown: {error}."
     view = case_view(shapes, names)
+    labels = {one.name: one.label or one.name for one in record.unknowns}
     page = rendered(
         "case_report.html.jinja",
         scripts=_policy(view.markup, SCRIPT.read_text(encoding="utf-8")),
@@ -116,17 +154,27 @@ def write_case_report(
         missing=missing,
         view=view,
         files=[path.name for path in written],
-        case=case,
-        words=words,
-        where=_where(shapes, names, informations),
-        provenance=words.setting_rows(
-            {
-                **(provenance or {}),
-                **({"case files, SHA-256": case.about.sha256} if case.about.sha256 else {}),
-            }
-        ),
+        record=record,
+        about=about,
+        step=_first(record, "image_step"),
+        tables=defaultdict(list, {k: one.readable() for k, one in report_tables(record).items()}),
+        confounded=[alike_words(group, labels) for group in record.confounded],
+        labels=labels,
+        number=number,
+        ended=ended,
+        provenance=[
+            {"": name, "value": str(value)}
+            for name, value in (_flat(provenance) | {"case files, SHA-256": sha256}).items()
+            if value
+        ],
     )
     return [write_atomically(folder / REPORT, page), *written]
+
+
+def _first(record: EstimateRecord, name: str) -> Mapping[str, Any]:
+    """The only row of a detail, in which what is missing is None."""
+    rows = record.detail_rows(name)
+    return defaultdict(lambda: None, rows[0]) if rows else defaultdict(lambda: None)
 
 
 def _policy(scene: str, script: str) -> str:
@@ -136,79 +184,38 @@ def _policy(scene: str, script: str) -> str:
     return " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
 
 
+def _flat(values: Mapping[str, Any], name: str = "") -> dict[str, Any]:
+    """Nested values under dotted names."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        full = f"{name}.{key}" if name else str(key)
+        flat |= _flat(value, full) if isinstance(value, Mapping) else {full: value}
+    return flat
+
+
 def _figures(
-    case: CaseFindings,
-    shapes: CaseFields,
-    names: Sequence[str],
-    informations: Sequence[Information],
-) -> list[tuple[str, Callable[[], Figure], str]]:
-    """Name, drawing and caption of each picture; a drawing raises where something is missing."""
+    record: EstimateRecord, shapes: CaseFields, names: Sequence[str]
+) -> list[tuple[str, Callable[[], Figure], Callable[[], str]]]:
+    """Name, drawing and caption of each picture; they raise where something is missing."""
     return [
         (
             "shapes",
             lambda: shapes_figure(shapes, names),
-            "The valve open and closed, from the atrium and from the side. Colours tell the "
-            "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary "
-            "tips. " + MIDSURFACES,
+            lambda: (
+                "The valve open and closed, from the atrium and from the side. Colours tell the "
+                "leaflets apart; thick line: annulus; thin: free edge and chordae; dots: papillary "
+                f"tips. {MIDSURFACES}"
+            ),
         ),
-        ("figure3", lambda: case_figure(shapes, names), ""),
+        ("figure3", lambda: case_figure(shapes, names), lambda: figure3_caption(shapes)),
         (
             "estimates",
-            lambda: estimates_figure(case),
-            "What was believed before the images (grey) and what they add (blue).",
+            lambda: estimates_figure(record),
+            lambda: "What was known before the images (grey) and what they add (blue).",
         ),
         (
-            "identifiability",
-            lambda: information_figure(shapes, informations),
-            "Fisher information on the logarithm of each modulus that each observed point of the "
-            "closed valve adds, seen from the atrium. Dark: how the valve closes there depends on "
-            "the modulus. Both pictures of a column have one colour scale, which is finer for "
-            "small values. Grey: not observed.",
-        ),
-        ("iterations", lambda: iterations_figure(case), "How the filter got there."),
-        (
-            "innovation",
-            lambda: innovation_figure(shapes),
-            "The innovation (observed minus predicted before the update), each over its predicted "
-            "standard deviation. Left: histogram. Right: its quantiles; points on the line mean "
-            "that it is distributed as the filter assumes.",
-        ),
-        (
-            "innovation_map",
-            lambda: innovation_map_figure(shapes, names),
-            "Where on the closed valve the innovation is large.",
-        ),
-        (
-            "distances",
-            lambda: distances_figure(case.distances),
-            "Distance between model and observed valve in each frame.",
-        ),
-        (
-            "narrow",
-            lambda: narrow_figure(case.narrow),
-            "Standard deviation of the estimate if one more thing were measured.",
+            "narrower",
+            lambda: narrower_figure(record.detail_rows("narrower")),
+            lambda: "Standard deviation of each modulus if one more thing were measured.",
         ),
     ]
-
-
-def _where(
-    shapes: CaseFields, names: Sequence[str], informations: Sequence[Information]
-) -> list[dict[str, str]]:
-    """A sentence for each modulus: which part of the valve informs it, and what remains of that."""
-    rows = []
-    for one in informations:
-        parts = where_words(shapes, one.raw, names)
-        if not parts:
-            text = "the closed valve does not depend on it at all."
-        else:
-            places = ", ".join(f"{place} ({words.percent(share)})" for place, share in parts)
-            text = f"learnt mostly from the {places}. "
-            text += f"{words.percent(one.kept)} of the information remains beyond the nuisances"
-            if one.kept < FLAT_SHARE:
-                text += ": what the images show of it could as well be their doing"
-            elif beyond := where_words(shapes, one.beyond, names, 1):
-                place, share = beyond[0]
-                text += f", the largest part of it in the {place} ({words.percent(share)})"
-            text += "."
-        rows.append({"label": one.label, "text": text})
-    return rows

@@ -4,16 +4,24 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from experiments.common.cases import blind
-from experiments.common.cases.blind import ESTIMATE, SECRET, estimate_blindly
+from experiments.common.cases.blind import (
+    ESTIMATE,
+    SECRET,
+    estimate_blindly,
+    read_estimate,
+    write_estimate,
+)
+from experiments.common.cases.own_case import case_result
+from experiments.common.records.record import Mesh, Model
 from mvest.errors import InputError
-from tests.experiments.studies.made_up_patients import an_outcome
+from mvest.problem.record import EstimateRecord, Unknown
 from tests.places import ROOT
 
 WAYS = {
@@ -123,6 +131,26 @@ def test_a_walk_does_not_name_what_is_sealed(attempts):
     assert names.count("hidden.json") == 2
 
 
+def a_result():
+    moduli = (Unknown(name="E_f.anterior", estimate=5.0), Unknown(name="E_f.posterior"))
+    estimate = EstimateRecord(
+        case="made_up", status="converged", reason="converged", unknowns=moduli, forward_solves=7
+    )
+    mesh, model = Mesh(sha256="0" * 64, nodes=5), Model(element="hex18", cells=(8, 2, 1))
+    return case_result(estimate, mesh, model, "passed", {"rest": np.eye(3)})
+
+
+def test_what_the_process_leaves_is_read_as_it_was(tmp_path):
+    left = a_result()
+    write_estimate(tmp_path, left)
+    found = read_estimate(tmp_path)
+    assert found.estimates == left.estimates
+    assert (found.mesh, found.model, found.gate) == (left.mesh, left.model, left.gate)
+    assert (found.row, found.parameters) == ("made_up", ("E_f.anterior", "E_f.posterior"))
+    assert found.forward_solves == 7
+    np.testing.assert_array_equal(found.arrays["rest"], np.eye(3))
+
+
 def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
     """What the process is asked, and what comes of its answer."""
     heard = []
@@ -130,7 +158,7 @@ def asked(monkeypatch, tmp_path, values, answer=None, returncode=0, stderr=""):
     def run(command, *, input, env, **options):
         heard.append(SimpleNamespace(command=command, text=input, env=env))
         if answer is not None:
-            (tmp_path / ESTIMATE).write_text(json.dumps(answer))
+            write_estimate(tmp_path, answer)
         return SimpleNamespace(returncode=returncode, stderr=stderr)
 
     monkeypatch.setattr(blind, "run", run)
@@ -153,15 +181,15 @@ VALUES = {
 
 
 def test_the_process_is_given_nothing_of_the_patient(monkeypatch, tmp_path):
-    left = an_outcome(5.0, 2.5)
-    heard, outcome = asked(monkeypatch, tmp_path, VALUES, asdict(left))
+    left = a_result()
+    heard, found = asked(monkeypatch, tmp_path, VALUES, left)
     given = json.loads(heard.text)["values"]
     assert not set(SECRET) & set(given)
     for secret in ("4.321", "13.579", "24680"):
         assert secret not in heard.text.replace(str(tmp_path), "")
     assert given["case"] == "case"
     assert given["personal"] == VALUES["personal"]
-    assert outcome == left
+    assert found.estimates == left.estimates
     assert not any("4.321" in value or "24680" in value for value in heard.env.values())
 
 

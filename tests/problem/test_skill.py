@@ -1,10 +1,9 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
 
-from experiments.common.cases.skill import (
+from mvest.problem.record import Unknown
+from mvest.problem.skill import (
     PRIOR_STD,
     baselines,
     generic_guess,
@@ -12,14 +11,14 @@ from experiments.common.cases.skill import (
     prior_alone,
     score,
     share_bounds,
-    skill_words,
+    skill,
 )
-from mvest.reporting.case.findings import UnknownRow
+from tests.places import CONF
 
 
-def answered(truth, estimate, low, high, generic) -> UnknownRow:
+def answered(truth, estimate, low, high, generic) -> Unknown:
     # Believed within a factor of 1.48.
-    return UnknownRow(
+    return Unknown(
         name="E_f.anterior", label="", unit="MPa", kind="modulus", treatment="estimated",
         prior_mean=generic, prior_std=0.2 * generic, estimate=estimate, low=low, high=high,
         truth=truth,
@@ -34,18 +33,20 @@ def test_errors_stand_beside_the_generic_guess_and_runs_lost_count_as_misses():
         answered(2.0, 3.0, 1.0, 5.0, 2.0),
         answered(1.0, None, None, None, 2.0),
     ]
-    assert skill_words(asked) == (
-        "2 of 4 moduli lie inside their 95 % intervals (1 inside those of the prior alone); the "
-        "median error is 20.0 %, that of the generic guess 50.0 %; 1 without an estimate."
-    )
+    assert skill(asked) == {
+        "n": 4,
+        "without_estimate": 1,
+        "inside": 2,
+        "inside_prior_alone": 1,
+        "median_error": pytest.approx(0.2),
+        "median_error_generic_guess": pytest.approx(0.5),
+    }
 
 
 def test_without_an_estimate_there_is_no_error_to_compare():
-    words = skill_words([answered(1.0, None, None, None, 2.0)])
-    assert words == (
-        "0 of 1 moduli lie inside their 95 % intervals (0 inside those of the prior alone); 1 "
-        "without an estimate."
-    )
+    found = skill([answered(1.0, None, None, None, 2.0)])
+    assert (found["n"], found["inside"], found["without_estimate"]) == (1, 0, 1)
+    assert found["median_error"] is found["median_error_generic_guess"] is None
 
 
 def test_what_anyone_could_say():
@@ -56,7 +57,7 @@ def test_what_anyone_could_say():
     assert before.low == pytest.approx(5.0 * np.exp(-1.95996 * 0.2), rel=1e-5)
     assert log_width(before) == pytest.approx(2 * 1.95996 * 0.2, rel=1e-5)
     assert before.inside is False
-    shift = UnknownRow(
+    shift = Unknown(
         name="shift.x", label="", unit="mm", kind="nuisance", treatment="estimated",
         prior_mean=0.0, prior_std=1.0, truth=-1.0,
     )  # fmt: skip
@@ -96,15 +97,15 @@ def test_what_stands_below_a_table_of_estimates():
     ]
     guess, before = baselines(rows)
     # 5 for 10, 4 and 8: 50 %, 25 % and 37.5 %, runs without an estimate included.
-    assert (guess.what, guess.n, guess.error) == ("generic guess", 0, pytest.approx(0.375))
-    assert guess.words == "5; median error 37.5 %"
+    assert (guess["what"], guess["low"], guess["n"]) == ("generic guess", None, 0)
+    assert guess["median_error"] == pytest.approx(0.375)
     # 5 within a factor of exp(1.96 x 0.2) = 1.48 of 4, and neither of 10 nor of 8.
-    assert (before.what, before.inside, before.n) == ("prior alone", 1, 3)
-    assert before.words == "5 (3.38 to 7.4); median error 37.5 %, 1 of 3 inside"
+    assert (before["what"], before["inside"], before["n"]) == ("prior alone", 1, 3)
+    assert (before["low"], before["high"]) == pytest.approx((3.38, 7.40), abs=0.01)
 
 
 def test_the_prior_of_tables_is_that_of_the_configuration():
-    text = (Path(__file__).parents[3] / "conf" / "personal" / "nuisances.yaml").read_text()
+    text = (CONF / "personal" / "nuisances.yaml").read_text()
     for name, about in yaml.safe_load(text)["unknowns"].items():
         if name.startswith("E_f."):
             assert about["std"] / about["mean"] == pytest.approx(PRIOR_STD, abs=0.005)

@@ -1,1 +1,0 @@
-"""One's own valve: a folder of data to moduli with intervals."""

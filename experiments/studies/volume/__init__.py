@@ -1,1 +1,0 @@
-"""A volume over time to moduli with intervals."""

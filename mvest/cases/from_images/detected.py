@@ -1,0 +1,385 @@
+"""A volume over time to a case: the valve is detected, measured, and written for other software."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.cases.case import ValveCase
+from mvest.cases.from_images.build import CaseTexts, case_of_sequence
+from mvest.cases.from_images.errors_in_world import samples_in_world, without_expected_error
+from mvest.cases.from_images.files import write_for_slicer, write_surfaces
+from mvest.cases.from_images.frame_choice import CaseFrames, choose_frames
+from mvest.cases.from_images.measure_bands import with_bands
+from mvest.cases.from_images.measures import Row, closed_frame, measure_sequence, write_measures
+from mvest.cases.from_images.settings import LEAFLETS, ImagedSettings
+from mvest.cases.pressure_curve import PressureCurve
+from mvest.cases.tissue import GENERIC_THICKNESS
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.trained_model import (
+    DetectionAccuracy,
+    DetectionModel,
+    default_model,
+    load_model,
+)
+from mvest.imaging.landmarks import ANNULUS_LABELS, LANDMARKS
+from mvest.imaging.learning.accuracy import unlike_share
+from mvest.imaging.markups import read_markups
+from mvest.imaging.models import MODEL_FILE
+from mvest.imaging.reading.reader import read_volume
+from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.volume import Modality, VolumeSequence
+from mvest.reading.table import read_numbers
+from mvest.typing import FloatArray, IntArray
+
+__all__ = ["CASE", "IMAGES", "DetectedValve", "called", "detect_in_volume", "image_step",
+           "read_for_case", "write_detected"]  # fmt: skip
+
+IMAGES, CASE = "images", "case"
+"""Folders of measures, surfaces and landmarks, and of the case."""
+
+STAND_IN_MMHG = 100.0
+"""Pressure of a case without one: it is checked, and neither written nor estimated."""
+
+NO_PRESSURE = (
+    "No pressure is given, so no case is written; an estimate will need imaged.pressure_mmHg or "
+    "imaged.pressure_curve, the transmitral pressure on the closed valve."
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedValve:
+    """The valve that was detected in a volume, and the case that it makes.
+
+    Attributes
+    ----------
+    volume : VolumeSequence
+    valve : ValveSequence
+    rows : list of dict
+        Measures of every frame.
+    frames : CaseFrames
+        Those that the case is made of.
+    case : ValveCase
+        With a stand-in for the pressure if none is stated.
+    settings : ImagedSettings
+    model_sha256 : str
+        Of the detection model.
+    trained_on : mapping
+        What that model says of its training.
+    unlike : str
+        How the volume is unlike those of training; empty if it is not.
+    """
+
+    volume: VolumeSequence
+    valve: ValveSequence
+    rows: list[Row]
+    frames: CaseFrames
+    case: ValveCase
+    settings: ImagedSettings
+    model_sha256: str
+    trained_on: Mapping[str, Any]
+    unlike: str
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was found and derived, for a reader."""
+        volume, case, frames = self.volume, self.case, self.frames
+        size = " x ".join(map(str, volume.frames.shape[1:]))
+        confidence = self.valve.frame_confidence
+        uncertainty = case.uncertainty
+        return (
+            f"{called(volume)}: {len(volume.times)} frames of {size} voxels, "
+            f"{volume.modality.value}.",
+            f"Valve detected with a confidence of {confidence.min():.2f} to "
+            f"{confidence.max():.2f} (open frame {frames.open}: {confidence[frames.open]:.2f}, "
+            f"closed frame {frames.closed}: {confidence[frames.closed]:.2f}).",
+            "The detectors were trained and tested on simulated volumes only; their error there is "
+            f"{uncertainty.typical_mm:.2f} mm in each coordinate, correlated over "
+            f"{uncertainty.correlation_length_mm:.0f} mm.",
+            *([f"{self.unlike[0].upper()}{self.unlike[1:]}."] if self.unlike else []),
+            *(f"Derived: {sentence}." for sentence in case.derived),
+            *(() if self.settings.states_pressure else (NO_PRESSURE,)),
+        )
+
+
+def called(volume: VolumeSequence) -> str:
+    """A volume named by its content: files are often named after a patient."""
+    return f"volume {volume.sha256[:12]}"
+
+
+def read_for_case(file: Path, settings: ImagedSettings) -> VolumeSequence:
+    """The volume in a file, which shows the valve open and closed.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or has one frame only.
+    """
+    volume = read_volume(
+        file,
+        modality=None if settings.modality is None else Modality(settings.modality),
+        frame_interval_s=settings.frame_interval_s,
+        time_unit=settings.time_unit,
+    )
+    if len(volume.times) < 2:
+        raise InputError(
+            f"{volume.source}: one frame, expected two or more: the valve open and closed"
+        )
+    return volume
+
+
+def detect_in_volume(
+    file: Path | str,
+    settings: ImagedSettings | None = None,
+    *,
+    estimate: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> DetectedValve:
+    """The valve in a volume over time, and the case that it makes.
+
+    Parameters
+    ----------
+    file : Path
+    settings : ImagedSettings, optional
+    estimate : bool
+        Whether the case is to be estimated, so that a pressure must be given.
+    progress : callable, optional
+        (frames done, all frames) -> None.
+
+    Raises
+    ------
+    NoValveError
+        If the volume shows no valve; it has the best candidate that was not accepted.
+    MvestError
+        If the volume cannot be read, or the valve in it makes no case.
+    """
+    settings = settings or ImagedSettings()
+    # What is asked for, before anything that takes long.
+    by_hand = _landmarks(settings)
+    curve = _pressure_curve(settings)
+    if estimate and not settings.states_pressure:
+        raise InputError(
+            "imaged.pressure_mmHg or imaged.pressure_curve: expected one of them, the transmitral "
+            "pressure on the closed valve"
+        )
+    volume = read_for_case(Path(file), settings)
+    model, measured = _model(settings, volume.modality)
+    valve = detect_valve(
+        volume,
+        model,
+        TrackingSettings(min_confidence=settings.min_confidence),
+        landmarks=by_hand,
+        progress=progress,
+    )
+    thickness = settings.thickness
+    rows = measure_sequence(valve, float(np.mean(list((thickness or GENERIC_THICKNESS).values()))))
+    frames = _frames(settings, curve, valve, rows)
+    accuracy = measured.at(valve.confidence)
+    rows = with_bands(valve, rows, accuracy.samples, accuracy.tip_samples)
+    corrected, errors, tip_errors = without_expected_error(valve, frames, measured)
+    kept = _thinned(len(errors), settings.error_samples)
+    case = case_of_sequence(
+        corrected,
+        frames,
+        CaseTexts(
+            settings.name or called(volume),
+            settings.description,
+            settings.source or called(volume),
+            settings.licence,
+            settings.simulated,
+        ),
+        thickness_mm=thickness,
+        error_samples=samples_in_world(corrected, frames, errors[kept], tip_errors[kept]),
+    )
+    off = np.linalg.norm(corrected.vertices[frames.closed] - valve.vertices[frames.closed], axis=1)
+    less = (
+        "leaflets and tips: less the error that is expected of the detectors where they find such "
+        f"a valve, by simulated volumes ({off.mean():.2f} mm in the closed frame)"
+    )
+    return DetectedValve(
+        volume,
+        valve,
+        rows,
+        frames,
+        replace(case, derived=(*case.derived, less)),
+        settings,
+        model.sha256,
+        model.trained_on,
+        _unlike(valve.confidence, accuracy),
+    )
+
+
+def write_detected(detected: DetectedValve, folder: Path) -> list[str]:
+    """Write measures, surfaces, landmarks and, if its pressure is stated, the case.
+
+    Parameters
+    ----------
+    detected : DetectedValve
+    folder : Path
+        Gets the folders ``images`` and ``case``; what they held before is removed.
+
+    Returns
+    -------
+    list of str
+        The main files, below the folder.
+    """
+    images, case = folder / IMAGES, folder / CASE
+    for place in (images, case):
+        shutil.rmtree(place, ignore_errors=True)
+    images.mkdir(parents=True)
+    write_measures(images, detected.rows)
+    write_surfaces(images, detected.valve)
+    write_for_slicer(
+        images,
+        detected.volume,
+        detected.valve,
+        float(detected.case.surface.thickness.mean()),
+        [detected.frames.open, detected.frames.closed],
+    )
+    files = [f"{IMAGES}/measures.csv", f"{IMAGES}/valve.vtp.series"]
+    if detected.settings.states_pressure:
+        write_case(case, detected.case)
+        files.append(f"{CASE}/case.yaml")
+    return files
+
+
+def image_step(
+    detected: DetectedValve,
+    files: Sequence[str] = (),
+    pictures: Sequence[Mapping[str, Any]] = (),
+) -> dict[str, tuple[Mapping[str, Any], ...]]:
+    """What a record says of the image step, as details (`mvest.personalisation.record`).
+
+    Parameters
+    ----------
+    detected : DetectedValve
+    files : sequence of str
+        Files beside the report (`write_detected`).
+    pictures : sequence of mapping
+        ``file`` and ``caption`` of pictures beside it.
+
+    Returns
+    -------
+    dict
+        ``image_step``, one row: volume, shape, spacing_mm, modality, sha256, open_frame,
+        closed_frame, confidence (of each frame), unlike, model_sha256, trained_on, sentences,
+        files; ``image_frames``: the measures of each frame; ``pictures``.
+    """
+    volume, frames = detected.volume, detected.frames
+    about = {
+        "volume": called(volume),
+        "sha256": volume.sha256,
+        "modality": volume.modality.value,
+        "shape": list(volume.frames.shape),
+        "spacing_mm": volume.spacing.tolist(),
+        "open_frame": frames.open,
+        "closed_frame": frames.closed,
+        "confidence": detected.valve.frame_confidence.tolist(),
+        "unlike": detected.unlike,
+        "model_sha256": detected.model_sha256,
+        "trained_on": dict(detected.trained_on),
+        "sentences": list(detected.sentences),
+        "files": list(files),
+    }
+    return {
+        "image_step": (about,),
+        "image_frames": tuple(dict(row) for row in detected.rows),
+        "pictures": tuple(pictures),
+    }
+
+
+def _model(
+    settings: ImagedSettings, modality: Modality
+) -> tuple[DetectionModel, DetectionAccuracy]:
+    """The detection model for a modality, whose accuracy was measured."""
+    if settings.model is None and modality is not Modality.ULTRASOUND:
+        raise InputError(
+            f"imaged.model is not given; for {modality.value} no model comes with the package: "
+            "expected a detection model's file"
+        )
+    model = default_model() if settings.model is None else load_model(Path(settings.model))
+    if model.accuracy is None:
+        raise InputError(
+            f"{settings.model or MODEL_FILE}: its accuracy was never measured, expected a model "
+            "whose was"
+        )
+    found = model.shape.layout.region_names
+    if settings.thickness is not None and set(found) != set(LEAFLETS):
+        raise InputError(
+            f"imaged.thickness_mm is of {', '.join(LEAFLETS)}; the model finds the leaflets "
+            f"{', '.join(found)}"
+        )
+    return model, model.accuracy
+
+
+def _unlike(confidence: float, accuracy: DetectionAccuracy) -> str:
+    """How a volume is unlike those of training; empty if it is not."""
+    if confidence >= accuracy.like_from:
+        return ""
+    share = unlike_share(len(accuracy.samples))
+    return (
+        f"the volume is unlike those that the detectors were trained on: confidence "
+        f"{confidence:.2f} in the median frame, expected at least {accuracy.like_from:.2f}, below "
+        f"which {100 * share:.2g} % of volumes like those are expected"
+    )
+
+
+def _pressure_curve(settings: ImagedSettings) -> PressureCurve | None:
+    if settings.pressure_curve is None:
+        return None
+    table = read_numbers(Path(settings.pressure_curve), ("time", "pressure"))
+    return PressureCurve(table[:, 0], table[:, 1])
+
+
+def _landmarks(settings: ImagedSettings) -> dict[int, dict[str, FloatArray]] | None:
+    """Frame -> name -> position (mm), of the files that settings name."""
+    landmarks: dict[int, dict[str, FloatArray]] = {}
+    for frame, file in settings.landmarks:
+        points = {
+            label: item.points[k]
+            for name, item in read_markups(Path(file)).items()
+            if item.kind == "Fiducial" and name != ANNULUS_LABELS
+            for k, label in enumerate(item.labels)
+        }
+        strange = sorted(set(points) - set(LANDMARKS))
+        if strange or not points:
+            raise InputError(
+                f"{file}: points {', '.join(strange) or 'none'}, expected some of "
+                f"{', '.join(LANDMARKS)}"
+            )
+        landmarks[frame] = points
+    return landmarks or None
+
+
+def _frames(
+    settings: ImagedSettings, curve: PressureCurve | None, valve: ValveSequence, rows: list[Row]
+) -> CaseFrames:
+    pressure, closed, count = settings.pressure_mmHg, settings.closed_frame, len(valve.times)
+    if curve is not None:
+        if closed is None:
+            sure = [r for r in rows if (r["confidence"] or 0.0) >= settings.min_confidence]
+            closed = closed_frame(sure)
+        if closed is None or not 0 <= closed < count:
+            raise InputError(f"closed frame {closed}, expected one of 0 to {count - 1}")
+        pressure = curve(float(valve.times[closed]))
+    return choose_frames(
+        valve,
+        rows,
+        STAND_IN_MMHG if pressure is None else pressure,
+        open_=settings.open_frame,
+        closed=closed,
+        held_out={frame: float(value) for frame, value in settings.held_out},
+        min_confidence=settings.min_confidence,
+    )
+
+
+def _thinned(count: int, wanted: int) -> IntArray:
+    """Numbers of evenly spread samples of the errors, at most ``wanted``."""
+    return np.unique(np.linspace(0, count - 1, wanted).round().astype(np.int64))

@@ -1,0 +1,183 @@
+"""Tables of one estimate: unknowns, frames, and what its report lists besides."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from mvest.problem.record import EstimateRecord, FrameFit, Row, Unknown
+from mvest.problem.verdict import NONE
+from mvest.reporting.markup import ended
+from mvest.reporting.tables import Column, Table, table
+
+__all__ = ["estimate_text", "frame_table", "report_tables", "unknown_table"]
+
+HIDDEN = Column(hidden=True)
+
+UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "deg": "°", "ratio": ""}
+"""End of the name of a measure -> its unit."""
+
+FRAME_MEASURES = {
+    "frame": ".0f",
+    "time_s": ".3f",
+    "confidence": ".2f",
+    "annulus_area_mm2": ".0f",
+    "orifice_mm2": ".0f",
+    "coaptation_area_mm2": ".0f",
+}
+"""Measures of the frames of a volume that a report shows, and their digits."""
+
+
+def unknown_table(unknowns: Iterable[Unknown]) -> Table:
+    """A row for each unknown: prior, estimate with its 95 % interval, and truth if it is known."""
+    rows = [unknown.model_dump() for unknown in unknowns]
+    if any(row["truth"] is not None for row in rows):
+        rows = [row | {"true_value": row["truth"]} for row in rows]
+    return table(
+        rows,
+        name=HIDDEN,
+        label=Column(label="unknown"),
+        unit=Column(),
+        kind=Column(),
+        treatment=Column(),
+        prior_mean=Column(std="prior_std", label="prior"),
+        estimate=Column(
+            std="std", low="low", high="high", truth="truth", label="estimate (95 % interval)"
+        ),
+        bound=HIDDEN,
+    )
+
+
+def frame_table(frames: Sequence[FrameFit]) -> Table:
+    """Distances of the models from each observed frame, and from a simulated valve's true one."""
+    rows, columns = [], {}
+    for frame in frames:
+        row: dict[str, Any] = {"frame": frame.frame, "seen": frame.seen}
+        for model in ("generic", "registered", "personalised"):
+            for what in (model, f"{model}_to_truth"):
+                if (spread := getattr(frame, what)) is not None:
+                    row |= {what: spread.mean, f"{what}_std": spread.std, f"{what}_max": spread.max}
+                    columns[what] = Column("mm", ".2f", std=f"{what}_std")
+                    columns[f"{what}_max"] = Column("mm", ".2f", hidden=True)
+        rows.append(row)
+    return table(rows, frame=Column(), seen=Column(label="shown to the filter"), **columns)
+
+
+def report_tables(record: EstimateRecord) -> dict[str, Table]:
+    """What a report of the estimate lists, by name; a name without rows is missing."""
+    rows = record.detail_rows
+    alone = record.alternatives.get("moduli_only")
+    moduli = [one for one in record.unknowns if one.kind != "nuisance"]
+    free = [one for one in record.unknowns if one.kind != "derived"]
+    spans = {"believed": ("believed_low", "believed_high"), "learned": ("low", "high")}
+    tables = {
+        "moduli": unknown_table(moduli if record.is_stated else ()),
+        "unknowns": unknown_table(free),
+        "moduli_only": unknown_table(() if alone is None else alone.moduli),
+        "frames": frame_table(record.frames),
+        "steps": _steps(record, free),
+        "measurements": _measurements(rows("measurements")),
+        "narrower": table(
+            [row | {"change": _change(row)} for row in map(dict, rows("narrower"))],
+            what=Column(label="if this were measured"),
+            parameter=HIDDEN,
+            std_now=Column(label="SD of its logarithm now"),
+            std_if_known=Column(label="then"),
+            change=Column("%", ".0f"),
+        ),
+        "errors": table(
+            rows("errors"),
+            name=Column(label="errors of the closed frame"),
+            unit=Column(),
+            **{name: Column(low=low, high=high) for name, (low, high) in spans.items()},
+            stretch=Column(label="moved by [SD]"),
+        ),
+        "geometry": table(
+            rows("geometry"),
+            name=Column(label="geometry"),
+            size=Column(label="expected error"),
+            unit=Column(),
+            stretch=Column(label="largest [SD]"),
+        ),
+        "whiteness": table(rows("whiteness"), name=Column(label="test"), p_value=Column("", ".2g")),
+        "budget": table(
+            rows("budget"),
+            part=Column(label="source of error"),
+            without=Column(label="SD without it"),
+            alone=Column(label="SD of it alone"),
+        ),
+        "image_errors": table(
+            rows("image_errors"), samples=HIDDEN, share_of_variance=Column(digits=".2f")
+        ),
+        "image_frames": _chosen(rows("image_frames")),
+        "settings": table(rows("settings")),
+    }
+    return {name: one for name, one in tables.items() if len(one)}
+
+
+def estimate_text(record: EstimateRecord) -> str:
+    """What a terminal says of an estimate: verdict, unknowns, frames."""
+    name, verdict = record.case or "estimate", record.verdict
+    lines = [f"{name}: {record.reason}"]
+    if verdict is not None:
+        lines = [f"{name}: {verdict.trust.upper()} ({len(verdict.passed)} checks passed)"]
+        lines += [f"  {ended(one.text)} Next: {ended(one.advice)}" for one in verdict.grounds]
+        no_number = "No modulus is stated; the run ended" if verdict.trust == NONE else "The run"
+        lines.append(f"{no_number}: {record.reason}")
+    if record.is_stated:
+        lines.append(unknown_table(record.unknowns).text())
+    if record.frames:
+        lines.append(frame_table(record.frames).text())
+    return "\n".join(lines)
+
+
+def _change(row: Row) -> float:
+    return 100.0 * (row["std_if_known"] / row["std_now"] - 1.0)
+
+
+def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:
+    """A row for each unknown and the objective, a column for each step of the filter."""
+    width = len(record.iterates[0]) if record.iterates else 0
+    for own in (free, [one for one in free if one.treatment == "estimated"]):
+        if own and len(own) == width:
+            break
+    else:
+        return table(())
+    numbers = ["start", *map(str, range(1, len(record.iterates)))]
+    rows: list[dict[str, Any]] = [
+        {"unknown": one.label or one.name, "unit": one.unit}
+        | {n: m[k] for n, m in zip(numbers, record.iterates, strict=True)}
+        for k, one in enumerate(own)
+    ]
+    objective = dict(zip(numbers, record.objective, strict=False))
+    return table(
+        [*rows, {"unknown": "misfit plus departure from the prior", "unit": ""} | objective]
+    )
+
+
+def _measurements(rows: Sequence[Row]) -> Table:
+    """A row for each measurement, a column for each frame and shape."""
+    names = dict.fromkeys(name for row in rows for name in row if name not in ("frame", "shape"))
+    return table(
+        {"measurement": _measured(name)}
+        | {f"{row['frame']}, {row['shape']}": row.get(name) for row in rows}
+        for name in names
+    )
+
+
+def _chosen(rows: Sequence[Row]) -> Table:
+    names = [name for name in FRAME_MEASURES if any(name in row for row in rows)]
+    columns = {name: Column("", FRAME_MEASURES[name], label=_measured(name)) for name in names}
+    return table(({name: row.get(name) for name in names} for row in rows), **columns)
+
+
+def _measured(name: str) -> str:
+    """``annulus_area_mm2`` as ``annulus area [mm²]``."""
+    words, _, unit = name.rpartition("_")
+    if unit == "s":
+        return f"{words} [s]"
+    if unit not in UNITS or not words:
+        return name.replace("_", " ")
+    text = re.sub(r"\bap\b", "AP", words.replace("_", " "))
+    return f"{text} [{UNITS[unit]}]" if UNITS[unit] else text
