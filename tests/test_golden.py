@@ -23,6 +23,9 @@ from pathlib import Path
 
 import pytest
 
+from experiments.common.records.record import read_record
+from experiments.sweeps.collected import read_sweep
+from mvest.problem.record import EstimateRecord
 from tests.places import ROOT
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -36,30 +39,23 @@ Values = dict[str, dict[str, list[float]]]
 """By run or job, and by unknown: estimate and standard deviation."""
 
 
+ALTERNATIVES = {"moduli_only": "without_nuisances", "paper": "as_in_the_paper"}
+
+
 def read_values(outputs: Path) -> Values:
     """What a command wrote of its estimates. Nothing else here knows how a record is laid out."""
 
-    def pairs(parameters: list[str], run: dict) -> dict[str, list[float]]:
-        both = zip(run["estimate"], run["std"], strict=True)
-        return {name: list(pair) for name, pair in zip(parameters, both, strict=True)}
-
-    def rows(unknowns: list[dict]) -> dict[str, list[float]]:
-        return {row["name"]: [row["estimate"], row["std"]] for row in unknowns}
+    def pairs(estimate: EstimateRecord) -> dict[str, list[float]]:
+        rows = [one for one in estimate.unknowns if one.kind != "derived"]
+        return {one.name: [one.estimate, one.std] for one in rows}
 
     sweeps = list(outputs.glob("*/sweep.json"))
     if sweeps:
-        record = json.loads(sweeps[0].read_text(encoding="utf-8"))
-        return {job["row"]: pairs(record["parameters"], job["runs"][0]) for job in record["jobs"]}
+        return {job.record.row: pairs(job.runs[0]) for job in read_sweep(sweeps[0]).jobs}
     (file,) = outputs.glob("*/*/result.json")
-    record = json.loads(file.read_text(encoding="utf-8"))
-    case = record["findings"].get("case")
-    if case is None:
-        return {"estimate": pairs(record["parameters"], record["findings"]["repeats"][0])}
-    found = {"estimate": rows(case["unknowns"])}
-    for other in ("without_nuisances", "as_in_the_paper"):
-        if case[other] is not None:
-            found[other] = rows(case[other]["parameters"])
-    return found
+    first = read_record(file).estimates[0]
+    others = {ALTERNATIVES[name]: pairs(other) for name, other in first.alternatives.items()}
+    return {"estimate": pairs(first), **others}
 
 
 @dataclass(frozen=True, slots=True)
