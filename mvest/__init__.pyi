@@ -37,7 +37,7 @@ from .problem.estimate import estimate as estimate
 from .problem.problem import Problem as Problem
 from .problem.synthetic import simulate_observation as simulate_observation
 from .reporting.case.report import report as report
+from .valve.anatomy.dimensions import TemplateParameters as TemplateParameters
 from .valve.anatomy.template import Template as Template
-from .valve.anatomy.template import TemplateParameters as TemplateParameters
 from .valve.anatomy.valve import Valve as Valve
 from .valve.mesh.structured import structured_mesh as structured_mesh

@@ -34,8 +34,6 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["ELEMENTS", "FACES", "Element", "Face", "element"]
-
 Evaluate = Callable[[FloatArray], FloatArray]
 
 

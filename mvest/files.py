@@ -15,8 +15,6 @@ from pathlib import Path
 
 from mvest.errors import InputError, cannot_write
 
-__all__ = ["remove_parts", "sha256_of", "write_atomically"]
-
 PREFIX = ".part-"
 """With which every temporary name begins."""
 

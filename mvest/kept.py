@@ -20,8 +20,6 @@ from filelock import FileLock
 from mvest.errors import cannot_write
 from mvest.files import remove_parts, sha256_of, write_atomically
 
-__all__ = ["Counts", "Entry", "get_or_make", "prune"]
-
 T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, LookupError, TypeError)

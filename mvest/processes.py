@@ -20,8 +20,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-__all__ = ["Program", "run", "side_by_side"]
-
 T = TypeVar("T")
 
 KEEPER = Path(__file__).with_name("_keeper.py")

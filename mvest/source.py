@@ -30,8 +30,6 @@ from typing import Any, NamedTuple
 
 from mvest.errors import InputError
 
-__all__ = ["SOURCES", "Sources", "source_key"]
-
 WHOLE = "mvest"
 """Package of whose modules all counts that they hold."""
 

@@ -7,8 +7,8 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import VolumeSequence
-from mvest.valve.anatomy.dimensions import AnnulusDimensions
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import AnnulusDimensions, TemplateParameters
+from mvest.valve.anatomy.template import Template
 
 HALF_GAP = 0.5
 """mm from the coaptation line to either closed midsurface."""

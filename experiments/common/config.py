@@ -59,7 +59,7 @@ from mvest.quantities import (
     Value,
     Values,
 )
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 
 __all__ = ["hash_of", "is_hashed", "plain", "register", "require_in_range", "without_places"]
 

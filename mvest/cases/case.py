@@ -16,8 +16,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 
-__all__ = ["ErrorSamples", "Frame", "Role", "Uncertainty", "ValveCase"]
-
 MIN_SAMPLES, MAX_SAMPLES = 4, 500
 LARGEST_ERROR = 20.0
 """mm, displacement of a point in any sample."""

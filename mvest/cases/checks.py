@@ -25,21 +25,6 @@ from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_checks import check_surface
 from mvest.valve.geometry.triangles import surface_edges
 
-__all__ = [
-    "at",
-    "check_annulus_size",
-    "check_band",
-    "check_chordae",
-    "check_closing_pressure",
-    "check_frames",
-    "check_no_handle",
-    "check_normals",
-    "check_regions",
-    "check_thickness",
-    "check_tips",
-    "ventricular_side",
-]
-
 ANNULUS_DIAMETER = (15.0, 80.0)
 """mm, largest extent of an annulus between a small child's and the most dilated adult's."""
 CLOSING_PRESSURE = (20.0, 250.0)

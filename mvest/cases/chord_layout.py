@@ -18,19 +18,9 @@ import numpy as np
 from mvest.cases.rims import arc_shares, commissures, directed, loop_vector_area
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.template import ChordLayout
+from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Chordae
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
-
-__all__ = [
-    "CLOSED_DEPTH",
-    "SEEN_CLOSURE",
-    "SEEN_ON_BAND",
-    "LeafletBand",
-    "Places",
-    "assumed_closure",
-    "lay_out_chordae",
-]
 
 FAMILIES = ("marginal", "basal")
 

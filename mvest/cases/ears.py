@@ -13,8 +13,6 @@ from mvest.errors import GeometryError
 from mvest.typing import IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
-__all__ = ["without_ears"]
-
 
 def without_ears(triangles: IntArray) -> tuple[IntArray, IntArray]:
     """The triangles with the inner edges of ears turned, where that can be done.

@@ -12,8 +12,6 @@ from mvest.errors import InputError
 from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line
 
-__all__ = ["ARRAYS", "read_error_samples", "write_error_samples"]
-
 ARRAYS = ("frames", "vertices", "tips")
 SOURCE = "source"
 

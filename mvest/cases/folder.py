@@ -26,8 +26,6 @@ from mvest.errors import InputError
 from mvest.reading.table import read_numbers
 from mvest.units import kpa_to_mpa, mpa_to_mmhg
 
-__all__ = ["read_case"]
-
 GENERIC_UNCERTAINTY = Uncertainty(1.0, 10.0)
 """Leaflets tracked in echocardiography are about 1 mm off, and smoothly so."""
 

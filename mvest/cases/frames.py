@@ -28,16 +28,6 @@ from mvest.errors import InputError
 from mvest.reading.table import read_numbers, read_vertices
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "MM_PER",
-    "SECONDS_PER",
-    "ReferenceFrame",
-    "SeenFrame",
-    "check_reference",
-    "place_frame",
-    "read_frame",
-]
-
 MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SECONDS_PER = {"s": 1.0, "ms": 1e-3}
 POINT_COLUMNS = ("x", "y", "z")

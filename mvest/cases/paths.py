@@ -12,8 +12,6 @@ from mvest.cases.schema import wrong
 from mvest.errors import InputError
 from mvest.reading.yaml_file import read_yaml
 
-__all__ = ["CASE_FILE", "CaseFolder", "files_of_case"]
-
 CASE_FILE = "case.yaml"
 
 

@@ -21,8 +21,6 @@ from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_ann
 from mvest.valve.measure.coaptation import orifice_area
 from mvest.valve.measure.measurements import leaflet_length
 
-__all__ = ["RANGES", "Doubt", "HumanRange", "doubts", "free_orifice", "require_plausible"]
-
 
 @dataclass(frozen=True, slots=True)
 class HumanRange:

@@ -16,8 +16,6 @@ import scipy
 from mvest.errors import InputError
 from mvest.typing import FloatArray
 
-__all__ = ["PressureCurve", "generic_curve"]
-
 VENTRICLE = ((0.40, 6.0), (0.53, 14.0), (0.58, 120.0), (0.75, 130.0), (0.80, 8.0))
 ATRIUM = ((0.40, 7.0), (0.47, 20.0), (0.53, 5.0), (0.58, 7.0), (0.70, 10.0))
 """(s, mmHg)."""

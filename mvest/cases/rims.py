@@ -14,16 +14,6 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 
-__all__ = [
-    "Rims",
-    "arc_shares",
-    "commissures",
-    "find_rims",
-    "loop_vector_area",
-    "match_annulus",
-    "two_loops",
-]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rims:

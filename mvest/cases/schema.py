@@ -17,19 +17,6 @@ from mvest.errors import InputError
 from mvest.reading.text import MAX_NUMBER, one_line
 from mvest.reading.yaml_file import read_yaml
 
-__all__ = [
-    "VERSION",
-    "CaseFile",
-    "ChordaeEntry",
-    "FrameEntry",
-    "ObservationEntry",
-    "PointData",
-    "Units",
-    "case_schema",
-    "read_case_file",
-    "wrong",
-]
-
 VERSION = 1
 """The version of the format that is read and written."""
 MAX_TEXT, MAX_NAME = 10_000, 200

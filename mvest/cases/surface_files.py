@@ -23,9 +23,8 @@ from mvest.errors import GeometryError, InputError
 from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER, one_line
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
-
-__all__ = ["MERGE_TOLERANCE", "RegionSurface", "merged", "part_of", "read_regions"]
+from mvest.valve.io.leaflet_surfaces import read_surface
+from mvest.valve.io.vtk_xml import SurfaceFile
 
 MERGE_TOLERANCE = 1e-5
 """Vertices closer than this share of the bounding box's diagonal are one (0.5 µm on 50 mm)."""

@@ -27,8 +27,6 @@ from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 
-__all__ = ["CHORD_COLUMNS", "GENERIC_THICKNESS", "point_data", "read_chordae", "read_leaflets"]
-
 CHORD_COLUMNS = ("tip", "x", "y", "z", "family", "rest_length_mm", "stiffness_n")
 GENERIC_THICKNESS = {"anterior": 1.32, "posterior": 1.26}
 """mm, the method paper's values (ISBI 2013)."""

@@ -18,8 +18,6 @@ from mvest.files import write_atomically
 from mvest.reading.table import write_columns
 from mvest.valve.io.leaflet_surfaces import write_surface
 
-__all__ = ["require_new", "write_case"]
-
 
 def write_case(folder: Path | str, case: ValveCase) -> Path:
     """Write a case: ``case.yaml``, one ``.vtp`` per frame, loops and chordae as ``.csv``.

@@ -24,8 +24,6 @@ from mvest.kept import Entry, prune
 from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray
 
-__all__ = ["NOT_FOUND", "Anchors", "Kept", "content_digest"]
-
 DIGITS = 32
 """Of a name."""
 

@@ -10,9 +10,6 @@ from mvest.mechanics.parameters import Parameter, is_positive
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["Coordinates"]
-
-
 STIFFENED = 0.5
 """What log(1 + stiffening) is multiplied by: with five steps of 0.2 a tissue that hardly stiffens
 becomes one that is nearly all exponential, and a leaflet moves by no more than with its modulus."""

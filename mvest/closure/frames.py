@@ -21,8 +21,6 @@ from mvest.mechanics.valve_system import HeldState
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 
-__all__ = ["ERROR", "OFFSET", "SCALE", "FramesModel", "is_frame_pressure"]
-
 OFFSET, ERROR = "pressure_offset", "pressure_error"
 """Parameters in mmHg: the offset of all stated pressures, and (``ERROR.FRAME``) that of one."""
 

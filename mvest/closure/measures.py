@@ -19,8 +19,6 @@ from mvest.valve.measure.passing_ball import largest_passing_ball
 from mvest.valve.mesh.embedding import embed
 from mvest.valve.mesh.solid_mesh import jacobian_determinants
 
-__all__ = ["StepMeasures", "measure_steps"]
-
 
 @dataclass(frozen=True, slots=True)
 class StepMeasures:

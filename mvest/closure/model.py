@@ -19,10 +19,11 @@ from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.ties import TiedPoints
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import MechanicsSettings
 from mvest.mechanics.solver import LinearSolver, linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
-from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.system import Loads, System
 from mvest.mechanics.valve_system import (
     HeldState,
     boundary_loading,
@@ -35,9 +36,6 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.embedding import Embedding, embed
 from mvest.valve.mesh.solid_mesh import SolidMesh
-
-__all__ = ["ClosedState", "ClosureModel", "ClosureResult"]
-
 
 CONTINUED = 40
 """Newton iterations within which a closed valve finds its next equilibrium, or is closed anew by

@@ -31,8 +31,6 @@ from mvest.valve.geometry.proximity import ClosestPoints, closest_points
 from mvest.valve.geometry.triangles import unit_rows
 from mvest.valve.mesh.embedding import Embedding, embed
 
-__all__ = ["PARTS", "RestGeometry"]
-
 PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "insertions")
 """Of a geometry, by the methods of `RestGeometry` that say what each is a change of."""
 

@@ -22,18 +22,6 @@ from mvest.estimation.prediction import Prediction
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = [
-    "GATE_CASES",
-    "MAX_LIMIT",
-    "MEAN_LIMIT",
-    "REFERENCE",
-    "GateCase",
-    "GateReport",
-    "GateRow",
-    "run_gate",
-    "vary",
-]
-
 MEAN_LIMIT = 0.1
 MAX_LIMIT = 0.5
 """mm, the largest accepted mean and maximal distance between closed states."""

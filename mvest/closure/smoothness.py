@@ -36,18 +36,6 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = [
-    "JUMP_LIMIT",
-    "RESOLUTION",
-    "SEEN",
-    "SIDE_LIMIT",
-    "SLOPE_LIMIT",
-    "Path",
-    "PathState",
-    "Piece",
-    "follow",
-]
-
 JUMP_LIMIT = 0.1
 """mm, largest accepted unexplained move of any vertex: what other numerics may move in the mean."""
 SLOPE_LIMIT = 0.05

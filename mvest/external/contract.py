@@ -30,25 +30,6 @@ from mvest.reading.table import read_numbers, write_columns
 from mvest.reading.text import one_line
 from mvest.typing import FloatArray
 
-__all__ = [
-    "ANSWERS",
-    "FORMAT",
-    "JACOBIAN",
-    "OBSERVATION",
-    "POINTS",
-    "REQUEST",
-    "RESPONSE",
-    "VERSION",
-    "Answer",
-    "RunRequest",
-    "read_answer",
-    "read_points",
-    "read_request",
-    "write_answer",
-    "write_points",
-    "write_request",
-]
-
 FORMAT, VERSION = "mvest-external", 1
 REQUEST, POINTS = "request.json", "points.csv"
 RESPONSE, OBSERVATION, JACOBIAN = "response.json", "observation.csv", "jacobian.csv"

@@ -10,8 +10,6 @@ import numpy as np
 from mvest.errors import ConfigurationError, InputError
 from mvest.typing import FloatArray
 
-__all__ = ["Differences"]
-
 SCHEMES = ("central", "forward")
 
 

@@ -22,8 +22,6 @@ from mvest.provenance import config_hash, write_json
 from mvest.reading.json_file import read_mapping
 from mvest.typing import FloatArray
 
-__all__ = ["ProcessModel"]
-
 FINISHED = "finished.json"
 """Written after an answer has been read and found in order."""
 

@@ -23,8 +23,6 @@ from mvest.errors import ConfigurationError
 from mvest.external.contract import REQUEST
 from mvest.processes import Program
 
-__all__ = ["ERRORS", "OUTPUT", "Command", "Ending", "files_of_command"]
-
 OUTPUT, ERRORS = "stdout.txt", "stderr.txt"
 """Files of a run's folder that hold what its program said."""
 

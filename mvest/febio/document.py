@@ -20,18 +20,6 @@ from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = [
-    "Averages",
-    "Control",
-    "FebDocument",
-    "PotentialContact",
-    "Prescribed",
-    "Pressure",
-    "SlidingContact",
-    "Springs",
-    "Support",
-]
-
 AXES = ("x", "y", "z")
 
 

@@ -26,8 +26,6 @@ from mvest.errors import InputError
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.settings import ExponentialTissue
 
-__all__ = ["LAWS", "FebLaw", "febio_law"]
-
 LAWS = ("orthotropic", "neo-hookean")
 
 

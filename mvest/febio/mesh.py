@@ -28,8 +28,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["FebMesh", "febio_mesh", "opposite_faces"]
-
 BRICK = np.array([0, 2, 8, 6, 18, 20, 26, 24, 1, 5, 7, 3, 19, 23, 25, 21, 9, 11, 17, 15, 10, 14, 16,
                   12, 4, 22, 13])  # fmt: skip
 WEDGE = np.array([0, 1, 2, 12, 13, 14, 3, 4, 5, 15, 16, 17, 6, 7, 8])

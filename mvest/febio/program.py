@@ -20,8 +20,6 @@ from mvest.processes import run
 from mvest.reading.text import read_text
 from mvest.typing import FloatArray
 
-__all__ = ["VARIABLE", "FebRun", "febio_program", "read_positions", "run_febio"]
-
 VARIABLE = "MVEST_FEBIO"
 MAX_LOG = 1 << 28
 """Bytes of a log that are read."""

@@ -28,8 +28,6 @@ from mvest.mechanics.system import System
 from mvest.mechanics.valve_system import boundary_loading, build_system
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["CONTACTS", "FebSettings", "differences", "valve_document"]
-
 CONTACTS = ("potential", "sliding", "none")
 SAMPLES = 61
 """Points of the curves of pressure and motion over the ramp."""

@@ -11,15 +11,6 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray
 
-__all__ = [
-    "ANNULUS_LABELS",
-    "LANDMARKS",
-    "TIPS",
-    "landmark_vertices",
-    "landmarks",
-    "slicerheart_labels",
-]
-
 _ON_LEAFLETS: Final[dict[str, tuple[float, int]]] = {
     "commissure_0": (0.0, 0),
     "commissure_180": (180.0, 0),

@@ -16,8 +16,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import BandGrid, band_grid
 
-__all__ = ["ValveLayout"]
-
 
 @dataclass(frozen=True)
 class ValveLayout:

@@ -24,8 +24,6 @@ from mvest.reading.bounded import refusing
 from mvest.reading.text import MAX_NUMBER, check_words, number, read_bytes, read_text
 from mvest.typing import FloatArray
 
-__all__ = ["TO_LPS", "PointList", "read_fcsv", "read_markups", "write_markups"]
-
 SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/"
     "Schema/markups-schema-v1.0.3.json#"

@@ -14,8 +14,6 @@ from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["MovingValve"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingValve:

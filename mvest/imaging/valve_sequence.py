@@ -10,8 +10,6 @@ from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray
 
-__all__ = ["MIN_CONFIDENCE", "ValveSequence"]
-
 MIN_CONFIDENCE = 0.7
 """Confidence from which on a frame shows a valve, wherever that is decided or drawn.
 

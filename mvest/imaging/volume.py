@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from mvest.errors import InputError
 from mvest.typing import FloatArray
 
-__all__ = ["Modality", "VolumeSequence"]
-
 
 class Modality(Enum):
     """What the voxels are: ultrasound echo (log-compressed), CT in HU, or MR signal."""

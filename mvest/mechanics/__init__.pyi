@@ -3,8 +3,9 @@ from .blocks import outer_faces as outer_faces
 from .body import simulate_body as simulate_body
 from .integrate import simulate as simulate
 from .law.biot import BiotLaw as BiotLaw
-from .law.biot import PoissonReading as PoissonReading
-from .law.biot import TransverselyIsotropic as TransverselyIsotropic
+from .law.moduli import PoissonReading as PoissonReading
+from .law.moduli import TransverselyIsotropic as TransverselyIsotropic
+from .parameters import Parameter as Parameter
 from .settings import ModulusField as ModulusField
 from .settings import StiffPatch as StiffPatch
 from .solid import Law as Law
@@ -15,5 +16,4 @@ from .steps import Step as Step
 from .steps import StepReason as StepReason
 from .system import Factors as Factors
 from .system import Loads as Loads
-from .system import Parameter as Parameter
 from .system import System as System

@@ -18,8 +18,6 @@ from mvest.mechanics.solver import LinearSolver
 from mvest.mechanics.system import Evaluation, System
 from mvest.typing import FloatArray
 
-__all__ = ["approach"]
-
 ITERATIONS = 15
 """Steps in which the neighbourhood of an equilibrium is reached or given up."""
 ASTRAY = 4

@@ -23,15 +23,6 @@ from scipy import sparse
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "BlockMatrix",
-    "SparsityPattern",
-    "add_forces",
-    "adjacency",
-    "elements_of_nodes",
-    "scatter_blocks",
-]
-
 Positions = NDArray[np.int32]
 
 

@@ -11,8 +11,6 @@ from mvest.elements import element
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["box", "outer_faces"]
-
 # All local nodes on the grid that halves every cell, in the node orders of mvest.elements.
 _EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 _TRIANGLES = (

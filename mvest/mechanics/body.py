@@ -11,15 +11,15 @@ from mvest.elements import FACES, element
 from mvest.errors import GeometryError, InputError, MaterialError
 from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.moduli import TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import Law, Solid
 from mvest.mechanics.solver import linear_solver
 from mvest.mechanics.steps import Damping, NewtonSettings, Simulation, Step
-from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.system import Loads, System
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
-
-__all__ = ["simulate_body"]
 
 
 def simulate_body(

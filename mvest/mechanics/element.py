@@ -12,15 +12,6 @@ from numpy.typing import NDArray
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "add_tangents",
-    "alpha_change",
-    "enhanced_strain",
-    "internal_forces",
-    "strain_derivative",
-    "strains",
-]
-
 VOIGT = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
 """Component of a six-vector that an entry of a symmetric tensor is."""
 

@@ -32,6 +32,7 @@ from mvest.mechanics.assembly import add_forces
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.forces.passing import HARMLESS
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import SolidState
 from mvest.mechanics.solver import EXACT, LinearSolver, linear_solver
 from mvest.mechanics.steps import (
@@ -42,11 +43,8 @@ from mvest.mechanics.steps import (
     StepReason,
     StepRecord,
 )
-from mvest.mechanics.system import Evaluation, Loads, Parameter, System
+from mvest.mechanics.system import Evaluation, Loads, System
 from mvest.typing import FloatArray
-
-__all__ = ["simulate"]
-
 
 RUNAWAY = 1.5
 """Times its own size that a body may be displaced by the iterations of one step, which have run

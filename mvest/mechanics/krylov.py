@@ -20,8 +20,6 @@ import numpy as np
 
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["gmres"]
-
 REDUCTION = 1e-14
 """Residual over that at a restart below which only the computed residual can say more."""
 

@@ -13,17 +13,6 @@ from enum import Enum
 
 from mvest.errors import InputError
 
-__all__ = [
-    "KINDS",
-    "Kind",
-    "NamePart",
-    "Parameter",
-    "check_names",
-    "is_positive",
-    "kind_of",
-    "known_names",
-]
-
 
 class NamePart(Enum):
     """What the second half of a name stands for."""

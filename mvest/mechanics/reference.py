@@ -29,8 +29,6 @@ from mvest.mechanics.solver import EXACT, LinearSolver
 from mvest.mechanics.system import Loads, System
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["RestVariation", "vary_equilibrium"]
-
 STEP = 1e-4
 """Of the differences, in the size of the smallest edge at rest and in rad: their error, of second
 order, and round-off are both about 1e-8 of a derivative."""

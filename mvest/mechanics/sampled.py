@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from mvest.elements import Element
 from mvest.typing import FloatArray
 
-__all__ = ["Sampling"]
-
 PAIRS = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 

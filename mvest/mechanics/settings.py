@@ -32,18 +32,6 @@ from mvest.quantities import (
 )
 from mvest.typing import FloatArray
 
-__all__ = [
-    "EXPONENTIAL_KINDS",
-    "ClosureProtocol",
-    "ContactSettings",
-    "ExponentialTissue",
-    "MechanicsSettings",
-    "ModulusField",
-    "StiffPatch",
-    "TissueSettings",
-    "smooth_step",
-]
-
 
 def smooth_step(u: float) -> float:
     """Quintic from 0 at ``u <= 0`` to 1 at ``u >= 1`` whose first two derivatives vanish there."""

@@ -45,8 +45,6 @@ from mvest.mechanics.sampled import Sampling
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["Law", "Solid", "SolidState", "kernels_are_compiled"]
-
 ENHANCED_ITERATIONS = 12
 ENHANCED_TOLERANCE = 1e-11
 """Size of the last alpha correction (strain) at which the elimination stops."""

@@ -24,9 +24,6 @@ from mvest.mechanics.assembly import BlockMatrix, SparsityPattern
 from mvest.mechanics.krylov import gmres
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["EXACT", "LinearSolver", "PardisoSolver", "SuperLUSolver", "linear_solver"]
-
-
 EXACT = 1e-13
 """Tolerance of a solution that is as good as double precision allows."""
 ROUND_OFF = 1e-14

@@ -9,15 +9,6 @@ from mvest.errors import InputError
 from mvest.quantities import Count, DampingRate, Halvings, Length, Tolerance
 from mvest.typing import FloatArray
 
-__all__ = [
-    "Damping",
-    "NewtonSettings",
-    "Simulation",
-    "Step",
-    "StepReason",
-    "StepRecord",
-]
-
 
 class StepReason(Enum):
     """Why a simulation stopped."""

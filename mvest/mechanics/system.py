@@ -30,8 +30,6 @@ from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = ["Evaluation", "Factors", "Loads", "Parameter", "System"]
-
 CONTACT_MARGIN = 0.12
 """A pair of elements enters the sparsity pattern this share of its reach before it touches."""
 

@@ -35,22 +35,6 @@ from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.embedding import Embedding, embed
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = [
-    "HeldState",
-    "ModulusVariation",
-    "Pacing",
-    "boundary_loading",
-    "build_system",
-    "check_parameters",
-    "factors_of",
-    "held_loading",
-    "material_law",
-    "patch_change",
-    "patch_members",
-    "retune",
-    "variation_of",
-]
-
 
 class Pacing(Protocol):
     """How pressure and the motion of the boundary run in time."""

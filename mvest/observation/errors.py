@@ -22,16 +22,6 @@ from mvest.typing import BoolArray, FloatArray
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 
-__all__ = [
-    "AnnulusOffset",
-    "CoaptationDropout",
-    "CorrelatedNoise",
-    "ObservationError",
-    "SpatialCorrelation",
-    "WhiteNoise",
-    "observe",
-]
-
 NUGGET = 1e-10
 """Part of the variance that is uncorrelated, so that the correlation can be factorised where
 vertices nearly coincide."""

@@ -27,8 +27,6 @@ from mvest.observation.vertices import Observation
 from mvest.quantities import Factor, Length, Share
 from mvest.typing import FloatArray
 
-__all__ = ["CURVES", "ROUGH", "ErrorBeliefs", "error_family"]
-
 ROUGH, CURVES = "rough part", "curves"
 """Names of the standard deviations of the rough part and of the points of curves."""
 

@@ -67,15 +67,6 @@ from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.refinement import refined
 from mvest.valve.geometry.triangles import directed_edges
 
-__all__ = [
-    "UNKNOWN",
-    "ObservedSurface",
-    "PredictedSurface",
-    "SurfaceObservation",
-    "mean_surface_distance",
-    "surface_distance",
-]
-
 UNKNOWN = -1
 """Region of a point that may be of any leaflet."""
 

@@ -13,8 +13,6 @@ from mvest.estimation.prediction import ObservationModel, Prediction, predict, r
 from mvest.observation.errors import SpatialCorrelation
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["FRAMES", "Observation", "observed_frames", "require_frames", "select_frames"]
-
 FRAMES = ("open", "closed")
 """Frames that a valve model predicts, in the order in which it stacks them."""
 

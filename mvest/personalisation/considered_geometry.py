@@ -30,7 +30,7 @@ from mvest.problem.problem import Observed
 from mvest.problem.registration import RegisteredModel, registration_of
 from mvest.quantities import Angle, Count, Factor, Length, Share, Thickness
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import ChordLayout
+from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.proximity import closest_points
 

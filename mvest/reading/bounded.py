@@ -21,8 +21,6 @@ from numpy.typing import DTypeLike, NDArray
 from mvest.errors import InputError, MvestError
 from mvest.reading.text import MAX_LINE, one_line
 
-__all__ = ["MAX_RATIO", "MAX_UNASKED", "array_of_words", "inflate", "max_inflated", "refusing"]
-
 MAX_UNASKED = 2**26
 MAX_RATIO = 100
 MAX_DICTIONARY = 2**27

@@ -10,8 +10,6 @@ from typing import Any, NoReturn
 from mvest.errors import InputError
 from mvest.reading.text import MAX_TEXT, number, one_line, read_bytes
 
-__all__ = ["parse_json", "read_json", "read_mapping"]
-
 MAX_DEPTH = 50
 MAX_INTEGER = 2**64
 """Beyond any seed, count or size; no array of NumPy holds a larger one."""

@@ -17,8 +17,6 @@ from mvest.errors import InputError
 from mvest.reading.bounded import max_inflated
 from mvest.reading.text import one_line
 
-__all__ = ["MAX_ARRAYS", "check_array", "read_npz"]
-
 MAX_ARRAYS = 2**29
 """Bytes of all arrays in one file."""
 MAX_MEMBERS = 10_000

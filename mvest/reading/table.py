@@ -14,8 +14,6 @@ from mvest.errors import InputError, cannot_write
 from mvest.reading.text import MAX_NUMBER, check_words, number, one_line, read_text
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["indices", "numbers", "read_columns", "read_numbers", "read_vertices", "write_columns"]
-
 
 def read_columns(
     file: Path,

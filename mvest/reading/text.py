@@ -9,16 +9,6 @@ from pathlib import Path
 
 from mvest.errors import InputError
 
-__all__ = [
-    "MAX_NUMBER",
-    "MAX_TEXT",
-    "check_words",
-    "number",
-    "one_line",
-    "read_bytes",
-    "read_text",
-]
-
 MAX_TEXT = 2**26
 """Bytes of a file of text, where its reader does not state less."""
 MAX_NUMBER = 1e9

@@ -18,8 +18,6 @@ import yaml
 from mvest.errors import InputError
 from mvest.reading.text import check_words, number, one_line, read_text
 
-__all__ = ["read_yaml"]
-
 MAX_FILE_SIZE = 1_000_000
 """Bytes; a description of a case is a few thousand."""
 MAX_DEPTH = 20

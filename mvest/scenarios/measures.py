@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.closure.model import ClosureModel
-from mvest.mechanics.system import Parameter, System
+from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.system import System
 from mvest.scenarios.scenario import plane_of
 from mvest.scenarios.stress import peak_stress
 from mvest.typing import FloatArray, IntArray
@@ -16,15 +17,6 @@ from mvest.valve.measure.annulus import AnnulusPlane, measure_annulus
 from mvest.valve.measure.coaptation import coaptation_area, coaptation_length
 from mvest.valve.measure.gap import find_gap
 from mvest.valve.measure.measurements import measure_tenting
-
-__all__ = [
-    "MEASURES",
-    "NEVER_NEGATIVE",
-    "Measured",
-    "contact_reach",
-    "meaning_of",
-    "measure_closed",
-]
 
 Measured = dict[str, float]
 """Name with its unit -> number."""

@@ -12,8 +12,6 @@ from mvest.errors import InputError
 from mvest.estimation.estimate import Estimate
 from mvest.typing import FloatArray
 
-__all__ = ["SampleSummary", "posterior_samples", "summary_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class SampleSummary:

@@ -11,12 +11,11 @@ from mvest.closure.model import ClosureModel
 from mvest.errors import InputError, MaterialError
 from mvest.estimation.estimate import Estimate
 from mvest.estimation.gaussian import Gaussian
-from mvest.mechanics.system import Parameter, System
+from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.system import System
 from mvest.scenarios.measures import NEVER_NEGATIVE, Measured, measure_closed
 from mvest.scenarios.posterior import SampleSummary, summary_of
 from mvest.typing import FloatArray
-
-__all__ = ["PredictedScenario", "Sample", "closed_valve", "predict_scenario"]
 
 NORMAL_95 = 1.959963984540054
 """Half-width of a 95 % interval in standard deviations."""

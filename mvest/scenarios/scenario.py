@@ -19,8 +19,6 @@ from mvest.valve.anatomy.valve import Motion, Valve
 from mvest.valve.geometry.proximity import plane_section
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
 
-__all__ = ["Annuloplasty", "Clip", "Scenario", "clip_points", "model_under", "narrowed", "plane_of"]
-
 NARROWEST = 0.3
 """Share of the anteroposterior diameter below which nothing is narrowed."""
 

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.system import Parameter, System
+from mvest.mechanics.parameters import Parameter
+from mvest.mechanics.system import System
 from mvest.typing import FloatArray
-
-__all__ = ["PeakStress", "contact_pressure", "nodal_stress", "peak_stress", "principal_cauchy"]
 
 _PLACE = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
 """Of tensor components in a six-vector 11, 22, 33, 23, 13, 12."""

@@ -41,18 +41,6 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.structured import structured_mesh
 
-__all__ = [
-    "Deviations",
-    "Hidden",
-    "PatientSimulation",
-    "VirtualPatient",
-    "close_patient",
-    "draw_hidden",
-    "held_states",
-    "patient_model",
-    "simulate_patient",
-]
-
 REFERENCE, CLOSED = "open", "closed"
 """Names of the first two frames of a virtual patient."""
 

@@ -22,11 +22,9 @@ from mvest.mechanics.settings import ExponentialTissue, MechanicsSettings
 from mvest.observation.errors import CorrelatedNoise, ObservationError, SpatialCorrelation
 from mvest.quantities import Factor, Length, Share, Stretch
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.triangles import surface_edges
-
-__all__ = ["World"]
 
 KERNELS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "exponential": lambda ratio: np.exp(-ratio),

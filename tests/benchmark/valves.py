@@ -13,9 +13,10 @@ from mvest.closure.model import ClosureModel
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.forces.pair_search import ContactPairs
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.mechanics.steps import Simulation
-from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.system import Loads, System
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.template import Template

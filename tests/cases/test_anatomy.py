@@ -12,7 +12,8 @@ from mvest.cases.folder import read_case
 from mvest.cases.plausibility import doubts
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
-from mvest.valve.anatomy.template import ChordLayout, Template
+from mvest.valve.anatomy.dimensions import ChordLayout
+from mvest.valve.anatomy.template import Template
 from tests.cases.folders import plain_folder, save, template_case
 from tests.cases.test_folder import assert_equal
 

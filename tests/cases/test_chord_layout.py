@@ -9,7 +9,8 @@ from mvest.cases.case import Role
 from mvest.cases.chord_layout import SEEN_ON_BAND, LeafletBand, lay_out_chordae
 from mvest.cases.folder import read_case
 from mvest.errors import InputError
-from mvest.valve.anatomy.template import ChordLayout, Template
+from mvest.valve.anatomy.dimensions import ChordLayout
+from mvest.valve.anatomy.template import Template
 from tests.cases.folders import closing, plain_folder, save, save_surface
 from tests.closure.test_model import CLOSING, model_of
 

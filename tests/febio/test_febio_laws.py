@@ -5,8 +5,8 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.febio.laws import febio_law
-from mvest.mechanics.law.biot import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.law.exponential import ExponentialLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.settings import ExponentialTissue
 
 A = TransverselyIsotropic.from_ratio(6.23, 2.651, 0.488, PoissonReading.LITERAL)

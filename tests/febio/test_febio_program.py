@@ -11,8 +11,8 @@ from mvest.febio.laws import febio_law
 from mvest.febio.mesh import febio_mesh
 from mvest.febio.program import febio_program, read_positions, run_febio
 from mvest.mechanics.body import simulate_body
-from mvest.mechanics.law.biot import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Law
 from mvest.mechanics.steps import NewtonSettings
 from tests.febio.test_febio_mesh import mesh_of

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.imaging.detection.tracking import NoValveError, detect_valve
+from mvest.imaging.detection.detect import NoValveError
+from mvest.imaging.detection.tracking import detect_valve
 from mvest.imaging.detection.trained_model import default_model
 from mvest.imaging.landmarks import LANDMARKS, landmarks
 from mvest.imaging.layout import ValveLayout

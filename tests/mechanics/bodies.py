@@ -9,7 +9,8 @@ from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.forces.cables import Cables, Hinge
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.settings import ContactSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System

@@ -23,7 +23,7 @@ from mvest.mechanics import (
 )
 from mvest.mechanics.forces.contact import Contact
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.law.biot import TransverselyIsotropic
+from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Simulation, StepRecord
 from tests.mechanics.bodies import MATERIALS, block, sandwich

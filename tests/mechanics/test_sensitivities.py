@@ -5,8 +5,9 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.mechanics.integrate import simulate
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.steps import NewtonSettings, Step
-from mvest.mechanics.system import Factors, Parameter
+from mvest.mechanics.system import Factors
 from tests.mechanics.bodies import sandwich
 
 TRUE = {

@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mvest.mechanics.law.biot import BiotLaw, TransverselyIsotropic
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.moduli import TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import Solid
-from mvest.mechanics.system import Parameter, System
+from mvest.mechanics.system import System
 from mvest.scenarios.stress import (
     _peaks,
     contact_pressure,

@@ -33,7 +33,8 @@ from mvest.simulation.motion import patient as patients
 from mvest.simulation.motion.closing import ClosingFrames, frames_along, with_tip_motion
 from mvest.simulation.motion.refusal import check_motion
 from mvest.simulation.virtual_patient import PatientSimulation
-from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
+from mvest.valve.anatomy.template import Template
 from tests import made_up_closure
 from tests.made_up_closure import MadeUpClosure
 

@@ -34,8 +34,8 @@ from mvest.files import write_atomically
 from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.body import simulate_body
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.biot import TransverselyIsotropic
 from mvest.mechanics.law.linear import LinearLaw
+from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.settings import (
     ClosureProtocol,
     ContactSettings,

@@ -6,7 +6,7 @@ import pytest
 from mvest.elements import ELEMENTS
 from mvest.mechanics import BiotLaw, Loads, Step, System, box, outer_faces, simulate
 from mvest.mechanics.forces.pressure import PressureLoad
-from mvest.mechanics.law.biot import TransverselyIsotropic
+from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.valve.mesh.solid_mesh import SolidMesh
 

@@ -19,7 +19,8 @@ from mvest.provenance import config_hash
 from mvest.quantities import Share
 from mvest.scenarios.scenario import narrowed, plane_of
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Motion, Valve
 from mvest.valve.mesh.given import ENVELOPE_SHARE, GivenValve
 from mvest.valve.mesh.solid_mesh import SolidMesh

@@ -15,7 +15,7 @@ from mvest.closure.anchors import content_digest
 from mvest.closure.robustness import GATE_CASES, GateCase, GateReport
 from mvest.errors import ConfigurationError
 from mvest.reporting.tables import Table, table
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 
 __all__ = ["anatomy_digest", "gate_cases", "gate_of", "gate_rows"]
 

@@ -52,7 +52,7 @@ from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.valve.geometry.surface_checks import enclosed_volume
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.io.leaflet_surfaces import SurfaceFile
+from mvest.valve.io.vtk_xml import SurfaceFile
 from mvest.valve.measure.annulus import measure_annulus
 from mvest.valve.measure.measurements import leaflet_length
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants

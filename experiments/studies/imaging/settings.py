@@ -8,7 +8,7 @@ from typing import Any
 from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.simulation.motion.population import PopulationSettings
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 
 __all__ = ["DrawnValves", "HeldOutSettings", "ImagingSettings", "Settings"]
 

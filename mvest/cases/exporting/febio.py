@@ -18,8 +18,6 @@ from mvest.problem.registration import REGISTRATION
 from mvest.reading.json_file import read_mapping
 from mvest.valve.mesh.given import GivenValve
 
-__all__ = ["FebioOptions", "export_febio", "model_of_case", "read_run"]
-
 GENERIC = {"anterior": (6.23, 6.23 / 2.35), "posterior": (2.09, 2.09 / 1.89)}
 """E_f (MPa) and E_f over E_perp of the method paper (ISBI 2013)."""
 CONTACT_COLUMNS, CONTACT_ROWS = 144, 32

@@ -28,8 +28,6 @@ from mvest.valve.geometry.stretch import principal_stretches
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface_series
 from mvest.valve.io.vtk_xml import SurfaceFile
 
-__all__ = ["SlicerOptions", "export_slicer"]
-
 FIELDS = "fields.npz"
 REGIONS = ("anterior", "posterior")
 """Of runs, which store numbers of leaflets and no names."""

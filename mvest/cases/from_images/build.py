@@ -23,7 +23,8 @@ from mvest.errors import GeometryError, InputError
 from mvest.imaging.layout import ValveLayout
 from mvest.imaging.valve_sequence import ValveSequence
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.template import Template, TemplateParameters, vertex_region
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template, vertex_region
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
 from mvest.valve.geometry.triangles import unit_rows

@@ -15,8 +15,6 @@ from mvest.valve.io.abaqus.deck_file import read_deck
 from mvest.valve.io.abaqus.leaflet_mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
 
-__all__ = ["AbaqusOptions", "import_abaqus"]
-
 STD_MM, CORRELATED_MM = 1.0, 10.0
 """Of a coordinate, and along the leaflets, where nothing is stated."""
 

@@ -13,9 +13,7 @@ from mvest.cases.tissue import CHORD_COLUMNS
 from mvest.errors import InputError
 from mvest.reading.table import write_columns
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import ChordLayout
-
-__all__ = ["chord_lines", "write_chords"]
+from mvest.valve.anatomy.dimensions import ChordLayout
 
 MARGINAL_MM = 4.0
 """From the free edge, within which a chord inserts as marginal ones do."""

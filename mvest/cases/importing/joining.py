@@ -24,8 +24,6 @@ from mvest.valve.anatomy.valve import band_grid
 from mvest.valve.geometry.thickening import smooth_vertex_normals
 from mvest.valve.geometry.triangles import areas
 
-__all__ = ["Commissures", "JoinedLeaflets", "commissures_on", "drawn_anew", "joined"]
-
 COINCIDENT = 1e-6
 """mm, below which vertices of both leaflets are one."""
 REGIONS = ("anterior", "posterior")

@@ -32,8 +32,6 @@ from mvest.valve.geometry.leaflet_fields import (
 )
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 
-__all__ = ["LabelsOptions", "import_labels"]
-
 TERMS = {"anterior": "sh-leaflet-mv-a", "posterior": "sh-leaflet-mv-p"}
 """Codes of SlicerHeart's terminology for the leaflets of the mitral valve."""
 PLAIN = {"anterior": 1, "posterior": 2}

@@ -14,8 +14,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import areas, surface_edges
 
-__all__ = ["Leaflet", "loop_length"]
-
 MAX_HOLE = 0.2
 """Of a leaflet's boundary: how long that of a hole may be, which is closed."""
 

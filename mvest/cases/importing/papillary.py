@@ -7,8 +7,6 @@ import numpy as np
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray
 
-__all__ = ["HEAD_MM", "papillary_tip"]
-
 HEAD_MM = 5.0
 """mm, height of the head of a muscle, from all of which its chordae rise."""
 MIN_SLENDER = 1.5

@@ -22,18 +22,8 @@ from mvest.valve.anatomy.dimensions import ChordLayout
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
-from mvest.valve.io.leaflet_surfaces import SurfaceFile, read_surface
-
-__all__ = [
-    "CITATION",
-    "DATA_VARIABLE",
-    "PARTS",
-    "SHAPE_ALONE",
-    "ReferenceHeartOptions",
-    "heart_files",
-    "heart_parts",
-    "import_reference_heart",
-]
+from mvest.valve.io.leaflet_surfaces import read_surface
+from mvest.valve.io.vtk_xml import SurfaceFile
 
 DATA_VARIABLE = "MVEST_HRA"
 """Environment variable that names the file of the heart, or a folder with its parts."""

@@ -19,16 +19,6 @@ from mvest.typing import FloatArray
 from mvest.valve.geometry.midsurface import Midsurface
 from mvest.valve.io.leaflet_surfaces import write_surface
 
-__all__ = [
-    "OBSERVER_MM",
-    "REGIONS",
-    "SegmentedFrame",
-    "check_handedness",
-    "segmentation_std",
-    "segmented_case",
-    "stated_tips",
-]
-
 REGIONS = ("anterior", "posterior")
 OBSERVER_MM = 1.0
 """Standard deviation of where a person or a network draws a leaflet's wall; that which a case has

@@ -34,8 +34,6 @@ from mvest.errors import GeometryError, InputError, MvestError
 from mvest.typing import FloatArray
 from mvest.valve.io.leaflet_surfaces import write_surface
 
-__all__ = ["SlicerheartOptions", "import_slicerheart"]
-
 OPEN, CLOSED = ("MD", "ED", "CD"), ("MS", "ES", "CS")
 """Phases in the order in which they are preferred."""
 TIMES = {"MS": 0.3, "CS": 0.4, "ES": 0.5}

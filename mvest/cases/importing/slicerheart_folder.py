@@ -24,8 +24,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.leaflet_surfaces import check_finite
 from mvest.valve.io.vtk_legacy import PolyDataFile, read_polydata
 
-__all__ = ["PHASES", "SeenPhase", "read_batch", "read_fem"]
-
 PHASES = {
     "MD": "mid-diastole",
     "ED": "end-diastole",

@@ -31,8 +31,6 @@ from mvest.valve.geometry.leaflet_fields import (
 from mvest.valve.geometry.midsurface import Midsurface, midsurface
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 
-__all__ = ["SolidOptions", "import_solid"]
-
 BLUR_VOXELS = 0.5
 """Smoothing of the grid on which two leaflets are joined."""
 

@@ -21,8 +21,6 @@ from mvest.mechanics.steps import Simulation
 from mvest.mechanics.valve_system import boundary_loading
 from mvest.typing import FloatArray
 
-__all__ = ["CycleModel"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleModel:

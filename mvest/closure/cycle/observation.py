@@ -12,8 +12,6 @@ from mvest.estimation.prediction import ObservationModel, Predicted, require_fin
 from mvest.estimation.wrappers import Remembered, rows_of
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["Beats", "CycleObservation"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleObservation:

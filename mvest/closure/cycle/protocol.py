@@ -11,8 +11,6 @@ from mvest.mechanics.settings import smooth_step
 from mvest.mechanics.steps import Step
 from mvest.quantities import BeatTime, Pressure, TimeStep
 
-__all__ = ["CycleProtocol"]
-
 DEFAULT_TIMES = tuple(round(0.05 * k, 2) for k in range(21))
 """s, from the open valve until it is open again."""
 

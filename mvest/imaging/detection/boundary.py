@@ -15,8 +15,6 @@ from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_shapes
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["BoundaryDetector", "boundary_samples", "leaflet_axes"]
-
 MISSES = Misses(1.2, 3.0, 0.03, 0.4)
 STEP_MM = 0.5
 """mm between places along a normal."""

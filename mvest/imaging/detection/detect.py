@@ -20,16 +20,6 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.quantities import Count, Length, Weight
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "FitSettings",
-    "FrameValve",
-    "NoValveError",
-    "find_frame",
-    "fit_frame",
-    "merits",
-    "search_frame",
-]
-
 LANDMARK_STD_MM = 1.2
 RIM_STD_MM = 0.8
 """mm, least standard deviation of a landmark's and a rim's pull: what the spread of votes does not

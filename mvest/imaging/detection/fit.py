@@ -21,8 +21,6 @@ from mvest.imaging.detection.shape_model import ShapeModel
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["Pulls", "fit_shape", "relax"]
-
 ROUNDS = 3
 TAIL = 2.5
 """Standard deviations beyond which a pull loses weight (Cauchy)."""

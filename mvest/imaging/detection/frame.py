@@ -14,8 +14,6 @@ from mvest.errors import InputError
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["LEVELS", "StandardFrame", "standard_frame"]
-
 VOXEL_MM = 0.8
 """mm, spacing to which volumes are resampled whose own differs from it by more than a fifth."""
 

@@ -17,8 +17,6 @@ from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["LandmarkDetector", "landmark_samples"]
-
 MISSES = Misses(0.0, 4.0, 0.03)
 START_MM = 4.0
 """mm, standard deviation of each coordinate of candidates about a point, in training."""

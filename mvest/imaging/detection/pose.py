@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 from mvest.imaging.layout import ValveLayout
 from mvest.typing import BoolArray, FloatArray, IntArray
 
-__all__ = ["Poses", "pose_of", "rotation_grid"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:

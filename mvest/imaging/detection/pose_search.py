@@ -20,15 +20,6 @@ from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
-__all__ = [
-    "REFINEMENTS",
-    "PoseSearch",
-    "coarse_samples",
-    "fine_samples",
-    "pose_error",
-    "refinement_samples",
-]
-
 ORIENTATIONS = 700
 """Orientations tried at every place: neighbours are some 25 to 30 degrees apart."""
 

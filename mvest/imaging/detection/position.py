@@ -13,8 +13,6 @@ from mvest.imaging.learning.sampling import SamplePattern, directions, features
 from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
-__all__ = ["PLACES", "PositionDetector", "position_samples"]
-
 PLACES = 24
 """Places at which orientations are tried."""
 

@@ -20,8 +20,6 @@ from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_shapes
 from mvest.typing import FloatArray
 
-__all__ = ["RimDetector", "rim_axes", "rim_samples"]
-
 MISSES = Misses(1.5, 4.0, 0.04, 0.5)
 GRIDS_MM = (1.6, 0.9)
 """mm between candidates in the first and second round."""

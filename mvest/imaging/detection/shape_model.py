@@ -17,8 +17,6 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.moving_valve import MovingValve
 from mvest.typing import FloatArray
 
-__all__ = ["ShapeModel", "fit_shape_model"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeModel:

@@ -15,8 +15,6 @@ from mvest.imaging.learning.sampling import SamplePattern, features
 from mvest.imaging.learning.truth import Misses, TrueValve, missed_poses
 from mvest.typing import FloatArray
 
-__all__ = ["ShapeStart", "shape_start_samples"]
-
 MODES = 8
 """Leading modes that are read off; among them how far the valve is open."""
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["smooth_in_time"]
-
 
 def smooth_in_time(
     times: FloatArray,

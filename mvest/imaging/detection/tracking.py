@@ -38,8 +38,6 @@ from mvest.imaging.volume import VolumeSequence
 from mvest.quantities import BeatTime, Count, Length, Share, Speed
 from mvest.typing import BoolArray, FloatArray
 
-__all__ = ["Landmarks", "NoValveError", "TrackingSettings", "detect_valve"]
-
 Landmarks = Mapping[int, Mapping[str, FloatArray]]
 """Placed by hand: frame -> name -> world position (3,) mm."""
 

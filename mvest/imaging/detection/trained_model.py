@@ -31,8 +31,6 @@ from mvest.reading.npz import read_npz
 from mvest.reading.text import one_line, read_bytes
 from mvest.typing import FloatArray
 
-__all__ = ["DetectionAccuracy", "DetectionModel", "default_model", "load_model", "save_model"]
-
 FORMAT = "mvest detection model"
 VERSION = 1
 OUTPUTS: Final = {

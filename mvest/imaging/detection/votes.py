@@ -6,8 +6,6 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["consensus"]
-
 ROUNDS = 4
 
 

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from mvest.imaging.reading.stated import fault
 from mvest.reading.bounded import max_inflated
 
-__all__ = ["beside", "files_of_volume", "read_exactly"]
-
 CHUNK = 2**22
 """Bytes read or decompressed at a time."""
 

@@ -18,8 +18,6 @@ from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, Stated
 from mvest.reading.bounded import array_of_words
 from mvest.typing import FloatArray
 
-__all__ = ["is_metaimage", "read_metaimage"]
-
 NAMES = FieldNames("DimSize", "ElementSpacing", "TransformMatrix", "Offset", "ElementDataFile")
 MAX_HEADER_BYTES = 2**16
 """Within which the line ElementDataFile, the last one, must come."""

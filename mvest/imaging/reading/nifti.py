@@ -18,8 +18,6 @@ from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.typing import FloatArray
 
-__all__ = ["is_nifti", "read_nifti"]
-
 NAMES = FieldNames("dim", "sform or qform", "sform or qform", "sform or qform", "data")
 GZIP = b"\x1f\x8b"
 MM_PER_UNIT = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 1e-3}

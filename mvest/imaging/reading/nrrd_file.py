@@ -26,8 +26,6 @@ from mvest.imaging.reading.stated import FieldNames, Header, StatedTimes, Stated
 from mvest.imaging.volume import Modality
 from mvest.typing import FloatArray
 
-__all__ = ["MODALITY_KEY", "Segment", "read_nrrd", "segment_names"]
-
 NAMES = FieldNames("sizes", "space directions", "space directions", "space origin", "data")
 MODALITY_KEY = "mvest.modality"
 """Key under which this package writes what the voxels are."""

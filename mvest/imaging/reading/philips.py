@@ -28,8 +28,6 @@ from mvest.imaging.reading.plausible import check_size
 from mvest.imaging.reading.stated import FieldNames, StatedTimes, StatedVolume, fault
 from mvest.imaging.volume import Modality
 
-__all__ = ["is_dicom", "read_philips"]
-
 SOP_CLASS = "1.2.840.113543.6.6.1.3.10002"
 DEFLATED = b"1.2.840.10008.1.2.1.99"
 SLICES, SLICE_UNIT, SLICE_SPACING = (0x3001, 0x1001), (0x3001, 0x1002), (0x3001, 0x1003)

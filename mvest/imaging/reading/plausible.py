@@ -18,8 +18,6 @@ from mvest.imaging.reading.times import times_in_seconds
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
-__all__ = ["MAX_BYTES", "check_size", "checked_sequence"]
-
 SPACING_MM = (0.05, 5.0)
 """Between neighbouring voxels; 3D echo has 0.3 to 1.5, CT 0.2 to 1, MR up to 5."""
 EXTENT_MM = (20.0, 500.0)

@@ -17,8 +17,6 @@ from mvest.imaging.reading.stated import StatedVolume, fault
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.reading.bounded import refusing
 
-__all__ = ["read_volume"]
-
 READABLE = "NRRD, MetaImage, NIfTI or Philips Cartesian DICOM"
 
 

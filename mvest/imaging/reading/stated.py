@@ -15,8 +15,6 @@ from mvest.imaging.volume import Modality
 from mvest.reading.text import MAX_LINE, one_line
 from mvest.typing import FloatArray
 
-__all__ = ["FieldNames", "Header", "StatedTimes", "StatedVolume", "fault"]
-
 MIN_VALUE = 40
 """Characters of a value that are shown in any case."""
 

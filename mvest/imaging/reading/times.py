@@ -10,8 +10,6 @@ from mvest.errors import InputError
 from mvest.imaging.reading.stated import StatedTimes, fault
 from mvest.typing import FloatArray
 
-__all__ = ["SECONDS_PER_UNIT", "times_in_seconds"]
-
 SECONDS_PER_UNIT = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),

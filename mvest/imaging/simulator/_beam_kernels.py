@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from mvest.typing import FloatArray
 
-__all__ = ["add_losses", "add_noise", "blur_across", "deposit", "envelope"]
-
 Float32Array = NDArray[np.float32]
 DECIBEL = np.log(10.0) / 20.0
 

@@ -22,8 +22,6 @@ from mvest.quantities import (
     Weight,
 )
 
-__all__ = ["SMALL", "SPEED_OF_SOUND", "Acquisition"]
-
 SPEED_OF_SOUND = 1540.0
 """m/s, mean of soft tissue that scanners assume (Szabo, Diagnostic Ultrasound Imaging, 2014)."""
 

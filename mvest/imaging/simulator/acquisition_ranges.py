@@ -10,8 +10,6 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition
 
-__all__ = ["SHIFTED", "TRAINING", "WIDE", "AcquisitionRanges", "Range", "draw_acquisition"]
-
 Interval: TypeAlias = tuple[float, float]
 
 

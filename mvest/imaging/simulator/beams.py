@@ -26,8 +26,6 @@ from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.imaging.simulator.scene import Echoes
 from mvest.typing import FloatArray
 
-__all__ = ["Axis", "BeamGrid", "Losses", "render_window"]
-
 Float32Array = NDArray[np.float32]
 
 

@@ -14,8 +14,6 @@ import numpy as np
 from mvest.imaging.moving_valve import MovingValve
 from mvest.typing import FloatArray
 
-__all__ = ["Heart", "make_heart", "waves"]
-
 ROWS = 33
 
 

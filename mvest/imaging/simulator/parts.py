@@ -10,8 +10,6 @@ from mvest.imaging.simulator.chambers import Heart, waves
 from mvest.imaging.simulator.scatterers import Cord, Material, TissuePart, TissueSheet, normals
 from mvest.typing import FloatArray
 
-__all__ = ["make_parts"]
-
 SURROUNDINGS_MM, FADE = 20.0, 2.0
 """Thickness of what is shown outside the heart, and over how much of it it fades (a choice)."""
 

@@ -11,8 +11,6 @@ from mvest.errors import InputError
 from mvest.imaging.simulator.acquisition import Acquisition
 from mvest.typing import FloatArray
 
-__all__ = ["Probe", "draw_probe"]
-
 
 def _zero() -> FloatArray:
     return np.zeros(3)

@@ -13,8 +13,6 @@ from mvest.imaging.simulator.beams import BeamGrid
 from mvest.imaging.simulator.probe import Probe
 from mvest.typing import FloatArray
 
-__all__ = ["compress", "scan_convert", "volume_frame"]
-
 Float32Array = NDArray[np.float32]
 
 

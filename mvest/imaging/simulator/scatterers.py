@@ -13,8 +13,6 @@ import numpy as np
 
 from mvest.typing import FloatArray
 
-__all__ = ["Cord", "Material", "TissuePart", "TissueSheet", "normals"]
-
 
 @dataclass(frozen=True, slots=True)
 class Material:

@@ -14,8 +14,6 @@ from mvest.imaging.simulator.probe import Probe
 from mvest.imaging.simulator.scatterers import TissuePart
 from mvest.typing import FloatArray
 
-__all__ = ["Echoes", "Scene", "cell_volume", "make_scene"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echoes:

@@ -19,8 +19,6 @@ from mvest.imaging.valve_sequence import ValveSequence
 from mvest.imaging.volume import Modality, VolumeSequence
 from mvest.typing import FloatArray
 
-__all__ = ["simulate_volume", "true_sequence"]
-
 
 def simulate_volume(
     valve: MovingValve,

@@ -18,14 +18,6 @@ from mvest.imaging.reading.nrrd_file import MODALITY_KEY
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import IntArray
 
-__all__ = [
-    "SEGMENTS",
-    "checked_path",
-    "segment_name",
-    "write_segmentation",
-    "write_sequence_nrrd",
-]
-
 TYPES = ("uint8", "int16", "float32")
 
 

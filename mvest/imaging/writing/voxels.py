@@ -8,8 +8,6 @@ from mvest.errors import InputError
 from mvest.imaging.volume import VolumeSequence
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["voxelise_leaflets"]
-
 
 def voxelise_leaflets(
     volume: VolumeSequence,

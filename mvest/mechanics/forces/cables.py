@@ -22,8 +22,6 @@ from mvest.errors import InputError
 from mvest.typing import BoolArray, FloatArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = ["Cables", "Hinge", "cable_force"]
-
 
 def cable_force(strain: FloatArray, toe: float) -> tuple[FloatArray, FloatArray]:
     """Force over EA and its derivative by the strain, both ``(c,)``."""

@@ -47,8 +47,6 @@ from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.mesh.embedding import Embedding
 
-__all__ = ["Contact"]
-
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""
 APPROACH = 0.75

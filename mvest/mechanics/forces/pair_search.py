@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["NEIGHBOUR", "ContactPairs", "search_pairs"]
-
 NEIGHBOUR = 0.8
 """Reach of a pair over its rest distance, at most: a sheet touches itself from 20 % compression."""
 FINENESS = 2

@@ -25,8 +25,6 @@ from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs
 from mvest.mechanics.settings import ContactSettings
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["HARMLESS", "Passing"]
-
 HARMLESS = 0.02
 """mm; a step that moves no point farther cannot take sheets through each other."""
 

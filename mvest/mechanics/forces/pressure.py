@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from mvest.elements import FACES
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["PressureLoad"]
-
 
 class PressureLoad:
     """Unit follower pressure on faces.

@@ -21,8 +21,6 @@ from mvest.typing import FloatArray
 from mvest.valve.mesh.embedding import Embedding, embed
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["TiedPoints", "Ties", "differences"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiedPoints:

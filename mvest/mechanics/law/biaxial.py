@@ -12,8 +12,6 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["biaxial_stress"]
-
 MAX_ITERATIONS = 100
 TOLERANCE = 1e-12
 """Change of the thickness strain at which the stretch of the thickness is found."""

@@ -36,11 +36,9 @@ import numba as nb
 import numpy as np
 
 from mvest.errors import InputError
-from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter, known_names
 from mvest.typing import FloatArray, IntArray
-
-__all__ = ["BiotLaw", "PoissonReading", "TransverselyIsotropic"]
 
 ONE, OTHER = np.array([1, 0, 0]), np.array([2, 2, 1])
 """The axes of each shear."""

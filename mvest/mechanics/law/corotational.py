@@ -19,8 +19,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["EdgeRotations"]
-
 
 class EdgeRotations:
     """Frames of linear tetrahedra that turn with their edges.

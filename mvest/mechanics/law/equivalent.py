@@ -12,8 +12,6 @@ from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.law.exponential import ExponentialLaw
 from mvest.mechanics.settings import ExponentialTissue, TissueSettings
 
-__all__ = ["CLOSED_STRETCHES", "as_stiff"]
-
 CLOSED_STRETCHES = (1.0, 1.11)
 """Along the fibres and across them: the medians of closed leaflets (``results/law.md``)."""
 

@@ -47,8 +47,6 @@ from mvest.mechanics.parameters import Parameter, known_names
 from mvest.mechanics.settings import EXPONENTIAL_KINDS, ExponentialTissue
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["ExponentialLaw"]
-
 MAX_EXPONENT = 12.0
 """Where the exponential ends: 1.6e5 times c0, many times what tears a leaflet."""
 

@@ -37,8 +37,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import LeafletSurface, lumped_areas
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["FieldBasis", "FieldLaw", "at_quadrature"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldBasis:

@@ -12,8 +12,6 @@ from mvest.mechanics.law.moduli import LeafletModuli, TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter, known_names
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["LinearLaw"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLaw:

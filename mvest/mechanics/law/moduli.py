@@ -17,8 +17,6 @@ import numpy as np
 from mvest.errors import InputError, MaterialError
 from mvest.typing import FloatArray
 
-__all__ = ["LeafletModuli", "PoissonReading", "TransverselyIsotropic"]
-
 
 class PoissonReading(Enum):
     """How the single Poisson ratio of the paper is read.

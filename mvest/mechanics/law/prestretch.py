@@ -28,8 +28,6 @@ from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.solid import Law
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["PrestretchedLaw"]
-
 POWERS = np.array([2.0, 2.0, -4.0, -1.0, -1.0, 2.0])
 """Of the prestretch, by which components of C and S of the shape that was seen are multiplied."""
 NORMAL = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])

@@ -12,8 +12,6 @@ from mvest.mechanics.parameters import Parameter, known_names
 from mvest.mechanics.solid import Law
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["RegionalLaw"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionalLaw:

@@ -29,8 +29,6 @@ from mvest.mechanics.parameters import Parameter, known_names
 from mvest.mechanics.settings import TissueSettings
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["StiffeningLaw"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StiffeningLaw:

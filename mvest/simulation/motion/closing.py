@@ -37,16 +37,6 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.mesh.structured import structured_mesh
 
-__all__ = [
-    "ClosingFrames",
-    "MotionSettings",
-    "close_in_motion",
-    "closing_frames",
-    "frames_along",
-    "moving_valve",
-    "with_tip_motion",
-]
-
 GIVE_UP: dict[str, Any] = {"max_iterations": 40, "max_halvings": 3, "largest_move": 2.0}
 """Newton's method gives a step up sooner than elsewhere: another valve is drawn in less time than
 it takes to follow one whose leaflets have run away."""

@@ -15,8 +15,6 @@ from mvest.imaging.moving_valve import MovingValve
 from mvest.reading.npz import check_array, read_npz
 from mvest.simulation.motion.population import Population
 
-__all__ = ["VERSION", "load_population", "save_population"]
-
 VERSION = 1
 """Of the format."""
 

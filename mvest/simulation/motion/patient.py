@@ -40,8 +40,6 @@ from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Valve
 from mvest.valve.geometry.proximity import closest_points
 
-__all__ = ["IMAGED", "ImagedPatient", "simulate_imaged_patient"]
-
 IMAGED = PatientSimulation(
     columns=54,
     rows=6,

@@ -22,16 +22,9 @@ from mvest.quantities import Factor, Length, Logarithm
 from mvest.simulation.motion.closing import MotionSettings, close_in_motion
 from mvest.simulation.motion.refusal import RefusedError
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
-
-__all__ = [
-    "Population",
-    "PopulationSettings",
-    "draw_population",
-    "draw_tip_motion",
-    "population_hash",
-]
 
 MAX_DRAWS = 20
 """Valves drawn in a row until one closes."""

@@ -15,8 +15,6 @@ from mvest.valve.geometry.triangles import surface_edges
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import orifice_area
 
-__all__ = ["MotionLimits", "Refusal", "RefusedError", "check_motion"]
-
 
 class Refusal(Enum):
     """Why a motion is refused."""

@@ -18,8 +18,6 @@ from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface
 from mvest.valve.geometry.thickening import smooth_normals_change, smooth_vertex_normals
 from mvest.valve.geometry.triangles import directed_edges
 
-__all__ = ["Band", "leaflet_normals", "leaflet_normals_change"]
-
 INSIDE = 2.0
 """Degrees from the line between two leaflets at which the fibre of either is read."""
 

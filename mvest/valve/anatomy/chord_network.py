@@ -29,8 +29,6 @@ from scipy.sparse.csgraph import dijkstra
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["ChordPaths", "trace_cables"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChordPaths:

@@ -15,17 +15,6 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.quantities import Angle, Factor, Length, Place, Share, Stiffness, Thickness
 
-__all__ = [
-    "AnnulusDimensions",
-    "ChordLayout",
-    "ClosedEdge",
-    "FreeEdge",
-    "LeafletDimensions",
-    "LeafletPair",
-    "PapillaryPlace",
-    "TemplateParameters",
-]
-
 Group = TypeVar("Group")
 
 

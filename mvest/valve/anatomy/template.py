@@ -19,10 +19,8 @@ import numpy as np
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve, band_grid
-
-__all__ = ["ChordLayout", "Template", "TemplateParameters", "vertex_region"]
 
 ANTERIOR, POSTERIOR = 0, 1
 REGIONS = ("anterior", "posterior")

@@ -16,20 +16,6 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, areas
 
-__all__ = [
-    "BandGrid",
-    "Chordae",
-    "LeafletSurface",
-    "Motion",
-    "Valve",
-    "band_grid",
-    "checked_floats",
-    "checked_indices",
-    "lumped_areas",
-    "lumped_areas_change",
-    "vertex_normals",
-]
-
 
 def checked_floats(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only copy as float64, its shape (None: any length) and finiteness checked.

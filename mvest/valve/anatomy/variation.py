@@ -27,9 +27,8 @@ import scipy
 
 from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray
-from mvest.valve.anatomy.template import Template, TemplateParameters
-
-__all__ = ["VariedAnatomy", "draw_variation", "vary"]
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
 
 LIMIT = 2.0
 """Standard deviations beyond which nothing is drawn."""

@@ -26,14 +26,6 @@ from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import surface_edges
 
-__all__ = [
-    "LeafletFields",
-    "ThickLeaflets",
-    "fields_of_masks",
-    "inside_surfaces",
-    "thick_leaflets",
-]
-
 # skimage states no types.
 marching_cubes: Any = measure.marching_cubes
 MARGIN_MM = 3.0

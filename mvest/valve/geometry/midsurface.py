@@ -24,8 +24,6 @@ from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface
 from mvest.valve.geometry.triangles import area_vectors
 from mvest.valve.geometry.walls import Wall, closed_band, walls
 
-__all__ = ["Midsurface", "midsurface"]
-
 EDGE_MM = 1.2
 """Edge length of the triangles, on average."""
 ROUNDS = 8

@@ -19,15 +19,6 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import area_vectors
 
-__all__ = [
-    "across_curve",
-    "closest_on_loop",
-    "curve_offsets",
-    "signed_distances",
-    "smooth_distances",
-    "smooth_offsets",
-]
-
 TOUCHING = 1e-9
 """Distance in mm below which the offset from a closest point has no direction of its own."""
 

@@ -21,8 +21,6 @@ from scipy import sparse
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import areas, directed_edges, unit_normals
 
-__all__ = ["Refinement", "refined"]
-
 MAX_TRIANGLES = 100_000
 """Of a refined surface."""
 

@@ -12,8 +12,6 @@ from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.annulus import AnnulusPlane, checked_loop
 
-__all__ = ["SpanningSurface", "spanning_surface"]
-
 RINGS = 12
 """Of vertices between the curve and its centre."""
 MAX_ROUNDS = 100

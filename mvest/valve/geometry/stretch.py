@@ -7,8 +7,6 @@ import numpy as np
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.triangles import areas
 
-__all__ = ["principal_stretches"]
-
 
 def principal_stretches(
     rest: FloatArray, deformed: FloatArray, triangles: IntArray

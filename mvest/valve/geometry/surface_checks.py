@@ -18,9 +18,6 @@ from mvest.valve.geometry.proximity import (
     overlapping_boxes,
 )
 
-__all__ = ["check_surface", "edge_table", "enclosed_volume", "listed"]
-
-
 ENOUGH_PAIRS = 1000
 """Of intersecting triangles that are counted for a message."""
 MAX_OVERLAPS = 1e7

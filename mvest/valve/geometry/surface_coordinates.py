@@ -34,13 +34,6 @@ from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.triangles import directed_edges, unit_rows
 
-__all__ = [
-    "SurfaceCoordinates",
-    "boundary_loops",
-    "cotangent_laplacian",
-    "surface_coordinates",
-]
-
 MIN_WEIGHT = 0.05
 """To which cotangent weights are raised if the coordinates fold over; equilateral triangles have
 0.58."""

@@ -18,14 +18,6 @@ from mvest.valve.geometry.surface_checks import (
 )
 from mvest.valve.geometry.triangles import area_vectors, area_vectors_change, surface_edges
 
-__all__ = [
-    "FACE_KINDS",
-    "ClosedSurface",
-    "smooth_normals_change",
-    "smooth_vertex_normals",
-    "thicken",
-]
-
 FACE_KINDS = ("ventricular", "atrial", "rim")
 """What a triangle of a thickened leaflet bounds."""
 

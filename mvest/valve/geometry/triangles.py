@@ -6,16 +6,6 @@ import numpy as np
 
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "area_vectors",
-    "area_vectors_change",
-    "areas",
-    "directed_edges",
-    "surface_edges",
-    "unit_normals",
-    "unit_rows",
-]
-
 
 def area_vectors(vertices: FloatArray, triangles: IntArray) -> FloatArray:
     """Normals ``(m, 3)`` of triangles, as long as their area in mm²."""

@@ -25,8 +25,6 @@ from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import surface_edges
 
-__all__ = ["Wall", "closed_band", "walls"]
-
 MAX_THICKNESS = 8.0
 """mm, diameter of the first ball; a thickened leaflet of a diseased valve has 5 mm."""
 BALL_ROUNDS = 40

@@ -23,8 +23,6 @@ from mvest.reading.text import MAX_TEXT, read_bytes
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.vtk_xml import MAX_SURFACE, SurfaceFile
 
-__all__ = ["read_glb"]
-
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _COMPONENTS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC3": 3}

@@ -24,13 +24,6 @@ from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
 from mvest.valve.io.vtk_legacy import read_vtk
 from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
 
-__all__ = [
-    "SurfaceFile",
-    "read_surface",
-    "write_surface",
-    "write_surface_series",
-]
-
 Data = Mapping[str, NDArray[np.generic]]
 """Named arrays with one row per point or cell."""
 

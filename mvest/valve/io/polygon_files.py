@@ -17,8 +17,6 @@ from mvest.reading.text import read_bytes
 from mvest.typing import FloatArray
 from mvest.valve.io.vtk_xml import MAX_SURFACE, SurfaceFile
 
-__all__ = ["read_obj", "read_ply", "read_stl"]
-
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _STL_HEADER = 84
 

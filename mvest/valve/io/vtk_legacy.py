@@ -20,8 +20,6 @@ from mvest.reading.text import one_line, read_bytes
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.vtk_xml import MAX_SURFACE, SurfaceFile
 
-__all__ = ["PolyDataFile", "read_polydata", "read_vtk"]
-
 _TYPES = {
     **{"char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2"},
     **{"int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8"},

@@ -23,8 +23,6 @@ from mvest.reading.bounded import array_of_words, inflate, max_inflated, refusin
 from mvest.reading.text import read_bytes
 from mvest.typing import FloatArray, IntArray
 
-__all__ = ["MAX_SURFACE", "CellFile", "SurfaceFile", "read_vtp", "read_vtu", "write_vtp"]
-
 MAX_SURFACE = 2**28
 """Bytes of a file with a surface or a mesh; a fine leaflet has some MB."""
 CELLS = {

@@ -21,14 +21,6 @@ from mvest.valve.measure.measurements import (
 )
 from mvest.valve.measure.passing_ball import largest_passing_ball
 
-__all__ = [
-    "MeasuredLeaflets",
-    "annulus_and_tips",
-    "clinical_meaning",
-    "clinical_measurements",
-    "clinical_names",
-]
-
 Numbers: TypeAlias = dict[str, float | None]
 
 UNITS = {"mm": "mm", "mm2": "mm²", "mm3": "mm³", "ratio": ""}

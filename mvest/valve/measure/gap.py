@@ -17,8 +17,6 @@ from mvest.typing import BoolArray, FloatArray, IntArray
 from mvest.valve.measure.annulus import AnnulusPlane
 from mvest.valve.measure.coaptation import project_leaflets
 
-__all__ = ["Gap", "find_gap"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:

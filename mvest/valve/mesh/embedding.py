@@ -17,8 +17,6 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["Embedding", "embed"]
-
 LAST_STEP = 1e-9
 """In reference coordinates; the step after one this small, its square, is round-off."""
 

@@ -14,8 +14,6 @@ from mvest.valve.mesh.structured import structured_mesh
 from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
 from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
 
-__all__ = ["ENVELOPE_SHARE", "GivenValve"]
-
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""
 

@@ -25,8 +25,6 @@ from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.geometry.triangles import directed_edges, unit_rows
 from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 
-__all__ = ["LayeredMesh", "layered_wedges"]
-
 LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
 """Node levels that one layer of each element adds."""
 MIN_AREA_RATIO = 0.5

@@ -14,8 +14,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import jacobian_determinants
 
-__all__ = ["QualityReport", "aspect_ratios", "mesh_quality", "scaled_jacobians"]
-
 
 @dataclass(frozen=True, slots=True)
 class QualityReport:

@@ -22,8 +22,6 @@ from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import SurfaceCoordinates, surface_coordinates
 from mvest.valve.geometry.triangles import areas, directed_edges
 
-__all__ = ["Remeshed", "remesh"]
-
 LLOYD_ITERATIONS = 40
 """Cap of the iteration; on the valves tried it stops earlier or moves no vertex visibly."""
 

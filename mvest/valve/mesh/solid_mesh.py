@@ -12,8 +12,6 @@ from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import checked_floats, checked_indices
 
-__all__ = ["SolidMesh", "jacobian_determinants"]
-
 
 def jacobian_determinants(
     nodes: FloatArray, elements: IntArray, reference: Element, points: FloatArray

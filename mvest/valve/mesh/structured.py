@@ -14,8 +14,6 @@ from mvest.errors import InputError
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.mesh.solid_mesh import SolidMesh
 
-__all__ = ["MaterialSurface", "structured_mesh"]
-
 
 class MaterialSurface(Protocol):
     """A valve with two leaflets in material coordinates, as template and band are.

@@ -12,7 +12,7 @@ from mvest.imaging.detection.tracking import TrackingSettings
 from mvest.imaging.learning.training import TrainingSettings
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
 from mvest.simulation.motion import PopulationSettings
-from mvest.valve.anatomy.template import TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from mvest.closure.model import ClosureModel
 from mvest.estimation import Prediction
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.io.leaflet_surfaces import write_surface
 from mvest.valve.mesh.structured import structured_mesh
 

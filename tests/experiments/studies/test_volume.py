@@ -14,7 +14,7 @@ from mvest.cases.folder import read_case
 from mvest.cases.from_images import valve_axes
 from mvest.errors import InputError
 from mvest.files import sha256_of
-from mvest.imaging.detection.tracking import NoValveError
+from mvest.imaging.detection.detect import NoValveError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.markups import PointList, write_markups
 from mvest.imaging.volume import Modality, VolumeSequence

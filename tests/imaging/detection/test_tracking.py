@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 from mvest.imaging.detection import position, tracking
-from mvest.imaging.detection.detect import fit_frame, search_frame
+from mvest.imaging.detection.detect import NoValveError, fit_frame, search_frame
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.detection.pose import Poses
 from mvest.imaging.detection.pose_search import PoseSearch
 from mvest.imaging.detection.position import PositionDetector
-from mvest.imaging.detection.tracking import (
-    NoValveError,
-    TrackingSettings,
-    detect_valve,
-)
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.landmarks import LANDMARKS, landmark_vertices
 from mvest.imaging.volume import VolumeSequence

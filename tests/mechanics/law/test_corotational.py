@@ -11,10 +11,11 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.integrate import simulate
 from mvest.mechanics.law.linear import LinearLaw
 from mvest.mechanics.law.moduli import LeafletModuli, PoissonReading
+from mvest.mechanics.parameters import Parameter
 from mvest.mechanics.settings import ClosureProtocol, MechanicsSettings, TissueSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Damping, NewtonSettings, Step
-from mvest.mechanics.system import Loads, Parameter, System
+from mvest.mechanics.system import Loads, System
 from mvest.mechanics.valve_system import material_law
 from tests.mechanics.bodies import block, rotation
 

@@ -6,7 +6,8 @@ import pytest
 from mvest.errors import MaterialError
 from mvest.mechanics.forces.cables import Hinge
 from mvest.mechanics.integrate import simulate
-from mvest.mechanics.law.biot import BiotLaw, PoissonReading, TransverselyIsotropic
+from mvest.mechanics.law.biot import BiotLaw
+from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Loads, System

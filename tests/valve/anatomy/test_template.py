@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError, InputError
-from mvest.valve.anatomy.template import (
-    ANTERIOR,
-    POSTERIOR,
-    ChordLayout,
-    Template,
-    TemplateParameters,
-)
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
+from mvest.valve.anatomy.template import ANTERIOR, POSTERIOR, Template
 
 TEMPLATE = Template()
 DEFAULT = TEMPLATE.parameters

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.valve.anatomy.template import ChordLayout, Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import ChordLayout, TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import MAX_REFUSED, draw_variation, vary
 from mvest.valve.mesh.structured import structured_mesh
 

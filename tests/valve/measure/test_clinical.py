@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError
-from mvest.valve.anatomy.dimensions import AnnulusDimensions
-from mvest.valve.anatomy.template import Template, TemplateParameters
+from mvest.valve.anatomy.dimensions import AnnulusDimensions, TemplateParameters
+from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.measure import clinical
 from mvest.valve.measure.clinical import clinical_meaning, clinical_measurements, clinical_names

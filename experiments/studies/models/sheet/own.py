@@ -8,8 +8,8 @@ from experiments.studies.models.sheet.sheet import Sheet, inadmissible
 from mvest.estimation.prediction import Prediction
 from mvest.mechanics.blocks import box, outer_faces
 from mvest.mechanics.body import simulate_body
-from mvest.mechanics.law.biot import TransverselyIsotropic
-from mvest.mechanics.system import Parameter
+from mvest.mechanics.law.moduli import TransverselyIsotropic
+from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray
 from mvest.valve.mesh.embedding import embed
 from mvest.valve.mesh.solid_mesh import SolidMesh

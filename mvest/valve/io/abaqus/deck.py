@@ -13,17 +13,6 @@ from mvest.reading.text import one_line
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.io.abaqus.keywords import Block
 
-__all__ = [
-    "SHELLS",
-    "TRUSSES",
-    "Amplitude",
-    "Deck",
-    "ElementSection",
-    "Elements",
-    "FaceLoad",
-    "lookup",
-]
-
 T = TypeVar("T")
 
 SHELLS = {"S4": 4, "S4R": 4, "S4RS": 4, "S4RSW": 4, "S3": 3, "S3R": 3, "S3RS": 3}
@@ -215,4 +204,5 @@ def lookup(sets: Mapping[str, T], name: str, what: str) -> T:
 
 
 def some(names: Iterable[str]) -> str:
+    """Names for a message, shortened where they are many."""
     return one_line(", ".join(names), 160) or "none"

@@ -32,8 +32,6 @@ from mvest.valve.io.abaqus.deck import (
 )
 from mvest.valve.io.abaqus.keywords import Block, blocks_of
 
-__all__ = ["read_deck"]
-
 CORNERS = SHELLS | TRUSSES
 """Nodes of the elements that are read."""
 MAX_BLOCKS = 20_000

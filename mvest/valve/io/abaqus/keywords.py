@@ -18,8 +18,6 @@ from mvest.reading.bounded import array_of_words
 from mvest.reading.text import MAX_NUMBER, one_line
 from mvest.typing import FloatArray
 
-__all__ = ["Block", "blocks_of"]
-
 _WORD = re.compile(r'(?:[^,"]|"[^"]*")+')
 
 

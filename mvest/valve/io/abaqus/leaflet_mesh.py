@@ -13,8 +13,6 @@ from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.surface_coordinates import boundary_loops
 from mvest.valve.io.abaqus.deck import SHELLS, Deck
 
-__all__ = ["LeafletMesh", "SetNames", "leaflet_mesh", "shell_numbers"]
-
 
 @dataclass(frozen=True, slots=True)
 class SetNames:

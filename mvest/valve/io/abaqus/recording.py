@@ -35,8 +35,6 @@ from mvest.valve.io.abaqus.truss_stiffness import truss_stiffness
 from mvest.valve.io.vtk_xml import read_vtu
 from mvest.valve.mesh.remesh import Remeshed
 
-__all__ = ["Recording", "read_recording", "recording_files"]
-
 TOLERANCE_MM = 1e-3
 """Frames are stored in single precision, whose rounding at 30 mm is 2e-6 mm."""
 SAME_MM = 1e-6

@@ -9,8 +9,6 @@ from mvest.reading.text import one_line
 from mvest.valve.io.abaqus.deck import ElementSection
 from mvest.valve.io.abaqus.keywords import Block
 
-__all__ = ["secant_modulus", "truss_stiffness"]
-
 MAX_STRAIN = 0.1
 """Of a linearisation: chordae tear beyond."""
 

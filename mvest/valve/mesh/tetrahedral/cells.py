@@ -9,15 +9,6 @@ import numpy as np
 from mvest.errors import GeometryError
 from mvest.typing import FloatArray, IntArray
 
-__all__ = [
-    "content_sha256",
-    "drop_unused_nodes",
-    "orient",
-    "outer_faces",
-    "promote_to_tet10",
-    "volumes",
-]
-
 _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of the face opposite to each corner, normals outwards when the volume is positive."""
 

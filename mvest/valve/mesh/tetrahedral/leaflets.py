@@ -20,8 +20,6 @@ from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.tetrahedral.cells import outer_faces, promote_to_tet10, tri6_faces
 from mvest.valve.mesh.tetrahedral.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
 
-__all__ = ["label_tetrahedra", "tetrahedral_leaflets"]
-
 PRESSURE_AREA_TOLERANCE = 0.1
 """Largest relative difference between the pressure faces' area and the ventricular side's."""
 

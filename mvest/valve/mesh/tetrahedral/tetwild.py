@@ -35,8 +35,6 @@ from mvest.valve.mesh.tetrahedral.cells import (
     volumes,
 )
 
-__all__ = ["TetrahedralMesh", "TetwildReport", "TetwildSettings", "tetrahedralize"]
-
 WORKER = Path(__file__).with_name("_tetwild_worker.py")
 
 
