@@ -10,10 +10,10 @@ import mvest
 from experiments.common.building import anatomy, closure, patient_store
 from experiments.common.building.truth import MADE_BY
 from experiments.studies.imaged_patient import study as imaged_patient
-from experiments.studies.imaging import store as imaging_store
-from experiments.studies.imaging import trials
+from experiments.studies.imaging.detectors import SAMPLED_BY
 from mvest.errors import InputError
 from mvest.simulation.motion.population import draw_population
+from mvest.simulation.trials import try_sequence
 from mvest.source import SOURCES, Sources, source_key
 
 FILES = {
@@ -276,8 +276,8 @@ def test_volumes_and_what_writes_them_count_where_they_are_used():
     assert imaged >= FORWARD | volumes | {
         "mvest.imaging.writing.slicer", "mvest.cases.writer",
     }  # fmt: skip
-    assert reached(*imaging_store.SAMPLED_BY) >= volumes
-    tried = reached(trials.try_sequence)
+    assert reached(*SAMPLED_BY) >= volumes
+    tried = reached(try_sequence)
     assert tried >= volumes | {"mvest.imaging.detection.tracking", "mvest.imaging.learning.truth"}
     for found in (imaged, tried):
         assert not [name for name in found if name.startswith("experiments.common.cases")]

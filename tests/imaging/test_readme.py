@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 
 from experiments.common.cases.settings import ImagedSettings
-from experiments.studies.imaging.settings import ImagingSettings
+from experiments.studies.imaging.detectors import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
 from mvest.imaging.layout import ValveLayout

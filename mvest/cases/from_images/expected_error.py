@@ -19,9 +19,10 @@ import numpy as np
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.accuracy import share_within
 from mvest.typing import FloatArray
 
-__all__ = ["error_at_shape", "expected_error", "in_mirror"]
+__all__ = ["coverage", "error_at_shape", "expected_error", "in_mirror"]
 
 PENALTIES = np.append(np.logspace(-3.0, 3.0, 25), np.inf)
 """Those tried, over the mean variance of the shapes; at infinity the shape says nothing."""
@@ -65,6 +66,61 @@ def expected_error(
     if accuracy.shapes is not None and accuracy.tip_shapes is not None:
         shapes = np.concatenate([accuracy.shapes, accuracy.tip_shapes], axis=2)
     return error_at_shape(layout, errors, shapes, shape)
+
+
+def coverage(
+    layout: ValveLayout,
+    accuracy: DetectionAccuracy,
+    errors: FloatArray,
+    shapes: FloatArray,
+    confidence: FloatArray,
+) -> list[dict[str, float]]:
+    """How true the stated errors are of valves that were not among the samples, by frame.
+
+    Parameters
+    ----------
+    layout : ValveLayout
+    accuracy : DetectionAccuracy
+    errors : (S, 2, n, 3) mm
+        Found less true, in the open and the closed frame.
+    shapes : (S, 2, n + 2, 3) mm
+        Where the valves were found; see `expected_error`.
+    confidence : (S,)
+        Of each volume.
+
+    Returns
+    -------
+    list of dict
+        For each frame ``within_95`` (% of coordinates within 1.96 of the stated deviations),
+        ``rms`` and ``stated`` (mm, the actual and the stated root mean square); and the same
+        ``..._handed_on``, less the error that is expected of such a shape.
+    """
+    n = layout.size
+    factors = np.array([accuracy.factor(one) for one in confidence])[:, None, None, None]
+    expected, samples = zip(
+        *(expected_error(layout, accuracy, shape) for shape in shapes), strict=True
+    )
+    left = (errors - np.stack(expected)[:, :, :n]) / factors
+    spread = np.stack([np.sqrt((one[:, :, :n] ** 2).mean(axis=(0, 3))) for one in samples])
+    rows = []
+    for k in range(2):
+        own = errors[:, k : k + 1]
+        handed_on = share_within(left[:, k] / spread[:, k, :, None], np.ones(n))
+        rows.append(
+            {
+                "within_95": 100 * share_within(own / factors, accuracy.std_mm),
+                "rms": _rms(own),
+                "stated": _rms(accuracy.std_mm) * _rms(factors),
+                "within_95_handed_on": 100 * handed_on,
+                "rms_handed_on": _rms(factors[:, 0] * left[:, k]),
+                "stated_handed_on": _rms(factors[:, 0, 0] * spread[:, k]),
+            }
+        )
+    return rows
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def error_at_shape(

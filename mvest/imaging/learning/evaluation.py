@@ -14,7 +14,7 @@ from mvest.imaging.layout import ValveLayout
 from mvest.imaging.learning.truth import TrueValve
 from mvest.typing import FloatArray
 
-__all__ = ["FrameErrors", "frame_errors", "surface_distances"]
+__all__ = ["FrameErrors", "best_threshold", "frame_errors", "surface_distances"]
 
 FINER = 4
 """Times as many points as vertices in each direction stand for a surface."""
@@ -128,3 +128,16 @@ def _across(points: FloatArray, true: FloatArray) -> float:
     t = ((points[:, None] - a) * along).sum(axis=2) / (along**2).sum(axis=1)
     foot = a + np.clip(t, 0, 1)[..., None] * along
     return float(np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1).mean())
+
+
+def best_threshold(right: FloatArray, wrong: FloatArray) -> float:
+    """The confidence that separates right detections from wrong ones best.
+
+    It maximises the share of ``right`` at or above it plus the share of ``wrong`` below it; of
+    equally good thresholds the middle one is taken.
+    """
+    edges = np.unique(np.concatenate([right, wrong]))
+    tried = np.concatenate([edges[:1] - 1e-3, 0.5 * (edges[1:] + edges[:-1]), edges[-1:] + 1e-3])
+    score = [(right >= t).mean() + (wrong < t).mean() for t in tried]
+    best = tried[np.isclose(score, max(score))]
+    return float(best[len(best) // 2])

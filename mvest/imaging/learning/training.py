@@ -49,6 +49,7 @@ __all__ = [
     "Draft",
     "RenderedFrame",
     "SampleCounts",
+    "Sampled",
     "Samples",
     "TrainingSettings",
     "draft_of",
@@ -129,6 +130,12 @@ class Draft:
         best = count // 2
         others = best + rng.choice(len(poses) - best, count - best, replace=False)
         return poses[np.concatenate([np.arange(best), others])]
+
+
+Sampled: TypeAlias = Callable[
+    [Sequence[int], ShapeModel, Callable[[], Draft] | None], Sequence[Samples]
+]
+"""(numbers of volumes, shapes, what makes the draft; none for the first volumes) -> samples."""
 
 
 def draft_of(samples: Sequence[Samples], settings: TrainingSettings, seed: int) -> Draft:
@@ -293,6 +300,7 @@ def train_model(
     processes: int = 1,
     trained_on: Mapping[str, Any] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    sampled: Sampled | None = None,
 ) -> DetectionModel:
     """Simulate volumes and learn all stages.
 
@@ -302,12 +310,14 @@ def train_model(
         Of one layout.
     settings : TrainingSettings
     seed : int
-        The result depends on it and on no number of processes.
+        The result depends on it and not on the number of processes.
     processes : int
     trained_on : mapping, optional
         Plain values that are kept with the model.
     progress : callable, optional
         Called with what is being done, how much is done and how much there is.
+    sampled : callable, optional
+        Makes the samples instead, from a cache for example; as `volume_samples` would.
 
     Raises
     ------
@@ -319,15 +329,27 @@ def train_model(
     if settings.modes < MODES:
         raise InputError(f"training: {settings.modes} modes, expected at least {MODES}")
     tell = progress or (lambda what, done, all_: None)
-    shape = fit_shape_model(valves, settings.modes)
-    samples: list[Samples] = []
-    first = min(settings.draft_volumes, settings.volumes)
-    for numbers in (range(first), range(first, settings.volumes)):
-        draft = draft_of(samples, settings, seed) if samples and len(numbers) else None
+
+    def simulated(
+        numbers: Sequence[int], shape: ShapeModel, make_draft: Callable[[], Draft] | None
+    ) -> list[Samples]:
+        draft = make_draft() if make_draft else None
         volumes = ((valves[k % len(valves)], k, shape, settings, seed, draft) for k in numbers)
-        for sample in side_by_side(volume_samples, volumes, processes):
-            samples.append(sample)
-            tell("volumes", len(samples), settings.volumes)
+        made: list[Samples] = []
+        for k, sample in zip(
+            numbers, side_by_side(volume_samples, volumes, processes), strict=True
+        ):
+            made.append(sample)
+            tell("volumes", k + 1, settings.volumes)
+        return made
+
+    sampled = sampled or simulated
+    shape = fit_shape_model(valves, settings.modes)
+    first = min(settings.draft_volumes, settings.volumes)
+    samples = drafted = list(sampled(range(first), shape, None))
+    if first < settings.volumes:
+        draft = (lambda: draft_of(drafted, settings, seed)) if drafted else None
+        samples = [*drafted, *sampled(range(first, settings.volumes), shape, draft)]
     stages = ((name, *samples_of(name, samples), settings, seed) for name in STAGES)
     boosters = {}
     grown = side_by_side(train_stage, stages, processes)

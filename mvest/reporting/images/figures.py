@@ -1,16 +1,16 @@
-"""Figures of the image step: measures over time, errors on held-out volumes, where it is unsure."""
+"""Figures of the image step: measures over time, errors and confidence of the detectors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from mvest.errors import InputError
-from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.accuracy import matern
 from mvest.imaging.valve_sequence import MIN_CONFIDENCE
 from mvest.reporting.style import (
     COLOURS,
@@ -26,26 +26,10 @@ from mvest.reporting.style import (
 from mvest.typing import FloatArray
 
 __all__ = [
-    "LIMITS_MM",
-    "SETTINGS",
-    "STAGES",
-    "distance_figure",
+    "confidence_figure",
+    "errors_figure",
     "measures_figure",
-    "std_figure",
-    "training_figure",
 ]
-
-SETTINGS: Final = ("in distribution", "shifted")
-"""Held-out simulated volumes drawn as the training ones, and with other image properties."""
-
-LIMITS_MM: Final = (0.5, 0.8, 1.5)
-"""Surface distances marked in figures and counted in tables."""
-
-FARTHEST_MM: Final = 4.5
-"""Volumes with a larger surface distance are counted at the edge of the figure."""
-
-STAGES: Final = ("position", "pose", "landmarks", "hinge", "surface")
-"""In the order in which the image step takes them; others follow."""
 
 Row = Mapping[str, Any]
 
@@ -159,178 +143,152 @@ def _leave_room(axes: Any, values: FloatArray) -> None:
     axes.set_ylim(middle - 0.6 * span, middle + 0.95 * span)
 
 
-def distance_figure(rows: Sequence[Row]) -> Figure:
-    """Mean surface distance of every held-out volume, in distribution and shifted.
+def errors_figure(
+    distances: Mapping[str, Sequence[float]],
+    limits_mm: Sequence[float],
+    stages: Sequence[Row],
+    *,
+    std_mm: FloatArray,
+    distance_mm: FloatArray,
+    correlation: FloatArray,
+    length_mm: float,
+) -> Figure:
+    """Errors of detectors in simulated volumes that no training saw, in four panels.
+
+    Parameters
+    ----------
+    distances : mapping
+        Setting -> mean surface distance of each detected valve, mm.
+    limits_mm : sequence of float
+        Distances to be marked.
+    stages : sequence of mapping
+        ``setting``, ``stage``, ``unit``, and median and 90th percentile of the error: ``error``
+        and ``error_90``.
+    std_mm : (rows, columns) mm
+        Standard deviation of a coordinate, from the annulus to the free edge.
+    distance_mm, correlation : (b,)
+        Correlation of errors at two vertices by their distance at rest.
+    length_mm : float
+        Of the Matérn correlation fitted to them.
+    """
+    figure = Figure(figsize=(8.3, 7.4), layout="constrained")
+    panels = figure.subplot_mosaic([["distance", "stages"], ["correlation", "std"]])
+    for axes in panels.values():
+        plain_axes(axes)
+    _draw_distances(panels["distance"], distances, limits_mm)
+    _draw_stages(panels["stages"], stages)
+    axes = panels["correlation"]
+    smooth = np.linspace(0.0, float(distance_mm.max()), 200)
+    axes.plot(distance_mm, correlation, MARKERS[0], ms=4, color=COLOURS[0], label="measured")
+    label = f"Matérn 3/2, {length_mm:.1f} mm"
+    axes.plot(smooth, matern(smooth, length_mm), color=COLOURS[1], lw=1.3, label=label)
+    axes.axhline(0.0, color=GREY, lw=0.8)
+    axes.set_xlabel("distance of two vertices at rest [mm]")
+    axes.set_title("Correlation of the errors at two vertices", fontsize=SMALL, loc="left")
+    axes.legend(fontsize=SMALL, frameon=False)
+    _draw_std(figure, panels["std"], std_mm)
+    headline(
+        figure,
+        "Errors of the detectors in simulated volumes that no training saw",
+        "Above: volumes of one frame. Below: the errors that are stated of a volume over time.",
+    )
+    return figure
+
+
+def _draw_distances(
+    axes: Any, distances: Mapping[str, Sequence[float]], limits_mm: Sequence[float]
+) -> None:
+    random = np.random.default_rng(0)
+    for k, values in enumerate(map(np.array, distances.values())):
+        axes.boxplot(
+            values, positions=[k], widths=0.5, whis=(5, 95), showfliers=False, manage_ticks=False,
+            medianprops={"color": "black"},
+        )  # fmt: skip
+        places = k + random.uniform(-0.17, 0.17, len(values))
+        axes.plot(places, values, MARKERS[k], ms=4, color=COLOURS[k], alpha=0.75, mew=0)
+    for limit in limits_mm:
+        axes.axhline(limit, color="0.25", lw=1.0, ls="--", zorder=0)
+    axes.set_xticks(range(len(distances)), distances, fontsize=SMALL)
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("distance from the true surface [mm]")
+    axes.set_title("Detected leaflets; whiskers: 5 to 95 %", fontsize=SMALL, loc="left")
+
+
+def _draw_stages(axes: Any, stages: Sequence[Row]) -> None:
+    names = {row["stage"]: f"{row['stage']}\n[{row['unit']}]" for row in stages}
+    for k, setting in enumerate(dict.fromkeys(row["setting"] for row in stages)):
+        own = {row["stage"]: row for row in stages if row["setting"] == setting}
+        places = np.arange(len(names)) + 0.2 * k - 0.1
+        ends = [[own[name][end] for name in names] for end in ("error", "error_90")]
+        axes.vlines(places, *ends, color=COLOURS[k], lw=1.2)
+        axes.plot(places, ends[0], MARKERS[k], ms=5, color=COLOURS[k], label=setting)
+    axes.set_xticks(range(len(names)), names.values(), fontsize=SMALL)
+    axes.set_yscale("log")
+    log_axis(axes.yaxis)
+    axes.legend(fontsize=SMALL, frameon=False)
+    axes.set_title("Error of each stage: median to 90th percentile", fontsize=SMALL, loc="left")
+
+
+def _draw_std(figure: Figure, axes: Any, std_mm: FloatArray) -> None:
+    """Over the valve's own plane: around it, and from the annulus to the free edge."""
+    rows, columns = std_mm.shape
+    phi = (np.arange(columns + 2) - 0.5) * 360.0 / columns
+    s = np.clip((np.arange(rows + 1) - 0.5) / (rows - 1), 0.0, 1.0)
+    # The last column is the first one again.
+    closed = np.concatenate([std_mm, std_mm[:, :1]], axis=1)
+    shown = axes.pcolormesh(phi, s, closed, cmap=SEQUENTIAL, vmin=0.0, rasterized=True)
+    axes.grid(visible=False)
+    axes.set_xlim(0, 360)
+    axes.set_ylim(1, 0)
+    axes.set_xticks([90, 180, 270], ["anterior", "commissure", "posterior"])
+    axes.set_yticks([0, 1], ["annulus", "free edge"])
+    axes.set_title("Standard deviation of a coordinate [mm]", fontsize=SMALL, loc="left")
+    figure.colorbar(shown, ax=axes, pad=0.02).ax.tick_params(labelsize=SMALL)
+
+
+def confidence_figure(rows: Sequence[Row], min_confidence: float, wrong_mm: float) -> Figure:
+    """Confidence of detectors in every volume, by kind.
 
     Parameters
     ----------
     rows : sequence of mapping
-        For each volume ``setting`` (see `SETTINGS`) and ``surface_mm``; None counts as a valve that
-        was not found.
-
-    Raises
-    ------
-    InputError
-        No volumes, or another setting.
+        ``kind``, ``confidence``, and ``points``: the mean distance (mm) of the found points from
+        the true ones, None without a valve.
+    min_confidence : float
+        From here on something is called a valve.
+    wrong_mm : float
+        Points this far off are those of something else, and are drawn hollow.
     """
-    table = pd.DataFrame(list(rows))
-    if table.empty or not set(table["setting"]) <= set(SETTINGS):
-        found = "none" if table.empty else ", ".join(sorted(set(map(str, table["setting"]))))
-        raise InputError(f"surface distances: settings {found}, expected {' or '.join(SETTINGS)}")
-    figure, grid = panels(1, 1, 3.6)
-    axes = grid[0, 0]
-    random = np.random.default_rng(0)
-    top = float(np.nanmax([*table["surface_mm"].astype(float), LIMITS_MM[-1]]))
-    edge = min(1.06 * top, FARTHEST_MM)
-    labels = []
-    for k, setting in enumerate(SETTINGS):
-        own = table.loc[table["setting"] == setting, "surface_mm"].astype(float)
-        values = own.dropna().to_numpy()
-        labels.append(f"{setting}\n({len(own)} volumes{_lost(len(own) - len(values))})")
-        if not len(values):
-            continue
-        axes.boxplot(
-            values, positions=[k], orientation="horizontal", widths=0.5, whis=(5, 95),
-            showfliers=False, manage_ticks=False, medianprops={"color": "black", "lw": 1.6},
-            boxprops={"color": GREY}, whiskerprops={"color": GREY}, capprops={"color": GREY},
-        )  # fmt: skip
-        places, beyond = k + random.uniform(-0.17, 0.17, len(values)), values > edge
-        axes.plot(
-            values[~beyond], places[~beyond], ls="none", marker=MARKERS[k], ms=4, color=COLOURS[k],
-            alpha=0.75, mew=0, label=setting,
-        )  # fmt: skip
-        if beyond.any():
-            axes.annotate(
-                f"{int(beyond.sum())} beyond, up to {values.max():.1f} mm →", (edge, k + 0.36),
-                ha="right", va="center", fontsize=SMALL, color=COLOURS[k],
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    figure, grid = panels(1, 1, 0.42 * len(kinds) + 1.6)
+    axes, random, labels = grid[0, 0], np.random.default_rng(0), []
+    for k, kind in enumerate(kinds):
+        own = [row for row in rows if row["kind"] == kind]
+        values = np.array([row["confidence"] for row in own])
+        places = k + random.uniform(-0.2, 0.2, len(own))
+        absent = all(row["points"] is None for row in own)
+        wrong = np.array([row["points"] is not None and row["points"] >= wrong_mm for row in own])
+        for which, face in ((~wrong, COLOURS[absent]), (wrong, "white")):
+            axes.plot(
+                values[which], places[which], MARKERS[absent], ms=4.2, mec=COLOURS[absent],
+                mfc=face, alpha=0.8,
             )  # fmt: skip
-    for limit in LIMITS_MM:
-        axes.axvline(limit, color="0.25", lw=1.0, ls="--", zorder=0, label="limit")
-        axes.annotate(
-            f"{limit:g}", (limit, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
-            textcoords="offset points", ha="center", va="bottom", fontsize=SMALL, color="0.25",
-        )  # fmt: skip
-    axes.set_yticks(range(len(SETTINGS)), labels, fontsize=SMALL)
-    axes.set_ylim(len(SETTINGS) - 0.5, -0.5)
-    axes.set_xlim(0, edge)
-    axes.set_xlabel("mean distance between found and true leaflets [mm]")
+        labels.append(f"{'no valve: ' if absent else ''}{kind} ({len(own)})")
+    axes.axvline(min_confidence, color="0.25", lw=1.0, ls="--", zorder=0)
+    axes.annotate(
+        "called a valve from here", (min_confidence, 1.0), xytext=(3, 2),
+        xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=SMALL,
+        color="0.25", va="bottom",
+    )  # fmt: skip
+    axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("confidence; of volumes over time (calibration, sequence) of the best frame")
     axes.grid(visible=False, axis="y")
     headline(
         figure,
-        "Distance of the found leaflets from the true ones",
-        "Simulated volumes that no training saw. Box: quartiles and median; whiskers: 5 to 95 %.",
+        "How sure the detectors are that there is a valve",
+        "Simulated volumes. Hollow: what was found is not the valve, its points are on average "
+        f"{wrong_mm:g} mm off or more.",
     )
-    return figure
-
-
-def _lost(count: int) -> str:
-    return f", {count} without a valve found" if count else ""
-
-
-def training_figure(table: pd.DataFrame) -> Figure:
-    """Error of every stage of the image step against the number of training volumes.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Columns ``stage``, ``training_volumes``, ``setting``, ``median``, ``p90`` and ``unit``.
-
-    Raises
-    ------
-    InputError
-        Columns are missing, or there are no rows.
-    """
-    wanted = ["stage", "training_volumes", "setting", "median", "p90", "unit"]
-    missing = [name for name in wanted if name not in table.columns]
-    if missing or table.empty:
-        what = f"no columns {', '.join(missing)}" if missing else "no rows"
-        raise InputError(f"errors by training volumes: {what}, expected {', '.join(wanted)}")
-    found = list(dict.fromkeys(table["stage"]))
-    stages = [s for s in STAGES if s in found] + [s for s in found if s not in STAGES]
-    columns = min(3, len(stages))
-    lines = -(-len(stages) // columns)
-    figure, grid = panels(lines, columns, 2.6 * lines + 0.9)
-    for axes, stage in zip(grid.flat, stages, strict=False):
-        part = table[table["stage"] == stage]
-        axes.set_title(stage, fontsize=SMALL + 0.5, loc="left")
-        axes.set_ylabel(f"error [{part['unit'].iloc[0]}]")
-        for k, setting in enumerate(SETTINGS):
-            own = part[part["setting"] == setting].sort_values("training_volumes")
-            for value, style, words in (("median", "-", "median"), ("p90", ":", "90 %")):
-                axes.plot(
-                    own["training_volumes"], own[value].astype(float), ls=style, lw=1.3,
-                    color=COLOURS[k], marker=MARKERS[k], ms=4, mfc=COLOURS[k] if style == "-" else
-                    "white", label=f"{setting}, {words}",
-                )  # fmt: skip
-        counts = sorted(set(part["training_volumes"]))
-        axes.set_xscale("log")
-        log_axis(axes.xaxis)
-        axes.set_xticks(counts, [str(count) for count in counts])
-        axes.set_xticks([], minor=True)
-        axes.set_ylim(bottom=0.0)
-        axes.set_xlabel("training volumes")
-    for axes in grid.flat[len(stages) :]:
-        axes.set_axis_off()
-    handles, labels = grid.flat[0].get_legend_handles_labels()
-    if len(stages) < grid.size:
-        grid.flat[-1].legend(handles, labels, fontsize=SMALL, frameon=False, loc="center")
-    else:
-        figure.legend(
-            handles, labels, fontsize=SMALL, frameon=False, ncols=4, loc="outside lower center"
-        )
-    headline(
-        figure,
-        "Errors of the image step against the number of training volumes",
-        "Simulated volumes that no training saw.",
-    )
-    return figure
-
-
-def std_figure(layout: ValveLayout, std_mm: FloatArray) -> Figure:
-    """Standard deviation of every point of the tissue over the valve's own plane (phi, s).
-
-    Parameters
-    ----------
-    layout : ValveLayout
-    std_mm : (n,) mm
-        NaN where it was never measured.
-
-    Raises
-    ------
-    InputError
-        Another number of values than the layout has vertices.
-    """
-    values = np.asarray(std_mm, dtype=np.float64)
-    if values.shape != (layout.size,):
-        raise InputError(f"std_mm: shape {values.shape}, expected ({layout.size},)")
-    figure = Figure(figsize=(8.3, 3.4), layout="constrained")
-    axes = figure.subplots()
-    plain_axes(axes)
-    image = values.reshape(layout.rows, layout.columns)
-    # The last column is the first one again.
-    image = np.ma.masked_invalid(np.concatenate([image, image[:, :1]], axis=1))
-    step, rise = 360.0 / layout.columns, 1.0 / (layout.rows - 1)
-    phi = np.arange(layout.columns + 2) * step - 0.5 * step
-    s = np.clip((np.arange(layout.rows + 1) - 0.5) * rise, 0.0, 1.0)
-    axes.set_facecolor("0.8")
-    axes.grid(visible=False)
-    shown = axes.pcolormesh(phi, s, image, cmap=SEQUENTIAL, vmin=0.0, rasterized=True)
-    axes.set_xlim(0, 360)
-    axes.set_ylim(1, 0)
-    axes.set_xticks(
-        [0, 90, 180, 270, 360],
-        ["0°\ncommissure", f"90°\nmiddle of the\n{layout.region_names[0]} leaflet",
-         "180°\ncommissure", f"270°\nmiddle of the\n{layout.region_names[1]} leaflet",
-         "360°\ncommissure"],
-    )  # fmt: skip
-    axes.set_yticks([0, 0.5, 1], ["annulus", "half way", "free edge"])
-    axes.axvline(180, color="white", lw=0.8, ls="--")
-    figure.colorbar(shown, ax=axes, pad=0.01).set_label("standard deviation [mm]", size=SMALL)
-    known = values[np.isfinite(values)]
-    note = "Of each coordinate of a point"
-    if len(known):
-        note += f"; median {np.median(known):.2f} mm, largest {known.max():.2f} mm"
-    unknown = len(values) - len(known)
-    note += f"; grey: never measured ({unknown} points)." if unknown else "."
-    headline(figure, "Where the image step is sure of the leaflets", note)
     return figure

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mvest.cases.from_images import without_expected_error
-from mvest.cases.from_images.expected_error import error_at_shape, in_mirror
+from mvest.cases.from_images.expected_error import coverage, error_at_shape, in_mirror
 from mvest.errors import InputError
 from mvest.imaging.detection.trained_model import DetectionAccuracy
 from mvest.imaging.layout import ValveLayout
@@ -47,6 +47,28 @@ def test_an_error_that_follows_the_shape_is_known_of_one_more_valve():
     assert errors[1:].std() > 1.0
     assert np.abs(expected - errors[0]).max() < 0.05
     assert samples.std() < 0.05
+
+
+def test_what_is_stated_covers_the_errors_of_further_valves():
+    shapes, errors, _ = world(3, 60, noise=1.0, law=0.5)
+    n, own = SMALL.size, slice(0, 40)
+    std = (errors[own, :, :n] - errors[own, :, :n].mean(axis=0)).std(axis=(0, 1, 3))
+    accuracy = DetectionAccuracy(
+        std, 5.0, errors[own, :, :n], errors[own, :, n:], widening=(2.0, 0.0),
+        shapes=shapes[own, :, :n], tip_shapes=shapes[own, :, n:],
+    )  # fmt: skip
+    left = errors[40:, :, :n] - errors[own, :, :n].mean(axis=0)
+    open_, closed = coverage(SMALL, accuracy, left, shapes[40:], np.ones(20))
+    for row, k in ((open_, 0), (closed, 1)):
+        # Stated twice as wide as they are: 1.96 becomes 3.92 standard deviations.
+        assert row["within_95"] > 99
+        assert row["rms"] == pytest.approx(np.sqrt((left[:, k] ** 2).mean()))
+        assert row["stated"] == pytest.approx(2 * np.sqrt((std**2).mean()))
+    exact = replace(accuracy, widening=(1.0, 0.0))
+    for row in coverage(SMALL, exact, errors[40:, :, :n], shapes[40:], np.ones(20)):
+        assert row["within_95_handed_on"] == pytest.approx(95, abs=3)
+        assert row["rms_handed_on"] == pytest.approx(row["stated_handed_on"], rel=0.1)
+        assert row["rms_handed_on"] < row["rms"]
 
 
 def test_what_no_shape_tells_varies_about_the_mean_as_one_more_valve_does():

@@ -7,7 +7,7 @@ from mvest.imaging.detection.boundary import leaflet_axes
 from mvest.imaging.detection.detect import FrameValve
 from mvest.imaging.detection.landmark_detector import landmark_points
 from mvest.imaging.layout import ValveLayout
-from mvest.imaging.learning.evaluation import frame_errors, surface_distances
+from mvest.imaging.learning.evaluation import best_threshold, frame_errors, surface_distances
 from mvest.imaging.learning.truth import TrueValve
 from mvest.valve.anatomy.template import Template
 from tests.imaging.detection.made_up import TIPS, poses
@@ -138,3 +138,10 @@ def test_stages_are_compared_with_vertices_or_landmarks(true):
         true.vertices, true.tips, true, LAYOUT,
     )  # fmt: skip
     assert errors.stages == pytest.approx({"a shape": 5.0, "landmarks": 1.0})
+
+
+def test_the_threshold_separates_right_from_wrong():
+    right, wrong = np.array([0.6, 0.8, 0.9]), np.array([0.1, 0.4])
+    assert best_threshold(right, wrong) == pytest.approx(0.5)
+    # One outlier does not move it.
+    assert 0.4 < best_threshold(np.array([0.3, 0.8, 0.9]), wrong) < 0.8

@@ -1,19 +1,11 @@
-"""Figures of the image step: what is drawn where, gaps, limits and what is refused."""
+"""Figures of the image step: what is drawn where, gaps and limits."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from mvest.errors import InputError
 from mvest.imaging.layout import ValveLayout
-from mvest.reporting.images.figures import (
-    LIMITS_MM,
-    SETTINGS,
-    distance_figure,
-    measures_figure,
-    std_figure,
-    training_figure,
-)
+from mvest.reporting.images.figures import confidence_figure, errors_figure, measures_figure
 
 
 def measures(t, **changes):
@@ -79,100 +71,77 @@ def test_bands_are_drawn_where_measures_have_bounds():
     assert not any("Bands" in text.get_text() for text in plain.texts)
 
 
-def volumes(setting, values):
-    return [{"setting": setting, "surface_mm": value} for value in values]
+DISTANCES = {"in distribution": [0.4, 0.5, 0.9], "shifted": [1.0, 12.0]}
+STAGES = [
+    {"stage": stage, "setting": setting, "unit": unit, "error": 1.0 + k, "error_90": 4.0}
+    for stage, unit in (("position", "mm"), ("pose", "°"))
+    for k, setting in enumerate(DISTANCES)
+]
 
 
-def test_every_volume_is_a_point_and_the_limits_are_marked():
-    rows = volumes("in distribution", [0.4, 0.5, 0.9]) + volumes("shifted", [1.0, None, 12.0])
-    axes = distance_figure(rows).axes[0]
-    points = {
-        line.get_label(): sorted(line.get_xdata())
-        for line in axes.lines
-        if line.get_label() in SETTINGS
-    }
-    assert points == {"in distribution": [0.4, 0.5, 0.9], "shifted": [1.0]}
-    limits = [line.get_xdata()[0] for line in axes.lines if line.get_label() == "limit"]
-    assert limits == list(LIMITS_MM)
-    words = [text.get_text() for text in axes.texts]
-    assert words == ["1 beyond, up to 12.0 mm →", "0.5", "0.8", "1.5"]
-    ticks = [text.get_text() for text in axes.get_yticklabels()]
-    assert ticks[0] == "in distribution\n(3 volumes)"
-    assert ticks[1] == "shifted\n(3 volumes, 1 without a valve found)"
-    assert axes.get_xlim() == (0, 4.5)
+def errors(std=None):
+    return errors_figure(
+        DISTANCES,
+        (0.5, 1.5),
+        STAGES,
+        std_mm=np.ones((5, 16)) if std is None else std,
+        distance_mm=np.array([1.0, 8.0]),
+        correlation=np.array([0.97, 0.48]),
+        length_mm=8.0,
+    )
 
 
-def test_a_setting_without_any_valve_is_drawn_empty():
-    axes = distance_figure(volumes("in distribution", [0.4]) + volumes("shifted", [None])).axes[0]
-    assert {line.get_label() for line in axes.lines} & set(SETTINGS) == {"in distribution"}
-    assert axes.get_xlim()[1] == pytest.approx(1.06 * 1.5)
+def test_every_detected_valve_is_a_point_and_the_limits_are_marked():
+    distance, stages = errors().axes[:2]
+    dots = [line for line in distance.lines if line.get_alpha() == 0.75]
+    assert [sorted(line.get_ydata()) for line in dots] == list(DISTANCES.values())
+    dashed = [line.get_ydata()[0] for line in distance.lines if line.get_linestyle() == "--"]
+    assert dashed == [0.5, 1.5]
+    assert [text.get_text() for text in distance.get_xticklabels()] == list(DISTANCES)
+    medians = {line.get_label(): list(line.get_ydata()) for line in stages.lines}
+    assert medians == {"in distribution": [1.0, 1.0], "shifted": [2.0, 2.0]}
+    names = [text.get_text() for text in stages.get_xticklabels()]
+    assert names == ["position\n[mm]", "pose\n[°]"]
 
 
-@pytest.mark.parametrize("rows", [[], volumes("moved", [0.5])])
-def test_other_settings_are_refused(rows):
-    with pytest.raises(InputError, match="expected in distribution or shifted"):
-        distance_figure(rows)
-
-
-def errors(stages=("pose", "surface", "position", "gate"), counts=(50, 200)):
-    return pd.DataFrame(
-        [
-            {
-                "stage": stage, "training_volumes": count, "setting": setting,
-                "median": 100 / count, "p90": 200 / count,
-                "unit": "degrees" if stage == "pose" else "mm",
-            }
-            for stage in stages
-            for count in reversed(counts)
-            for setting in SETTINGS
-        ]
-    )  # fmt: skip
-
-
-def test_each_stage_has_a_panel_in_its_own_unit():
-    figure = training_figure(errors())
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == ["position", "pose", "surface", "gate", "", ""]
-    assert panel(figure, "pose").get_ylabel() == "error [degrees]"
-    curves = {line.get_label(): line for line in panel(figure, "surface").lines}
-    assert set(curves) == {f"{s}, {w}" for s in SETTINGS for w in ("median", "90 %")}
-    # From few to many volumes, in whatever order the rows are.
-    assert list(curves["shifted, median"].get_xdata()) == [50, 200]
-    assert list(curves["shifted, 90 %"].get_ydata()) == [4.0, 1.0]
-    ticks = [text.get_text() for text in panel(figure, "gate").get_xticklabels()]
-    assert ticks == ["50", "200"]
-    assert figure.axes[-1].get_legend() is not None
-
-
-def test_a_full_grid_has_its_legend_outside():
-    figure = training_figure(errors(("position", "pose", "surface")))
-    assert len(figure.legends) == 1
-    assert len(figure.axes) == 3
-
-
-def test_a_table_that_is_none_is_refused():
-    with pytest.raises(InputError, match="no columns p90, unit"):
-        training_figure(errors().drop(columns=["p90", "unit"]))
-    with pytest.raises(InputError, match="no rows"):
-        training_figure(errors().iloc[:0])
+def test_the_fitted_correlation_is_drawn_beside_the_measured_one():
+    axes = errors().axes[2]
+    curve = next(line for line in axes.lines if "8.0 mm" in str(line.get_label()))
+    x, y = curve.get_data()
+    assert (y[0], x[-1]) == (1.0, 8.0)
+    assert y[-1] == pytest.approx((1 + np.sqrt(3)) * np.exp(-np.sqrt(3)))
 
 
 def test_the_map_of_std_has_each_vertex_at_its_phi_and_s():
     layout = ValveLayout(16, 5)
-    std = 0.2 + layout.s + layout.phi / 360
-    std[layout.vertex(90, 0)] = np.nan
-    figure = std_figure(layout, std)
-    mesh = figure.axes[0].collections[0]
+    std = (0.2 + layout.s + layout.phi / 360).reshape(5, 16)
+    axes = errors(std).axes[3]
+    mesh = axes.collections[0]
     values = mesh.get_array()
     assert values.shape == (5, 17)
     assert values[4, 4] == pytest.approx(0.2 + 1 + 0.25)
-    assert values.mask[0, 4]
-    assert values.mask.sum() == 1
     # Column 4 is drawn about 90 degrees; the valve is closed by its first column.
     corners = mesh.get_coordinates()
     assert corners[0, 4, 0] < 90 < corners[0, 5, 0]
     np.testing.assert_allclose(values[1, 0], values[1, 16])
-    assert figure.axes[0].get_ylim() == (1.0, 0.0)
-    assert any("never measured (1 points)" in text.get_text() for text in figure.texts)
-    with pytest.raises(InputError, match=r"shape \(3,\), expected \(80,\)"):
-        std_figure(layout, np.ones(3))
+    assert axes.get_ylim() == (1.0, 0.0)
+
+
+def test_the_figure_of_confidences_shows_wrong_valves_hollow():
+    rows = [
+        {"kind": "shifted", "confidence": 0.9, "points": 1.0},
+        {"kind": "shifted", "confidence": 0.6, "points": 20.0},
+        {"kind": "walls only", "confidence": 0.2, "points": None},
+    ]
+    axes = confidence_figure(rows, 0.5, 5.0).axes[0]
+    labels = [text.get_text() for text in axes.get_yticklabels()]
+    assert labels == ["shifted (2)", "no valve: walls only (1)"]
+    faces = {
+        float(x): line.get_markerfacecolor()
+        for line in axes.lines
+        if line.get_linestyle() == "None"
+        for x in line.get_xdata()
+    }
+    assert faces[0.6] == "white"
+    assert faces[0.9] != "white"
+    assert faces[0.2] not in ("white", faces[0.9])

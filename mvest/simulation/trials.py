@@ -1,0 +1,254 @@
+"""Trials of detectors: volumes of valves that no training saw are simulated and searched."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvest.cases.from_images.measures import OPEN_SHARE
+from mvest.errors import GeometryError
+from mvest.imaging.detection.detect import find_frame
+from mvest.imaging.detection.frame import standard_frame
+from mvest.imaging.detection.pose import pose_of
+from mvest.imaging.detection.tracking import TrackingSettings, detect_valve
+from mvest.imaging.detection.trained_model import DetectionModel, load_model
+from mvest.imaging.layout import ValveLayout
+from mvest.imaging.learning.evaluation import frame_errors, surface_distances
+from mvest.imaging.learning.training import Setting, render_frame
+from mvest.imaging.learning.truth import TrueValve
+from mvest.imaging.moving_valve import MovingValve
+from mvest.imaging.simulator.acquisition import Acquisition
+from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
+from mvest.imaging.simulator.probe import draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.typing import FloatArray
+from mvest.valve.measure.annulus import annulus_plane, measure_annulus
+from mvest.valve.measure.coaptation import orifice_area
+
+Row = Mapping[str, Any]
+
+ABSENT_DB = -80.0
+"""Echo of what is absent: far below the noise."""
+
+VALVE = ("leaflet_db", "annulus_db", "chord_db")
+REST = ("wall_db", "vessel_db", "papillary_db")
+
+WITHOUT_VALVE = {"walls only": VALVE, "no tissue": (*VALVE, *REST), "white noise": ()}
+"""Kinds of volumes without a valve -> what sends no echo. White noise is not simulated at all."""
+
+VOLUMES = ("in distribution", "shifted")
+"""Kinds of volumes of one frame of a valve: within and outside the ranges of the training."""
+
+SEQUENCES = ("calibration", "sequence", "shifted sequence", "wide calibration")
+"""Kinds of volumes of all frames of a valve. The calibration measures the detectors' errors."""
+
+KINDS = (*VOLUMES, *WITHOUT_VALVE, *SEQUENCES)
+
+PIXEL_MM = 0.3
+"""mm, of the picture in which the orifice is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One volume to be simulated.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`VOLUMES`, :data:`WITHOUT_VALVE` or :data:`SEQUENCES`.
+    number : int
+        Among those of its kind.
+    seed : int
+        Of the study.
+    acquisition : Acquisition
+        About which its own is drawn.
+    closed : int
+        Number of the closed frame of its valve; the first one is open.
+    """
+
+    kind: str
+    number: int
+    seed: int
+    acquisition: Acquisition
+    closed: int
+
+    @property
+    def spread(self) -> Setting:
+        """Whether its acquisition is drawn as in training, or in part or wholly outside."""
+        if self.kind.startswith("wide"):
+            return "wide"
+        return "shifted" if self.kind.startswith("shifted") else "training"
+
+    @property
+    def random(self) -> np.random.SeedSequence:
+        """Its own stream, shared with no other trial and with no training volume."""
+        return np.random.SeedSequence([self.seed, 1 + KINDS.index(self.kind), self.number])
+
+
+@lru_cache(maxsize=8)
+def _model(path: str) -> DetectionModel:
+    return load_model(path)
+
+
+def try_volume(
+    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
+) -> dict[str, Any]:
+    """Simulate one frame and search it.
+
+    Returns
+    -------
+    dict
+        ``row``: JSON text with kind, number, valve, frame and confidence. Where there is a valve,
+        also errors: mean distances of surfaces, of corresponding points and of papillary tips (mm);
+        of each stage (mm, the pose in degrees); and those of `_differences`, with sign.
+    """
+    choose, render = trial.random.spawn(2)
+    frame = int(np.random.default_rng(choose).integers(len(valve.times)))
+    has_valve = trial.kind not in WITHOUT_VALVE
+    base = trial.acquisition
+    if not has_valve:
+        nothing = dict.fromkeys(WITHOUT_VALVE[trial.kind], ABSENT_DB)
+        base = replace(base, **nothing, shadow_db_per_cm=0.0)  # type: ignore[arg-type]
+    seen = render_frame(valve, frame, base, trial.spread, render)
+    volume = seen.volume
+    if trial.kind == "white noise":
+        grey = np.random.default_rng(render).integers(0, 256, volume.frames.shape, dtype=np.uint8)
+        volume = replace(volume, frames=grey, source="white noise", sha256="")
+    model = _model(str(model_file))
+    found = find_frame(standard_frame(volume, 0), model, settings.fit)
+    row: dict[str, Any] = {
+        "kind": trial.kind,
+        "number": trial.number,
+        "valve": valve.name,
+        "frame": frame,
+        "confidence": float(found.confidence),
+    }
+    if has_valve:
+        true, layout = TrueValve.of(seen.vertices, seen.tips, model.shape), model.shape.layout
+        errors = frame_errors(found, found.vertices, found.tips, true, layout)
+        row |= {
+            "surface": errors.surface,
+            "points": errors.points,
+            "tips": errors.tips,
+            "position": errors.position,
+            "pose": errors.turn,
+            "landmarks": errors.stages["landmarks"],
+            "hinge": errors.annulus,
+            **_differences(found.vertices, found.tips, seen.vertices, seen.tips, layout),
+        }
+    return {"row": json.dumps(row)}
+
+
+def try_sequence(
+    valve: MovingValve, trial: Trial, model_file: Path, settings: TrackingSettings
+) -> dict[str, Any]:
+    """Simulate all frames of a valve as one volume and search it.
+
+    However low its confidence, what is found counts as the valve.
+
+    Returns
+    -------
+    dict
+        ``row``: JSON text like that of `try_volume`, with means over the frames: of distances, and
+        of differences without sign; ``confidence`` is that of the best frame. In mm, found minus
+        true in the valve's own axes, ``errors`` (2, n, 3) and ``tip_errors`` (2, 2, 3) of the open
+        and the closed frame; ``shapes`` and ``tip_shapes``, where the valve was found, in its found
+        axes; ``rest`` (n, 3), the true open vertices.
+    """
+    draw, scan = trial.random.spawn(2)
+    rng = np.random.default_rng(draw)
+    acquisition = draw_acquisition(rng, trial.acquisition, trial.spread)
+    probe = draw_probe(rng, acquisition)
+    volume = simulate_volume(valve, acquisition, probe, int(scan.generate_state(1)[0]))
+    true = true_sequence(valve, probe)
+    model, layout = _model(str(model_file)), valve.layout
+    found = detect_valve(volume, model, replace(settings, min_confidence=0.0))
+    frames = []
+    for k in range(len(true.times)):
+        x, tips, right = found.vertices[k], found.tips[k], true.vertices[k]
+        there, back = surface_distances(x, right, layout)
+        frames.append(
+            {
+                "surface": float(0.5 * (there.mean() + back.mean())),
+                "points": float(np.linalg.norm(x - right, axis=1).mean()),
+                "tips": float(np.linalg.norm(tips - true.tips[k], axis=1).mean()),
+                **_differences(x, tips, right, true.tips[k], layout),
+            }
+        )
+    two = [0, trial.closed]
+    row = {
+        "kind": trial.kind,
+        "number": trial.number,
+        "valve": valve.name,
+        "frames": len(frames),
+        "confidence": float(found.frame_confidence.max()),
+        "median_confidence": float(np.median(found.frame_confidence)),
+        **{name: _mean_size(frames, name) for name in frames[0]},
+        "surface_open": frames[0]["surface"],
+        "surface_closed": frames[trial.closed]["surface"],
+    }
+    axes = [pose_of(true.vertices[k], true.tips[k], layout) for k in two]
+    turn = np.concatenate([pose.rotation for pose in axes])
+    own = [pose_of(found.vertices[k], found.tips[k], layout) for k in two]
+    centre = np.stack([pose.centre for pose in own])
+    found_turn = np.concatenate([pose.rotation for pose in own])
+    return {
+        "row": json.dumps(row),
+        "errors": (found.vertices[two] - true.vertices[two]) @ turn,
+        "tip_errors": (found.tips[two] - true.tips[two]) @ turn,
+        "shapes": (found.vertices[two] - centre) @ found_turn,
+        "tip_shapes": (found.tips[two] - centre) @ found_turn,
+        "rest": (true.vertices[0] - axes[0].centre[0]) @ turn[0],
+    }
+
+
+def _mean_size(frames: Sequence[Row], name: str) -> float | None:
+    """Mean over the frames without sign; None where no frame has the value."""
+    known = [abs(frame[name]) for frame in frames if frame[name] is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _differences(
+    vertices: FloatArray,
+    tips: FloatArray,
+    true_vertices: FloatArray,
+    true_tips: FloatArray,
+    layout: ValveLayout,
+) -> dict[str, float | None]:
+    """What clinicians would measure wrongly, found minus true.
+
+    ``annulus_area`` (% of the true one), ``ap_diameter`` (mm), and ``state_right``: 100 where an
+    open orifice is found open and a closed one closed, otherwise 0. None if a shape defies it.
+    """
+    found, true = _measures(vertices, tips, layout), _measures(true_vertices, true_tips, layout)
+    if found is None or true is None:
+        return dict.fromkeys(("annulus_area", "ap_diameter", "state_right"))
+    return {
+        "annulus_area": 100.0 * (found[0] - true[0]) / true[0],
+        "ap_diameter": found[1] - true[1],
+        "state_right": 100.0 * (found[2] == true[2]),
+    }
+
+
+def _measures(
+    vertices: FloatArray, tips: FloatArray, layout: ValveLayout
+) -> tuple[float, float, bool] | None:
+    """Area (mm²) and anteroposterior diameter (mm) of the annulus, and whether the valve is open.
+
+    None if the shape defies it.
+    """
+    annulus = vertices[layout.annulus]
+    try:
+        plane = annulus_plane(annulus, tips.mean(axis=0), annulus[layout.column(90.0)])
+        size = measure_annulus(annulus, plane)
+        orifice = orifice_area(vertices, layout.triangles, annulus, plane, PIXEL_MM)
+    except GeometryError:
+        return None
+    is_open = bool(orifice >= OPEN_SHARE * size.projected_area)
+    return size.projected_area, size.anteroposterior_diameter, is_open
