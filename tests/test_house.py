@@ -36,7 +36,6 @@ LEAVES = (
 VALUE_OBJECTS = (
     "mvest.valve.anatomy.valve",
     "mvest.valve.mesh.solid_mesh",
-    "mvest.valve.mesh.embedding",
 )
 
 # What each room of mvest may import from mvest, itself aside: the longest name that fits counts.

@@ -257,7 +257,7 @@ FORWARD = {
 
 def test_what_is_kept_knows_what_makes_it():
     truth = reached(*MADE_BY)
-    assert truth >= FORWARD | {"mvest.valve.mesh.tetrahedral._tetwild_worker"}
+    assert truth >= FORWARD | {"mvest.valve.mesh._tetwild_worker"}
     assert not [name for name in truth if name.startswith(("mvest.imaging", "mvest.reporting"))]
     assert not [name for name in truth if name.startswith("mvest.estimation.filters")]
     one = reached(patient_store._simulate, patient_store._write)

@@ -25,7 +25,7 @@ from mvest.reporting.tables import Column, Table, joined, table
 from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.scenario import plane_of
 from mvest.typing import FloatArray
-from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.coaptation import find_gap
 from mvest.valve.measure.passing_ball import largest_passing_ball
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from mvest.valve.geometry.thickening import thicken
 from mvest.valve.measure.annulus import annulus_plane
 from mvest.valve.measure.coaptation import coaptation_length, orifice_area
 from mvest.valve.measure.passing_ball import largest_passing_ball
-from mvest.valve.mesh.embedding import embed
-from mvest.valve.mesh.solid_mesh import jacobian_determinants
+from mvest.valve.mesh.solid_mesh import embed, jacobian_determinants
 
 
 @dataclass(frozen=True, slots=True)

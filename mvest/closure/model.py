@@ -34,8 +34,7 @@ from mvest.mechanics.valve_system import (
 from mvest.source import source_key
 from mvest.typing import FloatArray
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.mesh.embedding import Embedding, embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 CONTINUED = 40
 """Newton iterations within which a closed valve finds its next equilibrium, or is closed anew by

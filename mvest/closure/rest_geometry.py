@@ -29,7 +29,7 @@ from mvest.valve.anatomy.band import leaflet_normals, leaflet_normals_change
 from mvest.valve.anatomy.valve import Valve, lumped_areas_change
 from mvest.valve.geometry.proximity import ClosestPoints, closest_points
 from mvest.valve.geometry.triangles import unit_rows
-from mvest.valve.mesh.embedding import Embedding, embed
+from mvest.valve.mesh.solid_mesh import Embedding, embed
 
 PARTS = ("shape", "thickness", "fibres", "annulus", "tips", "rest_lengths", "insertions")
 """Of a geometry, by the methods of `RestGeometry` that say what each is a change of."""

@@ -18,7 +18,7 @@ from mvest.febio.laws import FebLaw
 from mvest.febio.mesh import FebMesh
 from mvest.files import write_atomically
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 
 AXES = ("x", "y", "z")
 

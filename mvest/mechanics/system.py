@@ -28,7 +28,7 @@ from mvest.mechanics.forces.ties import Ties
 from mvest.mechanics.parameters import NamePart, Parameter, kind_of
 from mvest.mechanics.solid import Law, Solid, SolidState
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 
 CONTACT_MARGIN = 0.12
 """A pair of elements enters the sparsity pattern this share of its reach before it touches."""

@@ -32,8 +32,7 @@ from mvest.mechanics.system import Factors, Loads, System
 from mvest.typing import FloatArray, IntArray
 from mvest.units import mmhg_to_mpa
 from mvest.valve.anatomy.valve import Valve
-from mvest.valve.mesh.embedding import Embedding, embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 
 class Pacing(Protocol):

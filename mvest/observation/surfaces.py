@@ -64,8 +64,7 @@ from mvest.valve.geometry.moving_distance import (
     smooth_offsets,
 )
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.refinement import refined
-from mvest.valve.geometry.triangles import directed_edges
+from mvest.valve.geometry.triangles import directed_edges, refined
 
 UNKNOWN = -1
 """Region of a point that may be of any leaflet."""
@@ -237,7 +236,7 @@ class PredictedSurface:
         return cls(n, surface.triangles, surface.region, valve.free_edge, valve.annulus)
 
     def finer(self, rest: FloatArray, edge_length: float, width: float) -> PredictedSurface:
-        """The same surface drawn finer and smoothed; see `mvest.valve.geometry.refinement`.
+        """The same surface drawn finer and smoothed; see `mvest.valve.geometry.triangles`.
 
         Parameters
         ----------

@@ -14,8 +14,7 @@ from mvest.scenarios.scenario import plane_of
 from mvest.scenarios.stress import peak_stress
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.measure.annulus import AnnulusPlane, measure_annulus
-from mvest.valve.measure.coaptation import coaptation_area, coaptation_length
-from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.coaptation import coaptation_area, coaptation_length, find_gap
 from mvest.valve.measure.measurements import measure_tenting
 
 Measured = dict[str, float]

@@ -24,7 +24,7 @@ from mvest.mechanics.steps import NewtonSettings, StepReason
 from mvest.mechanics.valve_system import HeldState, boundary_loading, build_system
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Motion
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 from mvest.valve.mesh.structured import structured_mesh
 
 MODULI = ("E_f.anterior", "E_f.posterior")

@@ -19,7 +19,7 @@ from mvest.mechanics.reference import RestVariation
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import Step
 from mvest.mechanics.valve_system import boundary_loading, build_system, patch_change, patch_members
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 from tests.closure.test_model import AT, CLOSING, OPEN, model_of
 
 KINDS = ("shape", "thickness", "fibres", "annulus", "tips", "rest length", "insertions")

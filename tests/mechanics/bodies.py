@@ -14,8 +14,7 @@ from mvest.mechanics.law.moduli import PoissonReading, TransverselyIsotropic
 from mvest.mechanics.settings import ContactSettings
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Factors, Loads, System
-from mvest.valve.mesh.embedding import Embedding, embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 ELEMENT_NAMES = tuple(ELEMENTS)
 MATERIALS = {

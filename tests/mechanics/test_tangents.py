@@ -15,7 +15,7 @@ from mvest.mechanics.forces.pressure import PressureLoad
 from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.system import Loads, System
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 from tests.mechanics.bodies import ELEMENT_NAMES, MATERIALS, SIDE, block, sandwich
 
 STEPS = (2e-3, 1e-3, 1e-5)

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from mvest.mechanics import BiotLaw, Damping, Loads, NewtonSettings, Step, System, simulate
 from mvest.mechanics.forces.cables import Cables
 from mvest.mechanics.solid import Solid
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 from tests.mechanics.bodies import MATERIALS, block
 
 OMEGA = np.array([0.0, 0.0, 40.0])  # 1/s

@@ -22,11 +22,10 @@ from mvest.typing import FloatArray
 from mvest.valve.anatomy.dimensions import TemplateParameters
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.valve import Motion, Valve
-from mvest.valve.mesh.given import ENVELOPE_SHARE, GivenValve
+from mvest.valve.mesh.given import ENVELOPE_SHARE, GivenValve, tetrahedral_leaflets
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
+from mvest.valve.mesh.tetwild import TetwildSettings
 
 __all__ = [
     "Anatomy",

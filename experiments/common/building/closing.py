@@ -24,7 +24,7 @@ from mvest.scenarios.measures import contact_reach
 from mvest.scenarios.stress import contact_pressure, nodal_stress
 from mvest.typing import FloatArray
 from mvest.valve.geometry.thickening import thicken
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 
 __all__ = ["Closing", "close_valve", "draw_closing"]
 

@@ -59,9 +59,9 @@ from mvest.typing import FloatArray
 from mvest.units import mpa_to_mmhg
 from mvest.valve.io.abaqus.leaflet_mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording, recording_files
-from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import Remeshed, remesh
 from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.structured import layered_wedges
 
 __all__ = ["STUDY", "DonorStudy", "build_donor", "run_donor"]
 

@@ -24,7 +24,7 @@ from mvest.reading.bounded import refusing
 from mvest.reading.npz import read_npz
 from mvest.reporting.case.fields import CaseFields, read_case_fields
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.stretch import principal_stretches
+from mvest.valve.geometry.triangles import principal_stretches
 from mvest.valve.io.leaflet_surfaces import region_arrays, write_surface_series
 from mvest.valve.io.vtk_xml import SurfaceFile
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.typing import BoolArray, FloatArray
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 
 
 def cable_force(strain: FloatArray, toe: float) -> tuple[FloatArray, FloatArray]:

@@ -45,7 +45,7 @@ from mvest.mechanics.forces.pair_search import ContactPairs, search_pairs
 from mvest.mechanics.forces.passing import Passing
 from mvest.mechanics.settings import ContactSettings
 from mvest.typing import BoolArray, FloatArray, IntArray
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 
 BARRIER = 0.85
 """Distance of the barrier over the reference distance."""

@@ -18,8 +18,7 @@ import numpy as np
 
 from mvest.errors import InputError
 from mvest.typing import FloatArray
-from mvest.valve.mesh.embedding import Embedding, embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

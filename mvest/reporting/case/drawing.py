@@ -18,7 +18,7 @@ from mvest.reporting.figures import ATRIUM, LEAFLET_COLOURS, SIDE, VIEWS, View
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.valve import vertex_normals
 from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane
-from mvest.valve.measure.gap import Gap, find_gap
+from mvest.valve.measure.coaptation import Gap, find_gap
 
 __all__ = [
     "ATRIUM",

@@ -1,8 +1,22 @@
-"""What all code about triangulations starts from: edges, areas and normals of triangles."""
+"""Triangulations: edges, areas and normals, stretch between two shapes, and refinement.
+
+A surface is refined as a fixed linear function of its vertices. Facets of a curved surface lie
+inside it by ``h² / 8 r`` (edge length h, radius r), and its normals jump by ``h / r`` from one to
+the next: 0.1 mm and 20 degrees where leaflets bend. Edges are halved by Hermite's cubic, with the
+derivatives along the edge ``b - a`` that the triangles at its ends have on average::
+
+    (a + b) / 2 + (b - a) . (grad_a - grad_b) / 8
+
+of the position as a function over the surface at rest. The weights depend on that surface alone, so
+that derivatives of what moves with the vertices are exact.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy import sparse
 
 from mvest.typing import FloatArray, IntArray
 
@@ -45,3 +59,139 @@ def unit_normals(vertices: FloatArray, triangles: IntArray) -> FloatArray:
 def unit_rows(vectors: FloatArray) -> FloatArray:
     """Vectors ``(n, 3)`` at length one; those of no length stay."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def principal_stretches(
+    rest: FloatArray, deformed: FloatArray, triangles: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    r"""Largest and smallest stretch ``(n,)`` at each vertex, means over its triangles by area.
+
+    In a triangle with the edges :math:`D = [d_1, d_2]` at rest and :math:`d` now the stretches are
+    the singular values of :math:`d R^{-1}`, where :math:`D = Q R` (Q orthonormal).
+
+    Parameters
+    ----------
+    rest, deformed
+        ``(n, 3)`` mm.
+    triangles
+        ``(m, 3)``.
+    """
+
+    def edges(points: FloatArray) -> FloatArray:
+        corner = points[triangles]
+        return np.stack([corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=2)
+
+    upper = np.linalg.qr(edges(rest))[1]
+    values = np.linalg.svd(edges(deformed) @ np.linalg.inv(upper), compute_uv=False)
+    weight = np.repeat(areas(rest, triangles), 3)
+    total = np.bincount(triangles.ravel(), weight, minlength=len(rest))
+    return (
+        np.bincount(triangles.ravel(), weight * np.repeat(values[:, 0], 3), len(rest)) / total,
+        np.bincount(triangles.ravel(), weight * np.repeat(values[:, 1], 3), len(rest)) / total,
+    )
+
+
+MAX_TRIANGLES = 100_000
+"""Of a refined surface."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """A finer surface.
+
+    Attributes
+    ----------
+    weights : (r, n) sparse
+        Its vertices, of those of the coarse surface, which come first and stay.
+    triangles : (m, 3)
+    parent : (m,)
+        Triangle of the coarse surface of which each is a part.
+    loops : tuple of (e,)
+        Closed loops along edges, drawn finer as well.
+    """
+
+    weights: sparse.csr_array
+    triangles: IntArray
+    parent: IntArray
+    loops: tuple[IntArray, ...]
+
+
+def refined(
+    vertices: FloatArray,
+    triangles: IntArray,
+    edge_length: float,
+    loops: tuple[IntArray, ...] = (),
+) -> Refinement:
+    """A surface with its edges halved until half of them are shorter than a length.
+
+    Parameters
+    ----------
+    vertices : (n, 3) mm
+        At rest.
+    triangles : (m, 3)
+    edge_length : float
+        mm.
+    loops : tuple of (e,)
+        Vertices in the order of closed loops along edges.
+    """
+    fine = Refinement(
+        sparse.eye_array(len(vertices), format="csr"), triangles, np.arange(len(triangles)), loops
+    )
+    ends = vertices[directed_edges(triangles)]
+    length = float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)))
+    while length > edge_length and 4 * len(fine.triangles) <= MAX_TRIANGLES:
+        fine, length = _halved(vertices, fine), 0.5 * length
+    return fine
+
+
+def _halved(vertices: FloatArray, coarse: Refinement) -> Refinement:
+    x, triangles = coarse.weights @ vertices, coarse.triangles
+    n = len(x)
+    edges, number = np.unique(
+        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True
+    )
+    a, b = edges.T
+    own = sparse.eye_array(n, format="csr")
+    middle = 0.5 * (own[a] + own[b])
+    for along, slope in zip((x[b] - x[a]).T, _slopes(x, triangles), strict=True):
+        middle = middle + sparse.diags_array(along / 8.0) @ (slope[a] - slope[b])
+    # Of each triangle the middles of its edges from corner 0, from 1 and from 2.
+    p, q, r = n + number.reshape(3, -1)
+    i, j, k = triangles.T
+    parts = np.array([[i, p, r], [p, j, q], [r, q, k], [p, q, r]])
+    return Refinement(
+        sparse.vstack([own, middle], format="csr") @ coarse.weights,
+        np.moveaxis(parts, 2, 0).reshape(-1, 3),
+        np.repeat(coarse.parent, 4),
+        tuple(_halved_loop(loop, edges, n) for loop in coarse.loops),
+    )
+
+
+def _halved_loop(loop: IntArray, edges: IntArray, n: int) -> IntArray:
+    ends = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
+    # Edges are sorted by their first, then by their second vertex.
+    middle = n + np.searchsorted(edges @ [n, 1], ends @ [n, 1])
+    return np.stack([loop, middle], axis=1).ravel()
+
+
+def _slopes(x: FloatArray, triangles: IntArray) -> list[sparse.csr_array]:
+    """Gradient along x, y and z at each vertex, ``(n, n)`` of values at the vertices.
+
+    The mean over its triangles by area.
+    """
+    n, m = len(x), len(triangles)
+    area = np.maximum(areas(x, triangles), np.finfo(np.float64).tiny)
+    corner, row = x[triangles], np.repeat(np.arange(m), 3)
+    opposite = np.roll(corner, -2, axis=1) - np.roll(corner, -1, axis=1)
+    across = np.cross(unit_normals(x, triangles)[:, None], opposite)
+    around = sparse.csr_array((np.repeat(area, 3), (triangles.ravel(), row)), shape=(n, m))
+    mean = sparse.diags_array(1.0 / np.maximum(around.sum(axis=1), np.finfo(np.float64).tiny))
+    return [
+        mean
+        @ around
+        @ sparse.csr_array(
+            ((across[..., k] / (2.0 * area[:, None])).ravel(), (row, triangles.ravel())),
+            shape=(m, n),
+        )
+        for k in range(3)
+    ]

@@ -19,8 +19,7 @@ from mvest.errors import GeometryError, InputError
 from mvest.files import write_atomically
 from mvest.reading.bounded import refusing
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.io.gltf_binary import read_glb
-from mvest.valve.io.polygon_files import read_obj, read_ply, read_stl
+from mvest.valve.io.polygon_files import read_glb, read_obj, read_ply, read_stl
 from mvest.valve.io.vtk_legacy import read_vtk
 from mvest.valve.io.vtk_xml import CellFile, SurfaceFile, read_vtp, read_vtu, write_vtp
 

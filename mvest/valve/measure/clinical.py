@@ -9,8 +9,12 @@ import numpy as np
 
 from mvest.errors import MvestError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.geometry.spanning_surface import spanning_surface
-from mvest.valve.measure.annulus import AnnulusPlane, annulus_plane, measure_annulus
+from mvest.valve.measure.annulus import (
+    AnnulusPlane,
+    annulus_plane,
+    measure_annulus,
+    spanning_surface,
+)
 from mvest.valve.measure.coaptation import coaptation_area, coaptation_length, orifice_area
 from mvest.valve.measure.measurements import (
     leaflet_length,

@@ -13,9 +13,8 @@ import numpy as np
 
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import intersecting_triangles, plane_section
-from mvest.valve.geometry.spanning_surface import SpanningSurface
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.measure.annulus import AnnulusPlane, checked_loop, unit_vector
+from mvest.valve.measure.annulus import AnnulusPlane, SpanningSurface, checked_loop, unit_vector
 from mvest.valve.measure.coaptation import (
     coaptation_area,
     coaptation_length,

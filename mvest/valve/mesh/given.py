@@ -1,18 +1,28 @@
-"""A valve that is given as a surface, laid out and meshed as the template is."""
+"""A valve that is given as a surface, laid out and meshed as the template is.
+
+Leaflets may also be thickened and meshed with tetrahedra, and get labels, fibres and pressure
+faces. The mesher keeps neither vertices nor labels, so everything is found again by nearness: the
+region and the fibre from the midsurface, the side of an outer face from the closed surface.
+"""
 
 from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
 
-from mvest.errors import GeometryError, InputError
-from mvest.typing import FloatArray
+import numpy as np
+
+from mvest.errors import GeometryError, InputError, MeshingError
+from mvest.typing import FloatArray, IntArray
 from mvest.valve.anatomy.band import Band, leaflet_normals
-from mvest.valve.anatomy.valve import Valve, band_grid
+from mvest.valve.anatomy.valve import LeafletSurface, Valve, band_grid
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.thickening import FACE_KINDS, ClosedSurface, thicken
+from mvest.valve.geometry.triangles import area_vectors, areas
+from mvest.valve.mesh.cells import outer_faces, promote_to_tet10, tri6_faces
 from mvest.valve.mesh.solid_mesh import SolidMesh
 from mvest.valve.mesh.structured import structured_mesh
-from mvest.valve.mesh.tetrahedral.leaflets import tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings
+from mvest.valve.mesh.tetwild import TetrahedralMesh, TetwildSettings, tetrahedralize
 
 ENVELOPE_SHARE = 0.05
 """Envelope of an unstructured mesh over its edge length."""
@@ -90,3 +100,137 @@ class GivenValve:
         """
         settings = TetwildSettings(edge_length, ENVELOPE_SHARE * edge_length)
         return tetrahedral_leaflets(self.given.surface, settings, element, store)
+
+
+PRESSURE_AREA_TOLERANCE = 0.1
+"""Largest relative difference between the pressure faces' area and the ventricular side's."""
+
+
+def tetrahedral_leaflets(
+    surface: LeafletSurface,
+    settings: TetwildSettings,
+    element_type: str = "tet10",
+    store: Path | None = None,
+    normals: FloatArray | None = None,
+) -> SolidMesh:
+    """Thicken leaflets, mesh them with pytetwild, and transfer labels, fibres and faces.
+
+    Parameters
+    ----------
+    surface
+        Midsurface with thickness.
+    settings, store
+        See `mvest.valve.mesh.tetwild.tetrahedralize`.
+    element_type
+        ``"tet10"`` or ``"tet4"``.
+    normals
+        Offset directions of `mvest.valve.geometry.thickening.thicken`.
+    """
+    closed = thicken(surface, normals)
+    mesh = tetrahedralize(closed.vertices, closed.triangles, settings, store)
+    return label_tetrahedra(mesh, closed, surface, element_type)
+
+
+def label_tetrahedra(
+    mesh: TetrahedralMesh,
+    closed: ClosedSurface,
+    surface: LeafletSurface,
+    element_type: str = "tet10",
+) -> SolidMesh:
+    """Give a tetrahedral mesh the labels of the surface it was made from.
+
+    Elements take the region of the midsurface triangle nearest to their centroid. Fibres are those
+    of the nearest midsurface point, projected on the tangent plane there. Pressure faces are the
+    outer faces nearest to the closed surface's ventricular triangles, among those that face the
+    same way.
+
+    Raises
+    ------
+    InputError
+        The element type is neither ``tet4`` nor ``tet10``.
+    MeshingError
+        The pressure faces' area is not that of the ventricular side.
+    """
+    if element_type not in ("tet4", "tet10"):
+        raise InputError(f"element_type {element_type!r}: pytetwild meshes are 'tet4' or 'tet10'")
+    nodes, elements = mesh.nodes, mesh.tetrahedra
+    faces, owner = outer_faces(elements)
+    pressure = _ventricular(nodes, faces, closed)
+    faces, owner = faces[pressure], owner[pressure]
+    _check_pressure_area(nodes, faces, closed)
+    centroids = nodes[elements].mean(axis=1)
+    nearest = closest_points(centroids, surface.vertices, surface.triangles)
+    if element_type == "tet10":
+        nodes, elements = promote_to_tet10(nodes, elements)
+        faces = tri6_faces(faces, elements, owner)
+    return SolidMesh(
+        nodes=nodes,
+        elements=elements,
+        element_type=element_type,
+        region=surface.region[nearest.triangle],
+        region_names=surface.region_names,
+        fibre=_alike_within_elements(_fibres(nodes, surface)[elements]),
+        pressure_faces=faces,
+    )
+
+
+def _ventricular(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> IntArray:
+    """Outer faces whose nearest facing part of the closed surface is ventricular."""
+    centroids = nodes[faces].mean(axis=1)
+    normals = area_vectors(nodes, faces)
+    distance = np.full((len(faces), len(FACE_KINDS)), np.inf)
+    closed_normals = area_vectors(closed.vertices, closed.triangles)
+    for kind in range(len(FACE_KINDS)):
+        numbers = np.flatnonzero(closed.kind == kind)
+        if len(numbers) == 0:
+            continue
+        nearest = closest_points(centroids, closed.vertices, closed.triangles[numbers])
+        facing = (normals * closed_normals[numbers[nearest.triangle]]).sum(axis=1) > 0
+        # A face that looks away is kept as a candidate of last resort, behind every facing one.
+        distance[:, kind] = nearest.distance + np.where(facing, 0.0, 1e6)
+    return np.flatnonzero(distance.argmin(axis=1) == FACE_KINDS.index("ventricular"))
+
+
+def _check_pressure_area(nodes: FloatArray, faces: IntArray, closed: ClosedSurface) -> None:
+    ventricular = closed.triangles[closed.kind == FACE_KINDS.index("ventricular")]
+    wanted = areas(closed.vertices, ventricular).sum()
+    area = areas(nodes, faces).sum()
+    if abs(area - wanted) > PRESSURE_AREA_TOLERANCE * wanted:
+        raise MeshingError(
+            f"pressure faces cover {area:.1f} mm^2 of the {wanted:.1f} mm^2 of the ventricular "
+            f"side; give a shorter edge_length"
+        )
+
+
+def _fibres(nodes: FloatArray, surface: LeafletSurface) -> FloatArray:
+    """Fibre of the nearest midsurface point, in the tangent plane there, ``(n, 3)`` unit."""
+    nearest = closest_points(nodes, surface.vertices, surface.triangles)
+    corners = surface.triangles[nearest.triangle]
+    heaviest = corners[np.arange(len(nodes)), nearest.barycentric.argmax(axis=1)]
+    lead = surface.fibre[heaviest]
+    # A fibre has no sign: turn the corners' fibres to agree before averaging them.
+    vectors = surface.fibre[corners]
+    sign = np.where(np.einsum("ncj,nj->nc", vectors, lead) < 0, -1.0, 1.0)
+    mixed = np.einsum("nc,ncj->nj", nearest.barycentric * sign, vectors)
+    normal = area_vectors(surface.vertices, surface.triangles)[nearest.triangle]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    tangent = mixed - (mixed * normal).sum(axis=1, keepdims=True) * normal
+    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    bad = np.flatnonzero(length[:, 0] < 1e-3)
+    if len(bad):
+        raise InputError(
+            f"fibres stand upright on the leaflet near {np.round(nodes[bad[0]], 2)} mm; they must "
+            f"lie in it"
+        )
+    result: FloatArray = tangent / length
+    return result
+
+
+def _alike_within_elements(fibre: FloatArray) -> FloatArray:
+    """Turn the fibres ``(m, k, 3)`` of every element's nodes to agree in sign.
+
+    A fibre and its negative are the same tissue, but elements interpolate between their nodes.
+    """
+    lead = fibre[:, :1]
+    result: FloatArray = np.where((fibre * lead).sum(axis=2, keepdims=True) < 0, -fibre, fibre)
+    return result

@@ -1,11 +1,19 @@
-"""The solid mesh of a valve: nodes, elements, what tissue each is, and where the pressure acts."""
+"""The solid mesh of a valve: nodes, elements, what tissue each is, and where the pressure acts.
+
+Material points can be embedded in it. Whatever must not depend on the mesh (observation vertices,
+contact samples, chord patches, the hinge) is given as points of the reference frame. Here they get
+a host element and shape-function weights, so that the position of a point is ``weights @ nodal
+positions`` in any state and any mesh.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mvest.elements import FACES, Element, element
 from mvest.errors import GeometryError, InputError
@@ -111,3 +119,167 @@ class SolidMesh:
         for index in (self.elements, self.region, self.pressure_faces):
             digest.update(np.ascontiguousarray(index).tobytes())
         return digest.hexdigest()
+
+
+LAST_STEP = 1e-9
+"""In reference coordinates; the step after one this small, its square, is round-off."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Embedding:
+    """Points as weighted sums of nodes.
+
+    Attributes
+    ----------
+    nodes : ndarray
+        ``(k, w)`` node indices; entries with weight zero are padding.
+    weights : ndarray
+        ``(k, w)``, each row sums to one.
+    host : ndarray
+        ``(k,)`` host element, or -1 where a point has none (averages over several elements).
+    """
+
+    nodes: IntArray
+    weights: FloatArray
+    host: IntArray
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Positions ``(k, ...)`` of the points where the nodes are at ``x (n, ...)``."""
+        values = np.ascontiguousarray(x, dtype=np.float64)
+        flat = _weighted_sums(self.nodes, self.weights, values.reshape(len(values), -1))
+        return flat.reshape(len(self.nodes), *values.shape[1:])
+
+    def average(self, coefficients: FloatArray, groups: IntArray) -> Embedding:
+        """Weighted averages of the points.
+
+        Parameters
+        ----------
+        coefficients : ndarray
+            ``(g, s)`` weights of the members, rows summing to one.
+        groups : ndarray
+            ``(g, s)`` members of each average; padding has coefficient zero.
+        """
+        rows = []
+        for members, factor in zip(groups, coefficients, strict=True):
+            keep = factor != 0
+            index = self.nodes[members[keep]].ravel()
+            value = (factor[keep, None] * self.weights[members[keep]]).ravel()
+            unique, inverse = np.unique(index, return_inverse=True)
+            total = np.bincount(inverse, value, minlength=len(unique))
+            rows.append((unique[np.abs(total) > 1e-14], total[np.abs(total) > 1e-14]))
+        width = max((len(r[0]) for r in rows), default=1)
+        nodes = np.zeros((len(rows), width), dtype=np.int64)
+        weights = np.zeros((len(rows), width))
+        for k, (index, value) in enumerate(rows):
+            nodes[k, : len(index)] = index
+            nodes[k, len(index) :] = index[0]
+            weights[k, : len(index)] = value
+        return Embedding(nodes, weights, np.full(len(rows), -1, dtype=np.int64))
+
+
+@nb.njit(cache=True)
+def _weighted_sums(nodes: IntArray, weights: FloatArray, values: FloatArray) -> FloatArray:
+    """Rows ``(k, c)`` of ``weights (k, w)`` with the rows of ``values (n, c)`` at ``nodes``."""
+    out = np.zeros((nodes.shape[0], values.shape[1]))
+    for k in range(nodes.shape[0]):
+        for w in range(nodes.shape[1]):
+            for c in range(values.shape[1]):
+                out[k, c] += weights[k, w] * values[nodes[k, w], c]
+    return out
+
+
+def embed(
+    mesh: SolidMesh, points: FloatArray, *, tolerance: float = 1.0, candidates: int = 12
+) -> Embedding:
+    """Embed points of the reference frame in ``mesh``.
+
+    Each point gets the element whose map it inverts with the smallest violation of the element's
+    bounds (Newton iteration per candidate element). Points slightly outside the mesh (a coarse mesh
+    cuts corners of a curved surface) are extrapolated within their nearest element.
+
+    Parameters
+    ----------
+    mesh : SolidMesh
+    points : ndarray
+        ``(k, 3)`` mm.
+    tolerance : float
+        Largest accepted distance (mm) of a point from the mesh.
+    candidates : int
+        Number of nearest elements tried.
+
+    Raises
+    ------
+    InputError
+        If ``points`` is not ``(k, 3)`` finite.
+    GeometryError
+        If a point is farther from the mesh than ``tolerance``.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputError(f"points to embed: shape {points.shape}, expected finite (k, 3)")
+    reference = mesh.reference
+    centre = np.einsum("a,mai->mi", reference.shape(reference.centre)[0], mesh.nodes[mesh.elements])
+    n_try = min(candidates, len(mesh.elements))
+    _, near = cKDTree(centre).query(points, k=n_try)
+    near = near.reshape(len(points), n_try)
+    best = np.full(len(points), np.inf)
+    host = np.zeros(len(points), dtype=np.int64)
+    local = np.zeros((len(points), 3))
+    for c in range(n_try):
+        todo = np.flatnonzero(best > 1e-9)
+        if todo.size == 0:
+            break
+        e = near[todo, c]
+        xi, error = _invert(mesh, e, points[todo])
+        violation = np.where(error < 1e-8, reference.outside(xi), np.inf)
+        better = violation < best[todo] - 1e-12
+        at = todo[better]
+        best[at], host[at], local[at] = violation[better], e[better], xi[better]
+    size = np.linalg.norm(np.ptp(mesh.nodes[mesh.elements[host]], axis=1), axis=1)
+    distance = np.maximum(best, 0.0) * size / 2
+    far = np.flatnonzero(np.isfinite(distance) & (distance > tolerance))
+    for c in range(n_try if far.size else 0):
+        # Elements are thin: a point beyond a face is nearer to its element than the same violation
+        # beyond an end would be.
+        e = near[far, c]
+        xi, error = _invert(mesh, e, points[far])
+        at = np.einsum(
+            "ka,kai->ki", reference.shape(reference.inside(xi)), mesh.nodes[mesh.elements[e]]
+        )
+        away = np.where(error < 1e-8, np.linalg.norm(points[far] - at, axis=1), np.inf)
+        better = away < distance[far]
+        nearer = far[better]
+        distance[nearer], host[nearer], local[nearer] = away[better], e[better], xi[better]
+    if not np.all(distance <= tolerance):
+        i = int(np.argmax(distance))
+        raise GeometryError(
+            f"point {i} at {np.round(points[i], 3)} mm is outside the mesh "
+            f"(about {distance[i]:.2g} mm from its nearest element, tolerance {tolerance} mm)"
+        )
+    return Embedding(mesh.elements[host], reference.shape(local), host)
+
+
+def _invert(
+    mesh: SolidMesh, e: IntArray, points: FloatArray, iterations: int = 15
+) -> tuple[FloatArray, FloatArray]:
+    """Reference coordinates ``(k, 3)`` of points in elements ``e`` and the residual distance."""
+    reference = mesh.reference
+    x_e = mesh.nodes[mesh.elements[e]]
+    xi = np.repeat(reference.centre, len(e), axis=0)
+    left = np.arange(len(e))
+    for _ in range(iterations):
+        at, nodes = xi[left], x_e[left]
+        gap = points[left] - np.einsum("ka,kai->ki", reference.shape(at), nodes)
+        jacobian = np.einsum("kai,kaj->kij", nodes, reference.gradient(at))
+        regular = np.abs(np.linalg.det(jacobian)) > 1e-12
+        jacobian[~regular] = np.eye(3)
+        step = np.linalg.solve(jacobian, gap[:, :, None])[:, :, 0]
+        xi[left] = np.clip(at + np.clip(step, -1.0, 1.0), -3.0, 3.0)
+        left = left[np.abs(step).max(axis=1) > LAST_STEP]
+        if not left.size:
+            break
+    gap = points - np.einsum("ka,kai->ki", reference.shape(xi), x_e)
+    return xi, np.linalg.norm(gap, axis=1)

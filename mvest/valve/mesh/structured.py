@@ -1,18 +1,34 @@
-"""Layered solid meshes of the template: bricks, or prisms split into tetrahedra.
+"""Layered solid meshes, of the template or of a triangulated midsurface.
 
-Every node is placed on the exact surface in material coordinates, so that refined meshes converge
-to one and the same body.
+The template is meshed in bricks, or prisms split into tetrahedra. Every node is placed on the exact
+surface in material coordinates, so that refined meshes converge to one and the same body.
+
+A triangulated midsurface is thickened into layers of quadratic wedges. Each triangle gets nodes in
+the middle of its edges, laid on a finer surface where one is given, so that the six-node triangle
+follows the curvature. Where that would distort a triangle (a free edge with scallops shorter than
+its edges), the middles are pulled back towards the straight edge, and the mesh says how many. Every
+point of this sheet becomes a column of nodes along a smoothed normal, from the atrial side (``zeta
+= -1``) to the ventricular side (``zeta = +1``). Raw normals and a jumping thickness can invert
+wedges where a surface bends sharply, at commissures above all; both are smoothed, and an element
+that is still inverted is an error.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy.sparse as sp
 
-from mvest.errors import InputError
+from mvest.elements import FACES, element
+from mvest.errors import GeometryError, InputError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.anatomy.valve import LeafletSurface, vertex_normals
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.surface_coordinates import boundary_loops
+from mvest.valve.geometry.triangles import directed_edges, unit_rows
+from mvest.valve.mesh.solid_mesh import SolidMesh, jacobian_determinants
 
 
 class MaterialSurface(Protocol):
@@ -187,3 +203,209 @@ def _top_faces(elements: IntArray, nodes: FloatArray, on_top: IntArray) -> IntAr
         columns = np.concatenate([corners, mids]) if elements.shape[1] == 10 else corners
         faces.append(elements[chosen][:, columns])
     return np.concatenate(faces)
+
+
+LEVELS_PER_LAYER = {"wedge12": 1, "wedge18": 2}
+"""Node levels that one layer of each element adds."""
+MIN_AREA_RATIO = 0.5
+"""Smallest accepted ratio of least to greatest area factor in a six-node triangle. [choice]"""
+
+SMOOTHING = 3
+"""Rounds of averaging normals and thickness with their neighbours in the sheet."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayeredMesh:
+    """A solid mesh that remembers the sheet it was thickened from.
+
+    Node ``level * n_points + point`` lies on level ``level`` (0 is the atrial face) of sheet point
+    ``point``; element ``layer * n_triangles + triangle`` likewise.
+
+    Attributes
+    ----------
+    solid : SolidMesh
+    points : ndarray
+        ``(p, 3)`` mm, the midsurface: first the vertices of the surface, then the edge middles.
+    sheet : ndarray
+        ``(m, 6)`` six-node triangles, normals to the ventricle.
+    normals : ndarray
+        ``(p, 3)`` directions of the node columns.
+    levels : int
+        Number of nodes through the thickness.
+    straightened : int
+        Edges whose middle was pulled back from the finer surface.
+    """
+
+    solid: SolidMesh
+    points: FloatArray
+    sheet: IntArray
+    normals: FloatArray
+    levels: int
+    straightened: int
+
+    def columns(self, points: IntArray) -> IntArray:
+        """Node numbers ``(k, levels)`` above sheet points ``(k,)``, from atrial to ventricular."""
+        return np.asarray(points)[:, None] + len(self.points) * np.arange(self.levels)
+
+
+def layered_wedges(
+    surface: LeafletSurface,
+    *,
+    element_type: str = "wedge12",
+    layers: int = 1,
+    onto: LeafletSurface | None = None,
+) -> LayeredMesh:
+    """Thicken a midsurface into layers of six-node-triangle wedges.
+
+    Parameters
+    ----------
+    surface : LeafletSurface
+        Its vertices become the corners; the surface lies halfway through the thickness.
+    element_type : {"wedge12", "wedge18"}
+        Linear or quadratic through each layer.
+    layers : int
+        Number of layers.
+    onto : LeafletSurface, optional
+        Finer surface that the edge middles are laid on (its boundary loops for boundary edges), and
+        from which normals, fibre and thickness are taken; without it edges are straight.
+
+    Raises
+    ------
+    InputError
+        For an unknown element or fewer than one layer.
+    GeometryError
+        If elements are inverted at a quadrature point or node; the message names them.
+    """
+    if element_type not in LEVELS_PER_LAYER:
+        raise InputError(
+            f"cannot thicken into {element_type!r}; known: {', '.join(LEVELS_PER_LAYER)}"
+        )
+    if layers < 1:
+        raise InputError(f"{layers} layers, expected at least 1")
+    sheet, edges, on_boundary = _quadratic_sheet(surface.triangles)
+    middles = surface.vertices[edges].mean(axis=1)
+    thickness = np.concatenate([surface.thickness, surface.thickness[edges].mean(axis=1)])
+    fibre = np.vstack([surface.fibre, surface.fibre[edges].sum(axis=1)])
+    straightened = 0
+    if onto is not None:
+        curved = _lay_on(onto, middles, on_boundary)
+        middles, straightened = _pull_back(surface.vertices, middles, curved, sheet)
+    points = np.vstack([surface.vertices, middles])
+    small = sheet[:, FACES["tri6"].corners].reshape(-1, 3)
+    normals = vertex_normals(points, small)
+    if onto is not None:
+        at = closest_points(points, onto.vertices, onto.triangles)
+        thickness = at.interpolate(onto.thickness, onto.triangles)
+        fibre = at.interpolate(onto.fibre, onto.triangles)
+        normals = at.interpolate(onto.normals, onto.triangles)
+
+    average = _neighbour_average(small, len(points))
+    for _ in range(SMOOTHING):
+        normals = unit_rows(average @ normals)
+        thickness = average @ thickness
+    fibre = unit_rows(fibre - normals * np.einsum("ij,ij->i", fibre, normals)[:, None])
+
+    per_layer = LEVELS_PER_LAYER[element_type]
+    levels = layers * per_layer + 1
+    offset = np.linspace(-0.5, 0.5, levels)[:, None, None] * thickness[None, :, None]
+    nodes = (points[None] + offset * normals[None]).reshape(-1, 3)
+    elements = np.vstack(
+        [
+            np.hstack(
+                [sheet + level * len(points) for level in range(first, first + per_layer + 1)]
+            )
+            for first in range(0, levels - 1, per_layer)
+        ]
+    )
+    _reject_inverted(nodes, elements, element_type)
+    return LayeredMesh(
+        solid=SolidMesh(
+            nodes=nodes,
+            elements=elements,
+            element_type=element_type,
+            region=np.tile(surface.region, layers),
+            region_names=surface.region_names,
+            fibre=np.tile(fibre, (levels, 1)),
+            pressure_faces=sheet + (levels - 1) * len(points),
+        ),
+        points=points,
+        sheet=sheet,
+        normals=normals,
+        levels=levels,
+        straightened=straightened,
+    )
+
+
+def _quadratic_sheet(triangles: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Six-node triangles, the edges ``(e, 2)`` whose middles are the new points, boundary flags."""
+    edges, number, count = np.unique(
+        np.sort(directed_edges(triangles), axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    middle = int(triangles.max()) + 1 + number.reshape(3, -1).T
+    return np.hstack([triangles, middle]), edges, count == 1
+
+
+def _lay_on(fine: LeafletSurface, middles: FloatArray, on_boundary: IntArray) -> FloatArray:
+    """Move interior points to the closest points of the surface, boundary ones to its loops."""
+    at = closest_points(middles, fine.vertices, fine.triangles)
+    result = at.interpolate(fine.vertices, fine.triangles)
+    loops = boundary_loops(fine.triangles)
+    start = np.concatenate(loops)
+    end = np.concatenate([np.roll(loop, -1) for loop in loops])
+    a, along = fine.vertices[start], fine.vertices[end] - fine.vertices[start]
+    for i in np.flatnonzero(on_boundary):
+        t = np.clip(
+            np.einsum("ij,ij->i", middles[i] - a, along) / np.einsum("ij,ij->i", along, along), 0, 1
+        )
+        candidate = a + t[:, None] * along
+        result[i] = candidate[np.argmin(np.linalg.norm(candidate - middles[i], axis=1))]
+    return result
+
+
+def _pull_back(
+    vertices: FloatArray, straight: FloatArray, curved: FloatArray, sheet: IntArray
+) -> tuple[FloatArray, int]:
+    """Edge middles between ``straight`` and ``curved`` that distort no six-node triangle."""
+    reference = element("wedge12")
+    places = np.vstack([reference.points[:6], reference.node_coordinates[:6]])
+    gradient = reference.gradient(places * [1.0, 1.0, 0.0])
+    gradient = gradient[:, :6, :2] + gradient[:, 6:, :2]
+    share = np.ones(len(straight))
+    for _ in range(8):
+        middles = straight + share[:, None] * (curved - straight)
+        points = np.vstack([vertices, middles])
+        tangent = np.einsum("mai,qaj->mqij", points[sheet], gradient)
+        normal = np.cross(tangent[..., 0], tangent[..., 1])
+        mean = unit_rows(normal.mean(axis=1))
+        area = np.einsum("mqi,mi->mq", normal, mean)
+        bad = area.min(axis=1) < MIN_AREA_RATIO * area.max(axis=1)
+        edges = np.unique(sheet[bad, 3:] - len(vertices))
+        if not edges.size:
+            break
+        share[edges] *= 0.5
+    return middles, int(np.sum(share < 1))
+
+
+def _neighbour_average(triangles: IntArray, n: int) -> sp.csr_matrix:
+    """Matrix that averages a point (weight one half) with its neighbours (one half together)."""
+    a = np.concatenate([triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()])
+    b = np.concatenate([triangles[:, [1, 2, 0]].ravel(), triangles[:, [0, 1, 2]].ravel()])
+    adjacency = sp.csr_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
+    adjacency.data[:] = 1.0
+    share = 0.5 / np.asarray(adjacency.sum(axis=1)).ravel()
+    return sp.csr_matrix(0.5 * sp.identity(n) + sp.diags(share) @ adjacency)
+
+
+def _reject_inverted(nodes: FloatArray, elements: IntArray, element_type: str) -> None:
+    reference = element(element_type)
+    places = np.vstack([reference.points, reference.node_coordinates])
+    smallest = jacobian_determinants(nodes, elements, reference, places).min(axis=1)
+    inverted = np.flatnonzero(smallest <= 0)
+    if inverted.size:
+        names = ", ".join(str(i) for i in inverted[:10]) + (", ..." if inverted.size > 10 else "")
+        raise GeometryError(
+            f"{inverted.size} of {len(elements)} {element_type} elements are inverted (numbers "
+            f"{names}; smallest Jacobian determinant {smallest.min():.3g} mm^3, expected > 0): the "
+            "surface bends within its thickness; smooth it, or use smaller triangles or less "
+            "thickness"
+        )

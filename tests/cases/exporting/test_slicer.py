@@ -12,8 +12,8 @@ from mvest.cases.case import Role
 from mvest.cases.exporting.slicer import SlicerOptions, export_slicer
 from mvest.cases.writer import write_case
 from mvest.errors import InputError
-from mvest.valve.geometry.stretch import principal_stretches
 from mvest.valve.geometry.thickening import thicken
+from mvest.valve.geometry.triangles import principal_stretches
 from tests.cases.folders import template_case
 
 vtk = pytest.importorskip("vtk", reason="needs VTK, which comes with the extra viz")

@@ -11,7 +11,7 @@ from experiments.common.schema import build
 from experiments.studies.donor.findings import Findings
 from experiments.studies.donor.settings import CITATION, DATA_VARIABLE, DonorSettings
 from experiments.studies.donor.study import build_donor
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 from tests.experiments.configured import composed, plain
 from tests.valve.io.recorded import CASE, NAMES, skirt, write
 

@@ -16,7 +16,7 @@ from mvest.mechanics.forces.contact import (
 from mvest.mechanics.forces.pair_search import NEIGHBOUR, ContactPairs
 from mvest.mechanics.forces.passing import _longest_edges
 from mvest.mechanics.settings import ContactSettings
-from mvest.valve.mesh.embedding import Embedding
+from mvest.valve.mesh.solid_mesh import Embedding
 from tests.mechanics.bodies import grid_triangles, point_masses
 
 P0, R0, H = 0.02, 1.2, 2.0  # MPa and, for a thickness of 1 mm, mm

@@ -10,7 +10,7 @@ from mvest.mechanics.law.biot import BiotLaw
 from mvest.mechanics.solid import Solid
 from mvest.mechanics.steps import NewtonSettings, Step
 from mvest.mechanics.system import Loads, System
-from mvest.valve.mesh.embedding import embed
+from mvest.valve.mesh.solid_mesh import embed
 from tests.mechanics.bodies import GAP, block, point_masses, sandwich
 from tests.mechanics.test_tangents import check_system, moved
 

@@ -8,9 +8,9 @@ from mvest.errors import GeometryError, InputError
 from mvest.valve.anatomy.valve import LeafletSurface
 from mvest.valve.geometry.surface_coordinates import boundary_loops, surface_coordinates
 from mvest.valve.geometry.triangles import areas
-from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import remesh
 from mvest.valve.mesh.solid_mesh import jacobian_determinants
+from mvest.valve.mesh.structured import layered_wedges
 
 RADIUS, HEIGHT = 10.0, 12.0
 

@@ -5,8 +5,7 @@ import pytest
 
 from mvest.valve.anatomy.template import Template
 from mvest.valve.geometry.proximity import closest_points
-from mvest.valve.geometry.refinement import refined
-from mvest.valve.geometry.triangles import directed_edges
+from mvest.valve.geometry.triangles import directed_edges, refined
 
 VALVE = Template().valve(40, 11)
 REST, TRIANGLES = VALVE.surface.vertices, VALVE.surface.triangles

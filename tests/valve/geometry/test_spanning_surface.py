@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mvest.errors import GeometryError
-from mvest.valve.geometry.spanning_surface import spanning_surface
-from mvest.valve.measure.annulus import annulus_plane, measure_annulus
+from mvest.valve.measure.annulus import annulus_plane, measure_annulus, spanning_surface
 
 ANGLE = np.arange(128) * 2 * np.pi / 128
 

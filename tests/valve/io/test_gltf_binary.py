@@ -5,7 +5,7 @@ import pytest
 
 from mvest.cases.surface_files import read_regions
 from mvest.errors import GeometryError, InputError
-from mvest.valve.io import gltf_binary
+from mvest.valve.io import polygon_files
 from mvest.valve.io.leaflet_surfaces import read_surface
 from tests.valve.io.glb import Glb, write_parts
 
@@ -123,7 +123,7 @@ def test_another_version_and_a_file_that_is_cut_off_are_refused(tmp_path):
 
 
 def test_nodes_that_share_a_mesh_do_not_fill_the_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(gltf_binary, "MAX_CORNERS", 100)
+    monkeypatch.setattr(polygon_files, "MAX_CORNERS", 100)
     file = Glb()
     mesh = file.mesh(POINTS, TRIANGLES)
     for _ in range(9):

@@ -9,14 +9,12 @@ import pytest
 
 from experiments.studies.donor.settings import CITATION, DATA_VARIABLE
 from mvest.errors import GeometryError, InputError
-from mvest.valve.anatomy.chord_network import trace_cables
-from mvest.valve.io.abaqus.deck import ElementSection
-from mvest.valve.io.abaqus.keywords import blocks_of
+from mvest.valve.io.abaqus.chords import trace_cables, truss_stiffness
+from mvest.valve.io.abaqus.deck import ElementSection, blocks_of
 from mvest.valve.io.abaqus.leaflet_mesh import SetNames
 from mvest.valve.io.abaqus.recording import Recording, read_recording
-from mvest.valve.io.abaqus.truss_stiffness import truss_stiffness
-from mvest.valve.mesh.layered import layered_wedges
 from mvest.valve.mesh.remesh import remesh
+from mvest.valve.mesh.structured import layered_wedges
 from tests.places import ROOT
 from tests.valve.io.recorded import CASE, DOWN, NAMES, OGDEN, ROUND, deck, skirt, write
 

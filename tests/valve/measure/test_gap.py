@@ -5,7 +5,7 @@ import pytest
 
 from mvest.errors import InputError
 from mvest.valve.measure.annulus import annulus_plane
-from mvest.valve.measure.gap import find_gap
+from mvest.valve.measure.coaptation import find_gap
 from tests.valve.shapes import bands, circle, join, plate
 
 BELOW, FRONT = np.array([0.0, 0.0, 20.0]), np.array([0.0, 30.0, 0.0])

@@ -6,8 +6,7 @@ import pytest
 from mvest.errors import GeometryError, InputError
 from mvest.mechanics.blocks import box
 from mvest.valve.anatomy.template import Template
-from mvest.valve.mesh.embedding import Embedding, embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import Embedding, SolidMesh, embed
 from mvest.valve.mesh.structured import structured_mesh
 
 TEMPLATE = Template()

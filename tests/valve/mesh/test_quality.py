@@ -3,7 +3,7 @@ import pytest
 
 from mvest.elements import ELEMENTS
 from mvest.errors import InputError
-from mvest.valve.mesh.quality import mesh_quality
+from mvest.valve.mesh.cells import mesh_quality
 
 
 def ideal(name):

@@ -4,18 +4,18 @@ import pytest
 from mvest.elements import element
 from mvest.errors import ConfigurationError, GeometryError, InputError, MeshingError
 from mvest.valve.anatomy.valve import LeafletSurface
-from mvest.valve.mesh.quality import mesh_quality
-from mvest.valve.mesh.tetrahedral import tetwild as module
-from mvest.valve.mesh.tetrahedral.cells import (
+from mvest.valve.mesh import tetwild as module
+from mvest.valve.mesh.cells import (
     content_sha256,
+    mesh_quality,
     orient,
     outer_faces,
     promote_to_tet10,
     tri6_faces,
     volumes,
 )
-from mvest.valve.mesh.tetrahedral.leaflets import label_tetrahedra, tetrahedral_leaflets
-from mvest.valve.mesh.tetrahedral.tetwild import TetwildSettings, tetrahedralize
+from mvest.valve.mesh.given import label_tetrahedra, tetrahedral_leaflets
+from mvest.valve.mesh.tetwild import TetwildSettings, tetrahedralize
 
 COARSE = TetwildSettings(edge_length=1.0, envelope=0.01)
 

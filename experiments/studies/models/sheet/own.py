@@ -11,8 +11,7 @@ from mvest.mechanics.body import simulate_body
 from mvest.mechanics.law.moduli import TransverselyIsotropic
 from mvest.mechanics.parameters import Parameter
 from mvest.typing import FloatArray
-from mvest.valve.mesh.embedding import embed
-from mvest.valve.mesh.solid_mesh import SolidMesh
+from mvest.valve.mesh.solid_mesh import SolidMesh, embed
 
 __all__ = ["OwnSheet"]
 

@@ -24,13 +24,14 @@ from mvest.valve.io.abaqus.deck import (
     SHELLS,
     TRUSSES,
     Amplitude,
+    Block,
     Deck,
     Elements,
     ElementSection,
     FaceLoad,
+    blocks_of,
     lookup,
 )
-from mvest.valve.io.abaqus.keywords import Block, blocks_of
 
 CORNERS = SHELLS | TRUSSES
 """Nodes of the elements that are read."""

@@ -24,14 +24,13 @@ from scipy.sparse.csgraph import connected_components
 
 from mvest.errors import InputError, MvestError
 from mvest.typing import FloatArray, IntArray
-from mvest.valve.anatomy.chord_network import ChordPaths, trace_cables
 from mvest.valve.anatomy.valve import Chordae, LeafletSurface, Motion, Valve
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_coordinates import surface_coordinates
+from mvest.valve.io.abaqus.chords import ChordPaths, trace_cables, truss_stiffness
 from mvest.valve.io.abaqus.deck import TRUSSES, Deck, ElementSection
 from mvest.valve.io.abaqus.deck_file import read_deck
 from mvest.valve.io.abaqus.leaflet_mesh import LeafletMesh, SetNames, leaflet_mesh, shell_numbers
-from mvest.valve.io.abaqus.truss_stiffness import truss_stiffness
 from mvest.valve.io.vtk_xml import read_vtu
 from mvest.valve.mesh.remesh import Remeshed
 

@@ -243,7 +243,7 @@ def test_a_truth_outlives_comments_docstrings_and_layout(truth):
         ("mvest/units.py", "133.322387415", "133.3"),
         ("mvest/mechanics/settings.py", "patch_radius: Length = 2.0", "patch_radius: Length = 2.5"),
         ("mvest/elements.py", "0.445948490915965", "0.445948490915966"),
-        ("mvest/valve/mesh/tetrahedral/_tetwild_worker.py", "np.int64", "np.int32"),
+        ("mvest/valve/mesh/_tetwild_worker.py", "np.int64", "np.int32"),
         ("mvest/valve/mesh/given.py", "ENVELOPE_SHARE = 0.05", "ENVELOPE_SHARE = 0.06"),
     ],
 )

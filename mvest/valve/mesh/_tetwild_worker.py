@@ -1,6 +1,6 @@
 """Run fTetWild on one surface, in a process of its own: it may crash without a Python exception.
 
-Started by `mvest.valve.mesh.tetrahedral.tetwild` as ``_tetwild_worker.py INPUT.npz OUTPUT.npz``, in
+Started by `mvest.valve.mesh.tetwild` as ``_tetwild_worker.py INPUT.npz OUTPUT.npz``, in
 a temporary folder because fTetWild writes files of its own into the current one.
 """
 

@@ -26,10 +26,11 @@ from mvest.reading.npz import read_npz
 from mvest.typing import FloatArray, IntArray
 from mvest.valve.geometry.proximity import closest_points
 from mvest.valve.geometry.surface_checks import check_surface, enclosed_volume
-from mvest.valve.mesh.quality import QualityReport, mesh_quality
-from mvest.valve.mesh.tetrahedral.cells import (
+from mvest.valve.mesh.cells import (
+    QualityReport,
     content_sha256,
     drop_unused_nodes,
+    mesh_quality,
     orient,
     outer_faces,
     volumes,

@@ -1,1 +1,0 @@
-"""Solid meshes of tetrahedra by fTetWild."""
