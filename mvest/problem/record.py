@@ -274,6 +274,11 @@ class EstimateRecord(Frozen):
         """The estimated moduli."""
         return tuple(unknown for unknown in self.unknowns if unknown.is_modulus)
 
+    @property
+    def parameters(self) -> tuple[Unknown, ...]:
+        """The unknowns of the filter, without the moduli that follow from them."""
+        return tuple(unknown for unknown in self.unknowns if unknown.kind != "derived")
+
     def unknown(self, name: str) -> Unknown:
         """The unknown of that name.
 
@@ -290,6 +295,15 @@ class EstimateRecord(Frozen):
     def detail_rows(self, name: str) -> tuple[Row, ...]:
         """The rows of a detail; none where it was not computed."""
         return self.details.get(name, ())
+
+    def without_details(self, *kept: str) -> EstimateRecord:
+        """The same without how it came about: iterates, correlations, details but those kept."""
+        nothing: dict[str, Any] = dict.fromkeys(
+            ("correlation", "iterates", "iterate_std", "objective", "flat", "confounded"), ()
+        )
+        details = {name: rows for name, rows in self.details.items() if name in kept}
+        others = {name: other.without_details() for name, other in self.alternatives.items()}
+        return self.model_copy(update={**nothing, "details": details, "alternatives": others})
 
     def with_truth(self, truth: Mapping[str, float]) -> EstimateRecord:
         """The same with the true values of its unknowns, for a simulated valve.

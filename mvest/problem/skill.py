@@ -6,8 +6,8 @@ the interval that is believed before anything was seen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from statistics import median
+from collections.abc import Iterable, Sequence
+from statistics import mean, median
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,6 @@ __all__ = [
     "HALF",
     "PRIOR",
     "PRIOR_STD",
-    "baselines",
     "generic_guess",
     "log_width",
     "prior_alone",
@@ -68,69 +67,63 @@ def _with(
     return unknown.model_copy(update=values)
 
 
-def baselines(moduli: Sequence[Unknown]) -> list[dict[str, Any]]:
-    """What generic guess and prior alone are worth: rows that stand below a table of estimates.
+def skill(unknowns: Sequence[Unknown]) -> dict[str, Any]:
+    """Coverage and errors of estimates beside those of the generic guess and of the prior alone.
 
     Parameters
     ----------
-    moduli : sequence of Unknown
-        The estimates, of several leaflets and valves, with their truths; priors are the same for
-        all valves.
-
-    Returns
-    -------
-    list of dict
-        For each leaflet ``what`` (`GENERIC` or `PRIOR`), ``parameter``, ``estimate``, ``low``,
-        ``high``, ``inside`` of ``n`` truths (0 where there is no interval), and ``median_error``
-        (relative).
-    """
-    rows = []
-    for what, guess in ((GENERIC, generic_guess), (PRIOR, prior_alone)):
-        for name in dict.fromkeys(one.name for one in moduli):
-            own = [guess(one) for one in moduli if one.name == name and one.truth is not None]
-            known = [one.inside for one in own if one.inside is not None]
-            if own:
-                rows.append(
-                    {
-                        "what": what,
-                        "parameter": name,
-                        "estimate": own[0].estimate,
-                        "low": own[0].low,
-                        "high": own[0].high,
-                        "inside": sum(known),
-                        "n": len(known),
-                        "median_error": median(_errors(own)),
-                    }
-                )
-    return rows
-
-
-def skill(moduli: Sequence[Unknown]) -> dict[str, Any]:
-    """Coverage and median error of estimates beside those of generic guess and prior alone.
-
-    Parameters
-    ----------
-    moduli : sequence of Unknown
-        With their truths; those without an estimate count as misses.
+    unknowns : sequence of Unknown
+        At least one, of one kind, with their truths; of one valve or of many.
 
     Returns
     -------
     dict
-        ``n`` moduli, ``without_estimate`` of them, ``inside`` their 95 % intervals,
-        ``inside_prior_alone``, and the relative ``median_error`` of the estimates that there are
-        and of the generic guess for all (``median_error_generic_guess``); errors are None without
-        any estimate.
+        ``n`` unknowns, ``estimated`` of them, ``inside`` their 95 % intervals; ``coverage`` (%),
+        the share of the intervals that hold the truth, with exact 95 % bounds. Errors (``mean
+        error``, ``median error`` of their sizes, of the generic guess for the same and for all) and
+        the ``mean width`` of intervals are in ``unit``: relative to the truth (%) for moduli and
+        factors, otherwise as the unknown is. ``relative width`` is the median over the estimate,
+        ``width over prior`` that of the logarithm's interval over the prior's. None: not known.
     """
-    errors = _errors(moduli)
+    known = [own for own in unknowns if own.estimate is not None]
+    judged = [own.inside for own in unknowns if own.inside is not None]
+    inside, n = sum(judged), len(judged)
+    bounds = share_bounds(inside, n)
+    unit = "" if unknowns[0].is_modulus else unknowns[0].unit
+    errors = _errors(known, unit)
+    sizes = (
+        [abs(error) for error in _errors(map(generic_guess, some), unit)]
+        for some in (known, unknowns)
+    )
+    guess, guess_of_all = (median(each) if each else None for each in sizes)
+    widths = [
+        (own, own.high - own.low) for own in known if own.high is not None and own.low is not None
+    ]
+    ratios = [
+        width / before
+        for own in known
+        if not unit
+        and (width := log_width(own)) is not None
+        and (before := log_width(prior_alone(own)))
+    ]
     return {
-        "n": len(moduli),
-        "without_estimate": sum(one.estimate is None for one in moduli),
-        "inside": sum(one.inside is True for one in moduli),
-        "inside_prior_alone": sum(prior_alone(one).inside is True for one in moduli),
-        "median_error": median(errors) if errors else None,
-        "median_error_generic_guess": median(_errors([generic_guess(one) for one in moduli]))
-        if errors
-        else None,
+        "n": len(unknowns),
+        "estimated": len(known),
+        "inside": inside,
+        "coverage": 100 * inside / n if n else None,
+        "coverage low": 100 * bounds[0] if n else None,
+        "coverage high": 100 * bounds[1] if n else None,
+        "unit": unit or "%",
+        "mean error": mean(errors) if errors else None,
+        "median error": median(map(abs, errors)) if errors else None,
+        GENERIC: guess,
+        f"{GENERIC}, all": guess_of_all,
+        "inside prior": sum(prior_alone(own).inside is True for own in unknowns),
+        "mean width": mean(width * _scale(own, unit) for own, width in widths) if widths else None,
+        "relative width": None
+        if unit or not widths
+        else median(width / (own.estimate or 1.0) for own, width in widths),
+        "width over prior": median(ratios) if ratios else None,
     }
 
 
@@ -158,12 +151,17 @@ def share_bounds(inside: int, n: int) -> tuple[float, float]:
     return low, high
 
 
-def _errors(unknowns: Sequence[Unknown]) -> list[float]:
+def _errors(unknowns: Iterable[Unknown], unit: str) -> list[float]:
     return [
-        abs(one.estimate / one.truth - 1)
-        for one in unknowns
-        if one.truth is not None and one.estimate is not None
+        (own.estimate - own.truth) * _scale(own, unit)
+        for own in unknowns
+        if own.estimate is not None and own.truth is not None
     ]
+
+
+def _scale(unknown: Unknown, unit: str) -> float:
+    """By which errors of an unknown are multiplied: to a share of the truth in %, or 1."""
+    return 1.0 if unit or not unknown.truth else 100.0 / unknown.truth
 
 
 def _is_log(unknown: Unknown) -> bool:

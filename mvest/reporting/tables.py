@@ -41,7 +41,8 @@ class Column:
     low, high : str
         Columns with the ends of its interval: shown as ``value (low to high)``.
     truth : str
-        Column with its true value: an interval that misses it is marked with a cross.
+        Column with its true value, which has a place of its own: an interval that misses it is
+        marked with a cross.
     label : str
         Heading for readers; empty: the name with spaces for underscores.
     hidden : bool
@@ -122,7 +123,7 @@ class Table:
             other
             for name in self.values
             for column in [self._column(name)]
-            for other in (column.std, column.low, column.high, column.truth)
+            for other in (column.std, column.low, column.high)
             if other and other != name
         }
         shown = [n for n in self.values if n not in joined and not self._column(n).hidden]

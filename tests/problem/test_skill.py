@@ -5,7 +5,6 @@ import yaml
 from mvest.problem.record import Unknown
 from mvest.problem.skill import (
     PRIOR_STD,
-    baselines,
     generic_guess,
     log_width,
     prior_alone,
@@ -25,28 +24,46 @@ def answered(truth, estimate, low, high, generic) -> Unknown:
     )  # fmt: skip
 
 
-def test_errors_stand_beside_the_generic_guess_and_runs_lost_count_as_misses():
-    # Errors 10 %, 20 % and 50 %: median 20 %. Generic guesses off by 50 %, 50 %, 0 % and 100 %.
-    asked = [
-        answered(10.0, 11.0, 9.0, 13.0, 5.0),
-        answered(10.0, 8.0, 7.0, 9.0, 15.0),
-        answered(2.0, 3.0, 1.0, 5.0, 2.0),
-        answered(1.0, None, None, None, 2.0),
-    ]
-    assert skill(asked) == {
-        "n": 4,
-        "without_estimate": 1,
-        "inside": 2,
-        "inside_prior_alone": 1,
-        "median_error": pytest.approx(0.2),
-        "median_error_generic_guess": pytest.approx(0.5),
-    }
+ASKED = [
+    answered(10.0, 11.0, 9.0, 13.0, 5.0),
+    answered(10.0, 8.0, 7.0, 9.0, 15.0),
+    answered(2.0, 3.0, 1.0, 5.0, 2.0),
+    answered(1.0, None, None, None, 2.0),
+]
+
+
+def test_errors_stand_beside_the_generic_guess_and_lost_estimates_are_counted():
+    row = skill(ASKED)
+    assert (row["n"], row["estimated"], row["inside"]) == (4, 3, 2)
+    assert row["coverage"] == pytest.approx(200 / 3)
+    # Errors of 10, -20 and 50 %; guesses are off by 50, 50 and 0 %, and by 100 % of what is lost.
+    assert (row["mean error"], row["median error"]) == pytest.approx((40 / 3, 20.0))
+    assert (row["generic guess"], row["generic guess, all"]) == (50.0, 50.0)
+    # Of the priors only that of 2 MPa holds its truth.
+    assert row["inside prior"] == 1
+    # Widths of 4, 2 and 4 over estimates of 11, 8 and 3, and over truths of 10, 10 and 2.
+    assert row["relative width"] == pytest.approx(4 / 11)
+    assert row["mean width"] == pytest.approx((40 + 20 + 200) / 3)
+    prior = 2 * 1.959964 * 0.2
+    assert row["width over prior"] == pytest.approx(np.log(13 / 9) / prior, rel=1e-6)
 
 
 def test_without_an_estimate_there_is_no_error_to_compare():
-    found = skill([answered(1.0, None, None, None, 2.0)])
-    assert (found["n"], found["inside"], found["without_estimate"]) == (1, 0, 1)
-    assert found["median_error"] is found["median_error_generic_guess"] is None
+    row = skill(ASKED[3:])
+    assert (row["n"], row["estimated"], row["inside"], row["inside prior"]) == (1, 0, 0, 0)
+    for column in ("coverage", "coverage low", "median error", "generic guess", "relative width"):
+        assert row[column] is None
+    assert row["generic guess, all"] == 100.0
+
+
+def test_errors_of_displacements_are_in_their_unit():
+    shift = Unknown(
+        name="shift.x", unit="mm", kind="nuisance", prior_mean=0.0, prior_std=1.0, truth=0.1,
+        estimate=-0.2, low=-0.5, high=0.1,
+    )  # fmt: skip
+    row = skill([shift])
+    assert (row["unit"], row["mean error"], row["mean width"]) == ("mm", pytest.approx(-0.3), 0.6)
+    assert row["relative width"] is row["width over prior"] is None
 
 
 def test_what_anyone_could_say():
@@ -87,21 +104,6 @@ def test_scores_are_of_the_logarithm():
 )
 def test_bounds_of_a_share(inside, n, low, high):
     assert share_bounds(inside, n) == pytest.approx((low, high), abs=1e-7)
-
-
-def test_what_stands_below_a_table_of_estimates():
-    rows = [
-        answered(10.0, 11.0, 9.0, 13.0, 5.0),
-        answered(4.0, 8.0, 7.0, 9.0, 5.0),
-        answered(8.0, None, None, None, 5.0),
-    ]
-    guess, before = baselines(rows)
-    # 5 for 10, 4 and 8: 50 %, 25 % and 37.5 %, runs without an estimate included.
-    assert (guess["what"], guess["low"], guess["n"]) == ("generic guess", None, 0)
-    assert guess["median_error"] == pytest.approx(0.375)
-    # 5 within a factor of exp(1.96 x 0.2) = 1.48 of 4, and neither of 10 nor of 8.
-    assert (before["what"], before["inside"], before["n"]) == ("prior alone", 1, 3)
-    assert (before["low"], before["high"]) == pytest.approx((3.38, 7.40), abs=0.01)
 
 
 def test_the_prior_of_tables_is_that_of_the_configuration():

@@ -30,14 +30,14 @@ def test_programs_get_every_column_exactly() -> None:
 def test_readers_get_one_rounded_cell_and_a_cross_where_the_truth_is_outside() -> None:
     cells = [row["E (MPa)"] for row in WHOLE.readable()]
     assert cells == ["6.23 (6.10 to 6.30)", "–", "5.00 (4.80 to 5.20) ✗"]
-    assert set(WHOLE.readable()[0]) == {"E (MPa)", "sd (MPa)", "run", "n"}
+    assert set(WHOLE.readable()[0]) == {"E (MPa)", "sd (MPa)", "truth", "run", "n"}
     spread = table(ROWS, E=Column("MPa", std="sd"))
     assert spread.readable()[0]["E (MPa)"] == "6.23 ± 0.021"
 
 
 def test_no_text_of_a_run_acts() -> None:
     assert "<i>" not in WHOLE.markdown()
-    assert {line.count(" | ") for line in WHOLE.markdown().splitlines()} == {3}
+    assert {line.count(" | ") for line in WHOLE.markdown().splitlines()} == {4}
     assert r"\textbar{}" in WHOLE.latex()
 
 

@@ -32,8 +32,7 @@ FRAME_MEASURES = {
 def unknown_table(unknowns: Iterable[Unknown]) -> Table:
     """A row for each unknown: prior, estimate with its 95 % interval, and truth if it is known."""
     rows = [unknown.model_dump() for unknown in unknowns]
-    if any(row["truth"] is not None for row in rows):
-        rows = [row | {"true_value": row["truth"]} for row in rows]
+    known = any(row["truth"] is not None for row in rows)
     return table(
         rows,
         name=HIDDEN,
@@ -45,6 +44,7 @@ def unknown_table(unknowns: Iterable[Unknown]) -> Table:
         estimate=Column(
             std="std", low="low", high="high", truth="truth", label="estimate (95 % interval)"
         ),
+        truth=Column(label="true value", hidden=not known),
         bound=HIDDEN,
     )
 

@@ -1,0 +1,158 @@
+"""Tables and figure of what estimates are worth beside the generic guess and the prior alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.skill import GENERIC, skill
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY
+from mvest.reporting.tables import Column, Table, table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "GENERIC",
+    "VERDICTS",
+    "interval",
+    "interval_columns",
+    "moduli_figure",
+    "skill_table",
+    "stated",
+    "trust_of",
+    "verdict_table",
+]
+
+VERDICTS = (TRUSTWORTHY, DOUBTFUL, NONE)
+COLOURS = {TRUSTWORTHY: "#2b6ca3", DOUBTFUL: "#d08a2e", NONE: "#a9a9a9", "": "0.2"}
+"""Of verdicts in figures."""
+
+COLUMNS = {
+    "n": Column(),
+    "estimated": Column(),
+    "inside": Column(label="inside the interval"),
+    "coverage": Column("%", ".0f", low="coverage low", high="coverage high"),
+    "coverage low": Column("%"),
+    "coverage high": Column("%"),
+    "unit": Column(label="unit of errors"),
+    "mean error": Column(digits=".2f"),
+    "median error": Column(digits=".2f", label="median size of the error"),
+    GENERIC: Column(digits=".2f", label="the same of the generic guess"),
+    f"{GENERIC}, all": Column(digits=".2f", hidden=True),
+    "inside prior": Column(label="inside the prior's interval"),
+    "mean width": Column(digits=".2f", hidden=True),
+    "relative width": Column(digits=".2f", label="interval / estimate"),
+    "width over prior": Column(digits=".2f", label="interval / prior's"),
+}
+
+
+def trust_of(estimate: EstimateRecord) -> str:
+    """The verdict in a word: ``none`` without an estimate, empty where it was not judged."""
+    if not estimate.is_stated:
+        return NONE
+    return "" if estimate.verdict is None else estimate.verdict.trust
+
+
+def stated(estimate: EstimateRecord) -> list[Unknown]:
+    """The unknowns of the filter, without numbers where none may be stated."""
+    nothing: Mapping[str, None] = dict.fromkeys(("estimate", "std", "low", "high"))
+    return [
+        own if estimate.is_stated else own.model_copy(update=nothing) for own in estimate.parameters
+    ]
+
+
+def interval(label: str, unknown: Unknown | None) -> dict[str, Any]:
+    """Cells of an estimate with its 95 % interval."""
+    return {
+        label: unknown and unknown.estimate,
+        f"{label} low": unknown and unknown.low,
+        f"{label} high": unknown and unknown.high,
+        f"{label} inside": unknown and unknown.inside,
+    }
+
+
+def interval_columns(label: str, *, hidden: bool = False) -> dict[str, Column]:
+    """Columns of such cells in MPa; the truth has a column of its own."""
+    low, high, inside = (f"{label} {part}" for part in ("low", "high", "inside"))
+    return {
+        label: Column("MPa", low=low, high=high, truth="truth", hidden=hidden),
+        **dict.fromkeys((low, high), Column("MPa", hidden=True)),
+        inside: Column(hidden=True),
+    }
+
+
+def skill_table(by: str, groups: Mapping[str, Sequence[Unknown]]) -> Table:
+    """A row for each group of unknowns, see `mvest.problem.skill.skill`; none for empty ones.
+
+    Parameters
+    ----------
+    by : str
+        Name of the first column.
+    groups : mapping
+        Value of the first column -> unknowns.
+    """
+    rows = [{by: name, **skill(unknowns)} for name, unknowns in groups.items() if unknowns]
+    return table(rows, **{by: Column(), **COLUMNS})
+
+
+def verdict_table(estimates: Sequence[EstimateRecord]) -> Table:
+    """What a verdict is worth: the skill of all moduli, stated or not, by verdict."""
+    groups = {
+        str(trust): [own for one in estimates if trust_of(one) == trust for own in one.moduli]
+        for trust in VERDICTS
+    }
+    return skill_table("verdict", groups)
+
+
+def moduli_figure(groups: Mapping[str, Sequence[tuple[Unknown, str]]]) -> Figure:
+    """Estimates over their truths with 95 % intervals, in the colour of their verdicts.
+
+    There is a panel for each modulus and a band for each group, in which truths rise downwards.
+
+    Parameters
+    ----------
+    groups : mapping
+        Name -> moduli whose truths are known, each with the verdict in a word.
+    """
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(own.name for each in groups.values() for own, _ in each))
+    most = max((len(each) for each in groups.values()), default=0) / max(len(names), 1)
+    height = len(groups) * max(0.6, 0.11 * most) + 1.2
+    drawn = Figure(figsize=(4.2 * max(len(names), 1) + 1.6, height), layout="constrained")
+    panels = drawn.subplots(1, max(len(names), 1), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=False):
+        for k, each in enumerate(groups.values()):
+            rows = [(own, trust) for own, trust in each if own.name == name]
+            rows.sort(key=lambda row: row[0].truth or 0.0)
+            for j, (own, trust) in enumerate(rows):
+                _draw_modulus(axes, k + 0.8 * ((j + 0.5) / len(rows) - 0.5), own, trust)
+        axes.axvline(1.0, color="0.3", lw=0.8, zorder=0)
+        axes.set_xscale("log")
+        axes.set_xticks([0.5, 0.7, 1.0, 1.5, 2.0], labels=["0.5", "0.7", "1", "1.5", "2"])
+        axes.minorticks_off()
+        axes.set_xlabel(f"{name.replace('.', ' ')}, estimate / truth")
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_yticks(range(len(groups)), labels=list(groups))
+    panels[0].invert_yaxis()
+    for trust in VERDICTS:
+        panels[-1].plot([], [], "o-", color=COLOURS[trust], ms=4, lw=1.3, label=trust)
+    panels[-1].plot([], [], "|", color="0.5", ms=8, label=GENERIC)
+    panels[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return drawn
+
+
+def _draw_modulus(axes: Any, at: float, own: Unknown, trust: str) -> None:
+    """One estimate over its truth, and the generic guess."""
+    assert own.truth is not None
+    colour = COLOURS[trust]
+    if own.prior_mean is not None:
+        axes.plot(own.prior_mean / own.truth, at, "|", color="0.6", ms=5, zorder=1)
+    if own.estimate is None or own.low is None or own.high is None:
+        axes.text(1.0, at, "no estimate", fontsize=7, ha="center", va="center")
+        return
+    axes.plot([own.low / own.truth, own.high / own.truth], [at, at], color=colour, lw=1.3)
+    fill = "white" if trust == NONE else colour
+    axes.plot(own.estimate / own.truth, at, "o", color=colour, mfc=fill, ms=3.5)
