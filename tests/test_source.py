@@ -9,7 +9,7 @@ import experiments
 import mvest
 from experiments.common.building import anatomy, closure, patient_store
 from experiments.common.building.truth import MADE_BY
-from experiments.studies.imaged_patient import study as imaged_patient
+from experiments.studies import imaged_patient
 from experiments.studies.imaging.detectors import SAMPLED_BY
 from mvest.errors import InputError
 from mvest.simulation.motion.population import draw_population

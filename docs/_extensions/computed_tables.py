@@ -15,18 +15,16 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from study_pages import comment_of
 
-from experiments.common.cases.findings import Findings as OfPatients
-from experiments.common.cases.skill import median_errors
 from experiments.common.config import PARTS, Config
 from experiments.common.schema import ranges
+from experiments.common.skill import GENERIC, skill_table, stated
 from experiments.common.study import load_settings, study_names
 from experiments.results.keep import records_of
-from experiments.studies.imaged_patient.findings import Findings as OfVolumes
-from experiments.studies.imaged_patient.report import moduli_of_volumes
-from experiments.studies.patient.report import moduli_of_patients
 from mvest.mechanics.parameters import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
+
+LEAFLETS = ("anterior", "posterior")
 
 NOT_SETTINGS = ("experiment", "sweep", "hydra", "launcher", "imaging")
 """Groups of the configuration that other pages are about."""
@@ -94,21 +92,17 @@ def sweep_list() -> str:
 
 def guess_comparison() -> str:
     """Median errors of estimates, and of guessing the generic moduli for everybody."""
-    leaflets = ("anterior", "posterior")
     rows = []
-    results = ROOT / "results"
-    for title, records, moduli_of in (
-        ("known geometry", records_of(results, "population", OfPatients), moduli_of_patients),
-        ("simulated volumes", records_of(results, "volume", OfVolumes), moduli_of_volumes),
-    ):
-        moduli = moduli_of(records.values())
-        cells = [f"{title}, {len(records)} virtual patients"]
-        for wanted in ((leaflets[0],), (leaflets[1],), leaflets):
-            errors = median_errors([one for one in moduli if one.leaflet in wanted])
-            assert errors is not None
-            cells.append(f"{100 * errors[0]:.1f} / {100 * errors[1]:.1f}")
-        rows.append(cells)
-    head = ["median size of the error: estimate / generic guess (%)", *leaflets, "both"]
+    for title, name in (("known geometry", "population"), ("simulated volumes", "volume")):
+        kept = records_of(ROOT / "results", name)
+        assert kept is not None
+        estimates = [record.estimates[0] for record in kept.records.values()]
+        moduli = [own for one in estimates for own in stated(one) if own.is_modulus]
+        groups = {leaflet: [own for own in moduli if own.region == leaflet] for leaflet in LEAFLETS}
+        table = skill_table("leaflet", groups | {"both": moduli})
+        cells = [f"{row['median error']:.1f} / {row[f'{GENERIC}, all']:.1f}" for row in table.rows]
+        rows.append([f"{title}, {len(estimates)} virtual patients", *cells])
+    head = ["median size of the error: estimate / generic guess (%)", *LEAFLETS, "both"]
     return markdown(head, rows)
 
 

@@ -2,8 +2,8 @@
 
 A page belongs to a table of ``results/``. Its title and commands come from the experiments that
 name that table, its numbers and figures from the files of that name, included as they are. Notes in
-``docs/study_notes/NAME.md`` are optional; their header gives the page a title, a group, its place
-in it and further files (``title``, ``group``, ``order``, ``results``). No study is listed here.
+``docs/study_notes/NAME.md`` are optional; their header gives the page a title, a group and its
+place in it (``title``, ``group``, ``order``). No study is listed here.
 """
 
 from __future__ import annotations
@@ -44,14 +44,13 @@ class Page:
     group: str = LAST
     order: int = 1000
     notes: str = ""
-    adopts: tuple[str, ...] = ()
     experiments: list[Experiment] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
 
     def owns(self, stem: str) -> bool:
         """Whether a file of ``results/`` is of this page."""
-        return any(stem == own or stem.startswith(f"{own}_") for own in (self.name, *self.adopts))
+        return stem == self.name or stem.startswith(f"{self.name}_")
 
 
 def comment_of(text: str) -> str:
@@ -104,7 +103,6 @@ def read_notes(folder: Path) -> list[Page]:
                 data["group"],
                 data["order"],
                 body.strip(),
-                tuple(data.get("results", ())),
             )
         )
     return pages

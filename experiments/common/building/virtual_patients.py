@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from mvest.errors import ConfigurationError, GeometryError
+from mvest.quantities import Factor, Length, Modulus
 from mvest.simulation.virtual_patient import Deviations, PatientSimulation, draw_hidden
 from mvest.valve.anatomy.template import Template
 from mvest.valve.anatomy.variation import vary
@@ -34,13 +35,13 @@ class PatientSettings:
     name: str
     description: str
     world: str = ""  # what else is otherwise than its case says, in words
-    moduli: dict[str, float] = field(default_factory=dict)  # MPa
-    moduli_spread: float = 0.0  # SD of the logarithm by which they are drawn about these
-    variation: float = 0.0  # size of the random variation of the anatomy; 0: as configured
+    moduli: dict[str, Modulus] = field(default_factory=dict)  # MPa
+    moduli_spread: Factor = 0.0  # SD of the logarithm by which they are drawn about these
+    variation: Factor = 0.0  # size of the random variation of the anatomy; 0: as configured
     simulation: PatientSimulation = field(default_factory=PatientSimulation)
     deviations: Deviations = field(default_factory=Deviations)
-    paper_moduli: tuple[float, ...] = ()  # MPa, of the paper's patient
-    paper_distance_mm: tuple[float, ...] = ()  # generic, personalised
+    paper_moduli: tuple[Modulus, ...] = ()  # MPa, of the paper's patient
+    paper_distance_mm: tuple[Length, ...] = ()  # generic, personalised
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +49,7 @@ class EchoSettings:
     """How a virtual patient who is to be imaged moves, and how the volume is simulated."""
 
     spread: str = "training"  # of acquisitions; shifted: what no detector was trained on
-    tip_motion_mm: tuple[float, float] = (1.0, 3.0)  # of papillary tips
+    tip_motion_mm: tuple[Length, Length] = (1.0, 3.0)  # of papillary tips
 
 
 def require_patient(patient: PatientSettings | None) -> PatientSettings:

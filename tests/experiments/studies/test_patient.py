@@ -2,30 +2,26 @@
 
 import json
 import shutil
-from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from experiments.common.building import patient_store
 from experiments.common.building.virtual_patients import PatientSettings
-from experiments.common.cases.blind import SECRET, read_estimate
+from experiments.common.cases.blind import SECRET, read_estimate, write_estimate
 from experiments.common.cases.own_case import read_configured, run_case
 from experiments.common.cases.settings import PersonalSettings
-from experiments.common.records.record import NOT_GATED, stamp, write_record
+from experiments.common.records.record import NOT_GATED, stamp
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.studies.patient import study as patient
-from experiments.studies.patient.settings import Settings
-from experiments.studies.patient.study import STUDY, expect_patient, reveal, run_patient
+from experiments.studies import patient
+from experiments.studies.patient import Settings, expect_patient, reveal, run_patient
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, GeometryError, InputError
 from mvest.problem.verdict import ONE_STATE
-from mvest.provenance import write_json
-from mvest.reporting.case.fields import read_case_fields
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.experiments.configured import composed, plain
-from tests.experiments.studies.made_up_patients import an_outcome
+from tests.experiments.studies.made_up_patients import a_result
 from tests.made_up_closure import TRUE, made_up_case, use
 
 
@@ -75,21 +71,24 @@ def simulated(monkeypatch):
 def in_process(monkeypatch):
     """Let the estimating process be this one, and the closure a formula."""
     use(monkeypatch)
-    monkeypatch.setattr(
-        "experiments.common.cases.findings.clinical_measurements", lambda *arguments: {}
-    )
-    seen = []
+    monkeypatch.setattr("mvest.personalisation.record.clinical_measurements", lambda *arguments: {})
 
     def blindly(values, folder, case, sealed, gate):
         given = {k: v for k, v in values.items() if k not in SECRET}
         personal = build(PersonalSettings, given["personal"])
-        outcome = run_case(given, personal, read_configured(str(case)), folder, gate=gate)
-        write_json(folder / "estimate.json", asdict(outcome))
-        seen.append((folder, sealed))
+        result = run_case(given, personal, read_configured(str(case)), gate=gate)
+        write_estimate(folder, result)
         return read_estimate(folder)
 
     monkeypatch.setattr(patient, "estimate_blindly", blindly)
-    return seen
+
+
+@pytest.fixture
+def out(tmp_path):
+    """Folder of a job."""
+    folder = tmp_path / "job"
+    folder.mkdir()
+    return folder
 
 
 def test_a_patient_is_simulated_once(tmp_path, simulated):
@@ -169,118 +168,107 @@ def test_a_study_of_patients_needs_one():
 
 
 def test_nothing_is_revealed_before_the_estimation_has_ended(
-    tmp_path, simulated, in_process, monkeypatch
+    tmp_path, out, simulated, in_process, monkeypatch
 ):
-    out = tmp_path / "job"
-    out.mkdir()
     files = {}
     true_reveal = patient.reveal
 
     def watch(estimated, *rest):
         files.update({p.name: p.read_bytes() for p in out.iterdir()})
-        assert all(row.truth is None for row in estimated.findings.case.unknowns)
+        (estimate,) = estimated.estimates
+        for one in (estimate, *estimate.alternatives.values()):
+            assert all(row.truth is None for row in one.unknowns)
         return true_reveal(estimated, *rest)
 
     monkeypatch.setattr(patient, "reveal", watch)
     values = config_of(tmp_path)
-    outcome = run(values, out)
+    result = run(values, out)
     assert set(files) == {"estimate.json", "fields.npz"}
     hidden = json.loads(files["estimate.json"])
-    assert hidden["findings"]["repeats"][0]["relative_error"] is None
-    assert hidden["findings"]["repeats"][0]["seed"] is None
-    assert hidden["findings"]["revealed"] is None
+    # The priors and the settings of the mechanics are given to everyone.
+    del hidden["estimate"]["details"]["settings"]
     for value in (6.28, 2.61, *TRUE.values()):
         assert value not in leaves(hidden)
     # What was estimated did not change when the truth came.
-    revealed = json.loads(json.dumps(asdict(outcome)))["findings"]
-    for key in ("estimate", "std", "iterates"):
-        assert revealed["repeats"][0][key] == hidden["findings"]["repeats"][0][key]
-    for key in ("narrow", "objective"):
-        assert revealed["case"][key] == hidden["findings"]["case"][key]
-    assert stamp(values, "hash", outcome, 0.0).provenance.seed == 1
-    assert outcome.findings.revealed.paper_moduli == (6.28, 2.61)
-    assert outcome.findings.revealed.paper_distance_mm == (1.5, 1.47)
+    (estimate,) = result.estimates
+    before = hidden["estimate"]
+    assert [row.estimate for row in estimate.unknowns] == [
+        row["estimate"] for row in before["unknowns"]
+    ]
+    for key in ("iterates", "objective", "verdict", "innovation"):
+        assert json.loads(estimate.model_dump_json())[key] == before[key]
+    assert stamp(values, "hash", result, 0.0).provenance.seed == 1
+    numbers = result.numbers
+    assert (numbers["paper_anterior_MPa"], numbers["paper_posterior_MPa"]) == (6.28, 2.61)
+    assert (numbers["paper_generic_mm"], numbers["paper_personalised_mm"]) == (1.5, 1.47)
 
 
 def leaves(value):
     if isinstance(value, dict):
-        # The priors and the settings of the mechanics are given to everyone.
-        return {v for k, item in value.items() if k != "settings" for v in leaves(item)}
+        return {v for item in value.values() for v in leaves(item)}
     if isinstance(value, list):
         return {v for item in value for v in leaves(item)}
     return {value}
 
 
-def test_what_is_revealed_is_right(tmp_path, simulated, in_process, monkeypatch):
-    out = tmp_path / "job"
-    out.mkdir()
-    values = config_of(tmp_path)
+def test_what_is_revealed_is_right(tmp_path, out, simulated, in_process, monkeypatch):
     monkeypatch.setattr(patient, "gate_of", lambda values: "NOT passed on 54 x 6 hex18")
-    outcome = run(values, out)
-    assert outcome.gate == "NOT passed on 54 x 6 hex18"
-    assert ONE_STATE in [ground.check for ground in outcome.findings.case.verdict.grounds]
-    write_record(tmp_path / "record.json", stamp(values, "hash", outcome, 0.0))
-    assert outcome.status == "converged"
-    case, (estimate,) = outcome.findings.case, outcome.findings.repeats
-    for row in case.unknowns:
+    result = run(config_of(tmp_path), out)
+    (estimate,) = result.estimates
+    assert result.gate == "NOT passed on 54 x 6 hex18"
+    assert ONE_STATE in [ground.check for ground in estimate.verdict.grounds]
+    assert (result.status, estimate.seed) == ("converged", 1)
+    assert result.numbers["anatomies_drawn"] == 1
+    for row in estimate.parameters:
         assert row.truth == TRUE[row.name]
         assert row.inside is (row.low <= row.truth <= row.high)
-    for other in (case.without_nuisances, case.as_in_the_paper):
-        assert [row.truth for row in other.parameters] == [5.1, 2.6]
-        assert all(isinstance(row.inside, bool) for row in other.parameters)
+    for other in estimate.alternatives.values():
+        assert [row.truth for row in other.moduli] == [5.1, 2.6]
+        assert all(isinstance(row.inside, bool) for row in other.moduli)
     # Nuisances are far off here, so that an estimation without them is wrong and sure of it.
-    assert not all(row.inside for row in case.without_nuisances.parameters)
-    np.testing.assert_allclose(
-        estimate.relative_error, np.array(estimate.estimate) / [5.1, 2.6] - 1
-    )
-    assert estimate.seed == 1
-    moduli = {(row.region, row.name): row for row in case.moduli}
+    assert not all(row.inside for row in estimate.alternatives["moduli_only"].moduli)
     for region, true in (("anterior", 5.1), ("posterior", 2.6)):
-        own = moduli[region, "E_f"]
+        own = estimate.unknown(f"E_f.{region}")
         assert own.truth == pytest.approx(true)
         for name in ("E_perp", "G"):
-            row = moduli[region, name]
+            row = estimate.unknown(f"{name}.{region}")
             assert row.truth / own.truth == pytest.approx(row.estimate / own.estimate)
-    fields = read_case_fields(out / "fields.npz")
-    truth = made_up_case().frames
-    for k, row in enumerate(case.distances):
-        gap = np.linalg.norm(fields.fitted[k] - fields.truth[k], axis=1)
-        assert row.to_truth.personalised.mean == pytest.approx(gap.mean(), abs=1e-4)
-        assert row.to_truth.personalised.max == pytest.approx(gap.max(), abs=1e-4)
-        assert row.to_truth.generic.mean > row.to_truth.personalised.mean
+    truth, arrays = made_up_case().frames, result.arrays
+    for k, fit in enumerate(estimate.frames):
+        gap = np.linalg.norm(arrays["fitted"][k] - arrays["truth"][k], axis=1)
+        assert fit.personalised_to_truth.mean == pytest.approx(gap.mean(), abs=1e-4)
+        assert fit.personalised_to_truth.max == pytest.approx(gap.max(), abs=1e-4)
+        assert fit.generic_to_truth.mean > fit.personalised_to_truth.mean
         # The truth is where it would have been seen without errors, of this frame and no other.
         same = np.linalg.norm(truth[k + 1].vertices - truth[2 - k].vertices, axis=1)
         assert same.max() > 0.5
-        raw = np.load(out / "fields.npz")["truth"][k]
-        np.testing.assert_allclose(raw, truth[k + 1].vertices, atol=1e-4)
+        np.testing.assert_allclose(arrays["truth"][k], truth[k + 1].vertices, atol=1e-4)
+    # Scores in the posterior's covariance, over the number of unknowns.
+    assert 0.0 < result.numbers["nees"] < 100.0
 
 
-def test_revealing_leaves_what_it_was_given(tmp_path, simulated, in_process):
+def test_revealing_leaves_what_it_was_given(tmp_path, out, simulated, in_process):
     values = config_of(tmp_path)
     place = make_patient(values)
-    out = tmp_path / "job"
-    out.mkdir()
     estimated = patient.estimate_blindly(values, out, place.case, place.hidden, NOT_GATED)
-    before = json.dumps(asdict(estimated))
-    revealed = reveal(estimated, place, out / "fields.npz", settings_in(values), 1)
-    assert json.dumps(asdict(estimated)) == before
-    assert [row.truth for row in revealed.findings.case.unknowns[:2]] == [5.1, 2.6]
+    before, names = estimated.estimates[0].model_dump_json(), set(estimated.arrays)
+    revealed = reveal(estimated, place, settings_in(values), 1)
+    assert estimated.estimates[0].model_dump_json() == before
+    assert set(estimated.arrays) == names
+    assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [5.1, 2.6]
 
 
-def test_a_failed_estimation_is_revealed_too(tmp_path, simulated, in_process, monkeypatch):
+def test_a_failed_estimation_is_revealed_too(tmp_path, out, simulated, in_process, monkeypatch):
     use(monkeypatch, fails_above=4.0)
-    out = tmp_path / "job"
-    out.mkdir()
-    values = config_of(tmp_path, "figures=true")
-    outcome = run(values, out)
-    record = stamp(values, "hash", outcome, 0.0)
-    write_record(tmp_path / "record.json", record)
-    assert outcome.status == "failed"
-    assert STUDY.write_run(out, record) == [out / "unknowns.csv"]
-    rows = outcome.findings.case.unknowns
+    values = config_of(tmp_path)
+    result = run(values, out)
+    assert result.status == "failed"
+    rows = result.estimates[0].parameters
     assert [row.truth for row in rows] == [TRUE[row.name] for row in rows]
     assert all(row.inside is None for row in rows)
-    assert outcome.findings.repeats[0].relative_error is None
+    assert result.numbers["nees"] is None
+    kept = patient.keep(stamp(values, "hash", result, 0.0))
+    assert kept.estimates[0].moduli == result.estimates[0].moduli
 
 
 def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
@@ -288,7 +276,7 @@ def test_a_truth_that_is_damaged_is_said(tmp_path, simulated, in_process):
     place = make_patient(values)
     (place.hidden / "positions.npz").write_bytes(b"nothing")
     with pytest.raises(InputError, match="does not hold what a patient hides"):
-        reveal(an_outcome(5.0, 2.0), place, tmp_path / "fields.npz", settings_in(values), 1)
+        reveal(a_result(5.0, 2.0), place, settings_in(values), 1)
 
 
 SMALLEST = (
@@ -316,17 +304,14 @@ def test_the_estimate_is_the_same_where_there_is_no_truth_to_see(tmp_path):
     for name in ("one", "two"):
         out = tmp_path / name
         out.mkdir()
-        found.append(patient.estimate_blindly(config, out, place.case, place.hidden))
+        result = patient.estimate_blindly(config, out, place.case, place.hidden)
+        found.append(result.estimates[0])
         if name == "one":
-            revealed = reveal(found[0], place, out / "fields.npz", settings_in(config), 1)
+            revealed = reveal(result, place, settings_in(config), 1)
             shutil.rmtree(place.hidden)
-    one, two = (replace(outcome.findings.repeats[0], seconds=0.0) for outcome in found)
+    one, two = (record.model_copy(update={"seconds": 0.0, "details": {}}) for record in found)
     assert one == two
-    one, two = (outcome.findings.case for outcome in found)
-    assert (one.objective, one.distances, one.measurements) == (
-        two.objective, two.distances, two.measurements
-    )  # fmt: skip
-    assert [row.truth for row in revealed.findings.case.unknowns[:2]] == [6.28, 2.61]
+    assert [row.truth for row in revealed.estimates[0].unknowns[:2]] == [6.28, 2.61]
 
 
 def test_a_check_speaks_of_the_patients_case_and_reveals_nothing(tmp_path, simulated, monkeypatch):

@@ -1,38 +1,34 @@
-"""Tables 2 and 3, Figure 3 and the population, from made-up records."""
+"""Tables 2 and 3, Figure 3, the population and the scenarios, from made-up records."""
 
 import copy
-import json
 import shutil
-from dataclasses import asdict, replace
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-from matplotlib.figure import Figure
 
-from experiments.common.cases.report import case_text, write_case_run
-from experiments.results.keep import publish
-from experiments.studies.patient import tables as patient_tables
-from experiments.studies.patient.population import (
-    population_figure,
-    population_frame,
-    write_population_tables,
-)
-from experiments.studies.patient.report import KEPT_ARRAYS
-from experiments.studies.patient.study import STUDY
-from experiments.studies.patient.tables import (
-    figure3,
-    in_order,
-    table2,
-    table3,
-    write_patient_tables,
+from experiments.common.records.record import Record
+from experiments.common.study import Results
+from experiments.results.keep import publish, records_of
+from experiments.studies import patient as study
+from experiments.studies.patient import (
+    KEPT_ARRAYS,
+    STUDY,
+    ecdf_band,
+    figure,
+    figure_3,
+    keep,
+    ranks_figure,
+    summary,
 )
 from mvest.errors import InputError
-from mvest.problem.verdict import NONE, TRUSTWORTHY, Ground, Verdict
+from mvest.problem.record import Unknown
+from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
 from mvest.reporting.case.fields import read_case_fields
+from tests.experiments.studies.made_up import SOURCE
 from tests.experiments.studies.made_up_patients import (
-    TRUTH,
     alone,
     distances,
     lost_patient,
@@ -42,24 +38,18 @@ from tests.experiments.studies.made_up_patients import (
 )
 from tests.reporting.case.made_up_case import arrays
 
-PLACE, DRAWN = Path("records") / "patients", Path("records") / "population"
+
+def of(records: Sequence[Record]) -> Results:
+    return Results({f"{k:02}": record for k, record in enumerate(records)})
 
 
-def by_name(records) -> dict:
-    """As the tables take them: in their order."""
-    return in_order({record.findings.case.about.name: record for record in records})
-
-
-def published(results, name, record, fields):
-    """Publish a run that left ``fields`` in its folder."""
-    folder = results / "run"
-    folder.mkdir(exist_ok=True)
-    shutil.copy(fields, folder / "fields.npz")
-    return publish(STUDY, results, {name: (record, folder)})
+def rows(records: Sequence[Record], name: str = "") -> list[dict[str, Any]]:
+    """The rows of a table for readers."""
+    return summary(of(records))[name].rows
 
 
 @pytest.fixture(scope="module")
-def fields_file(tmp_path_factory):
+def fields_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("fields") / "fields.npz"
     stored = arrays(np.random.default_rng(1))
     known = {k: np.nan_to_num(v, nan=1.0) for k, v in stored.items() if k.startswith("distance")}
@@ -67,275 +57,328 @@ def fields_file(tmp_path_factory):
     return path
 
 
-def test_table2_lays_estimates_beside_the_truth():
-    (anterior, posterior) = table2([patient()]).to_dict("records")
+# -- Tables 2 and 3 -------------------------------------------------------------------------------
+def test_table_2_lays_estimates_beside_the_truth():
+    (anterior, posterior) = rows([patient()], "table_2")
     assert anterior["patient"] == "normal_small"
     assert (anterior["modulus"], posterior["modulus"]) == ("E_f.anterior", "E_f.posterior")
-    assert anterior["hidden truth [MPa]"] == 6.0
-    assert anterior["estimate [MPa]"] == 5.8
-    assert (anterior["95 % low [MPa]"], anterior["95 % high [MPa]"]) == pytest.approx((5.3, 6.3))
-    assert anterior["inside"]
+    assert (anterior["truth"], anterior["estimate"]) == (6.0, 5.8)
+    assert (anterior["estimate low"], anterior["estimate high"]) == pytest.approx((5.3, 6.3))
+    assert anterior["estimate inside"]
     assert anterior["without nuisances inside"]
     assert not posterior["without nuisances inside"]
-    assert posterior["without nuisances [MPa]"] == 3.1
-    assert posterior["paper's filter [MPa]"] == 4.0
+    assert posterior["without nuisances"] == 3.1
+    assert posterior["paper's filter"] == 4.0
     assert posterior["paper's filter ended"] == "no rounds left"
-    assert [r["paper's estimate for its patient [MPa]"] for r in (anterior, posterior)] == [
-        6.28, 2.61
-    ]  # fmt: skip
+    assert (anterior["paper"], posterior["paper"]) == (6.28, 2.61)
+    shown = summary(of([patient()]))["table_2"].readable()[1]
+    assert shown["without nuisances (MPa)"] == "3.1 (2.6 to 3.6) ✗"
+    assert shown["truth (MPa)"] == "2"
 
 
-def test_table3_says_how_much_closer_and_where_the_truth_is():
-    closed, late = table3([patient()]).to_dict("records")
+def test_table_3_says_how_much_closer_and_where_the_truth_is():
+    closed, late = rows([patient()], "table_3")
     # 2.0 mm to 0.5 mm is three quarters; 1.0 mm to 0.8 mm a fifth.
-    assert closed["closer [%]"] == pytest.approx(75.0)
-    assert late["closer [%]"] == pytest.approx(20.0)
-    assert (closed["shown to the filter"], late["shown to the filter"]) == (True, False)
-    assert closed["registered mean [mm]"] == 1.5
-    assert closed["personalised to the truth [mm]"] == 0.25
+    assert closed["closer"] == pytest.approx(75.0)
+    assert late["closer"] == pytest.approx(20.0)
+    assert (closed["seen"], late["seen"]) == (True, False)
+    assert closed["registered"] == 1.5
+    assert closed["personalised to truth"] == 0.25
     # The paper's distances are of the frame that its filter was shown.
-    assert closed["paper generic [mm]"] == 1.5
-    assert pd.isna(late["paper generic [mm]"])
+    assert (closed["paper generic"], late["paper generic"]) == (1.5, None)
 
 
-def test_the_words_count_what_the_tables_hold(tmp_path):
-    usual = patient().findings.case
+def test_coverage_and_distances_are_counted():
+    usual = patient().estimates[0]
     other = patient(
         "normal_large",
         unknowns=(*moduli(5.8, 4.0), *usual.unknowns[2:]),
-        distances=(distances("closed", True, 1.0, 0.9, 1.2), usual.distances[1]),
+        frames=(distances("closed", True, 1.0, 0.9, 1.2), usual.frames[1]),
     )
-    write_patient_tables(tmp_path, by_name([patient(), other]), {})
-    second = (tmp_path / "table2.md").read_text()
-    assert "contains the truth for 3 of 4 moduli" in second
-    assert "without nuisances for 2 of 4" in second
-    assert "paper's filter for 0 of 4" in second
-    # Widths of 1 MPa over 5.8, 2.1, 5.8 and 4.0 MPa: 0.17 to 0.48, mean 0.267.
-    assert "over the estimate: 0.17 to 0.48, mean 0.27" in second
-    # (1 - 0.3/0.4 + 1 - 0.1/0.4) / 2 = 50 %, and 5 %: the most first.
-    assert "on average: pressure known by 50 %; registration known by 5 %." in second
-    assert second.count("✗") == 1 + 2 + 4
-    assert "Simulated valves" in second
-    third = (tmp_path / "table3.md").read_text()
+    found = {row["estimation"]: row for row in rows([patient(), other], "moduli")}
+    assert (found["with nuisances"]["inside"], found["with nuisances"]["n"]) == (3, 4)
+    assert found["without nuisances"]["inside"] == 2
+    # Its numbers count although it has not converged: Table 2 shows them.
+    paper = found["paper's filter"]
+    assert (paper["inside"], paper["estimated"]) == (0, 4)
+    # Errors of 3.3, 5, 3.3 and 100 %; guessing 1 for 6 and 2 is off by 83 and 50 %.
+    assert found["with nuisances"]["median error"] == pytest.approx((100 * 0.2 / 6 + 5) / 2)
+    assert found["with nuisances"]["generic guess"] == pytest.approx(200 / 3)
+    by_frame = {row["frames"]: row for row in rows([patient(), other], "distances")}
     # 75 % and -20 %: closer in one of two, 27.5 % on average.
-    assert "shown: personalised closer than generic in 1 of 2, by 28 % on average" in third
-    assert "laid rigidly on the closed frame in 1." in third
-    assert "not shown: personalised closer than generic in 2 of 2, by 20 % on average" in third
-    assert "laid rigidly on the closed frame in 0." in third
+    seen, held = by_frame["shown to the filter"], by_frame["held out"]
+    assert (seen["closer than generic"], seen["closer by"]) == (1, pytest.approx(27.5))
+    assert (seen["closer than registered"], held["closer than registered"]) == (1, 0)
+    assert (held["closer than generic"], held["closer by"]) == (2, pytest.approx(20.0))
+    assert seen["personalised to truth"] == pytest.approx(0.425)
 
 
-def test_patients_come_in_their_order_and_others_by_name(tmp_path):
+def test_what_would_narrow_an_interval_comes_with_the_most_first():
+    # (1 - 0.3/0.4 + 1 - 0.1/0.4) / 2 = 50 %, and 5 %.
+    found = rows([patient()], "narrower")
+    assert [(row["if known"], round(row["narrower by"], 6)) for row in found] == [
+        ("pressure known", 50.0),
+        ("registration known", 5.0),
+    ]
+
+
+def test_the_five_patients_come_in_their_order_and_others_by_name():
     names = ["zebra", "prolapse", "aardvark", "normal_small", "fibroelastic"]
-    assert list(by_name(patient(name) for name in names)) == [
-        "normal_small", "prolapse", "fibroelastic", "aardvark", "zebra"
-    ]  # fmt: skip
+    found = [row["patient"] for row in rows([patient(name) for name in names], "table_2")[::2]]
+    assert found == ["normal_small", "prolapse", "fibroelastic", "aardvark", "zebra"]
 
 
-@pytest.mark.parametrize(
-    "records", [[lost_patient()], [patient(), lost_patient()]], ids=["alone", "beside"]
-)
-def test_a_patient_without_an_estimate_is_in_the_tables(tmp_path, records):
-    write_patient_tables(tmp_path, by_name(records), {})
-    text = (tmp_path / "table2.md").read_text()
-    assert "prolapse" in text
-    assert "nan" not in text
-    assert "prolapse" in (tmp_path / "table2.csv").read_text()
-    if len(records) == 2:
-        assert "contains the truth for 2 of 2 moduli" in text
-        assert "prolapse" not in (tmp_path / "table3.md").read_text()
-    else:
-        assert "No estimation of these patients ended with moduli." in text
+def test_a_patient_without_an_estimate_is_in_the_tables():
+    records = [patient(), lost_patient()]
+    found = rows(records, "table_2")
+    assert [row["estimate"] for row in found] == [5.8, 2.1, None, None]
+    assert found[2]["verdict"] == NONE
+    (with_nuisances, *_) = rows(records, "moduli")
+    assert (with_nuisances["n"], with_nuisances["estimated"], with_nuisances["inside"]) == (4, 2, 2)
+    assert {row["patient"] for row in rows(records, "table_3")} == {"normal_small"}
+    assert rows([lost_patient()], "table_3") == []
 
 
-def test_moduli_whose_verdict_is_none_are_not_stated(tmp_path):
+def test_moduli_whose_verdict_is_none_are_not_stated():
     # Both truths lie in its intervals; it is no less without an estimate.
     refused = patient("prolapse", verdict=Verdict(NONE, (Ground("gate", NONE, "open", "wait"),)))
-    trusted = patient(verdict=Verdict(TRUSTWORTHY))
-    kept = {"a": trusted, "b": refused}
-    write_patient_tables(tmp_path, kept, {})
-    text = (tmp_path / "table2.md").read_text(encoding="utf-8")
-    row = next(line for line in text.splitlines() if line.startswith("| prolapse"))
-    assert row.startswith("| prolapse | none | 6 | none |")
-    third = (tmp_path / "table3.md").read_text(encoding="utf-8")
-    assert third.count("| prolapse | none |") == third.count("| trustworthy |") == 2
-    assert "none 1 of 1, by 20 %; trustworthy 1 of 1, by 20 % on average." in third
-    assert "contains the truth for 2 of 2 moduli" in text
-    assert "For 1 of 2 the verdict is that there is no estimate (prolapse)" in text
-    write_population_tables(tmp_path, [trusted, refused])
-    text = (tmp_path / "population.md").read_text(encoding="utf-8")
-    assert "| with nuisances | E_f.anterior | 1 of 2 | 1 (100 %)" in text
-    assert "with nuisances: the 95 % interval contains the truth 2 times of 2" in text
-    assert "Called trustworthy: 1 patients, 2 of 2 moduli inside" in text
+    records = [patient(verdict=Verdict(TRUSTWORTHY)), refused]
+    denied = rows(records, "table_2")[2]
+    assert (denied["patient"], denied["verdict"], denied["estimate"]) == ("prolapse", NONE, None)
+    assert rows(records, "moduli")[0]["estimated"] == 2
+    held = {row["frames"]: row["n"] for row in rows(records, "distances")}
+    assert (held["held out, none"], held["held out, trustworthy"]) == (1, 1)
 
 
-def test_a_patient_without_the_other_filters_is_in_the_tables(tmp_path):
-    write_patient_tables(
-        tmp_path, by_name([patient(without_nuisances=None, as_in_the_paper=None)]), {}
-    )
-    text = (tmp_path / "table2.md").read_text()
-    assert "without nuisances for" not in text
-    mixed = patient("prolapse", as_in_the_paper=alone(moduli(None, None), "no rounds left"))
-    write_patient_tables(tmp_path, by_name([mixed]), {})
-    text = (tmp_path / "table2.md").read_text()
-    assert "without nuisances for 1 of 2" in text
-    assert "paper's filter for" not in text
+def test_a_patient_without_the_other_filters_is_in_the_tables():
+    (row, _) = rows([patient(alternatives={})], "table_2")
+    assert row["paper's filter"] is row["paper's filter converged"] is None
+    assert [one["estimation"] for one in rows([patient(alternatives={})], "moduli")] == [
+        "with nuisances"
+    ]
 
 
 def test_publishing_keeps_a_patient_and_renews_the_tables(tmp_path, fields_file):
-    written = published(tmp_path, "patients-normal-small", patient(), fields_file)
-    assert {path.name for path in written} == {
-        f"{table}.{kind}" for table in ("table2", "table3") for kind in ("csv", "md", "tex")
-    } | {"figure3.png", "figure3.pdf"}
-    kept = json.loads((tmp_path / PLACE / "patients-normal-small.json").read_text())
-    assert kept["findings"]["case"]["unknowns"] == [
-        asdict(row) for row in patient().findings.case.unknowns
-    ]
-    with np.load(tmp_path / PLACE / "patients-normal-small.npz") as stored:
+    def published(name: str, record: Record) -> list[Path]:
+        folder = tmp_path / "run"
+        folder.mkdir(exist_ok=True)
+        shutil.copy(fields_file, folder / "fields.npz")
+        return publish(STUDY, tmp_path, {name: (record, folder)})
+
+    written = published("patients-normal-small", patient())
+    parts = {"table_2", "table_3", "moduli", "distances", "narrower"}
+    expected = {f"patients_{part}.{kind}" for part in parts for kind in ("csv", "tex")}
+    figures = {"patients_figure_3.png", "patients_figure_3.pdf"}
+    assert {path.name for path in written} == expected | figures | {"patients.md"}
+    kept = records_of(tmp_path, "patients")
+    assert kept is not None
+    (estimate,) = kept.first.estimates
+    assert estimate.unknowns == patient().estimates[0].unknowns
+    assert set(estimate.details) == {"narrower"}
+    with np.load(tmp_path / "records" / "patients" / "patients-normal-small.npz") as stored:
         assert set(stored.files) <= set(KEPT_ARRAYS)
         assert "sensitivity" not in stored.files
-        assert "truth" not in stored.files
     first = {path: path.read_bytes() for path in written}
-    again = published(tmp_path, "patients-normal-small", patient(), fields_file)
+    again = published("patients-normal-small", patient())
     assert {path: path.read_bytes() for path in again} == first
-    published(tmp_path, "patients-prolapse", patient("prolapse"), fields_file)
-    table = pd.read_csv(tmp_path / "table2.csv", comment="#")
-    assert list(table["patient"].unique()) == ["normal_small", "prolapse"]
+    published("patients-prolapse", patient("prolapse"))
+    assert "prolapse" in (tmp_path / "patients_table_2.csv").read_text()
 
 
-def test_a_table_reads_back_as_it_was(tmp_path):
-    write_patient_tables(tmp_path, by_name([patient(), patient("prolapse")]), {})
-    back = pd.read_csv(tmp_path / "table3.csv", comment="#")
-    pd.testing.assert_frame_equal(back, table3([patient(), patient("prolapse")]))
-    assert (tmp_path / "table3.csv").read_text().startswith("# ")
-
-
-def test_figure3_has_one_scale_for_all(fields_file, monkeypatch):
+def test_figure_3_has_one_scale_for_all(fields_file, monkeypatch):
     fields = read_case_fields(fields_file)
     far = copy.copy(fields)
     object.__setattr__(far, "distance_generic", 5 * fields.distance_generic)
-    seen = []
-    true_colours = patient_tables.corner_colours
-    monkeypatch.setattr(
-        patient_tables,
-        "corner_colours",
-        lambda scale, *rest: seen.append(scale) or true_colours(scale, *rest),
-    )
-    figure = figure3({"near": fields, "far": far})
-    assert len(seen) == 4
-    assert len({id(scale) for scale in seen}) == 1
-    (norm,) = {(scale.norm.vmin, scale.norm.vmax) for scale in seen}
-    assert norm[0] == 0.0
-    closed = far.distance_generic[far.closed]
-    assert norm[1] > np.median(closed)
-    panels = [axes for axes in figure.axes if axes.get_title()]
+    drawn = figure_3({"near": fields, "far": far})
+    panels = [axes for axes in drawn.axes if axes.get_title()]
     assert len(panels) == 4
     # The frame that the filter was shown, not the one that was held out.
     assert f"{np.mean(fields.distance_fitted[0]):.2f}" in panels[2].get_title()
-    assert "five" not in figure.get_suptitle()
-    assert "(simulated)" in figure.get_suptitle()
+    (bar,) = [axes for axes in drawn.axes if axes not in panels]
+    low, high = bar.get_ylim()
+    assert low == 0.0
+    assert high > np.median(far.distance_generic[far.closed])
 
 
-def test_figure3_says_where_there_is_no_estimate(fields_file):
+def test_figure_3_says_where_there_is_no_estimate(fields_file):
     fields = read_case_fields(fields_file)
-    figure = figure3({"sound": fields, "lost": fields}, ["lost"])
-    titles = [axes.get_title() for axes in figure.axes[:4]]
+    drawn = figure_3({"sound": fields, "lost": fields}, ["lost"])
+    titles = [axes.get_title() for axes in drawn.axes[:4]]
     assert [title.startswith("NO ESTIMATE") for title in titles] == [False, False, False, True]
 
 
-def test_figure3_needs_distances(fields_file):
+def test_figure_3_needs_distances(fields_file):
     fields = copy.copy(read_case_fields(fields_file))
     object.__setattr__(fields, "distance_fitted", None)
     with pytest.raises(InputError, match="Figure 3 needs the distances"):
-        figure3({"one": fields})
+        figure_3({"one": fields})
 
 
 # -- the population ------------------------------------------------------------------------------
-def population(n=20, misses=2):
+def population(n: int = 20, misses: int = 2) -> list[Record]:
     found = []
     for k in range(n):
         anterior = unknown("E_f.anterior", 7.0 if k < misses else 6.1 + 0.01 * k, 0.5)
-        rows = (anterior, *patient().findings.case.unknowns[1:])
-        found.append(patient(f"drawn_{k}", "population", unknowns=rows, as_in_the_paper=None))
+        unknowns = (anterior, *patient().estimates[0].unknowns[1:])
+        others = {"moduli_only": alone(moduli(5.7, 3.1))}
+        record = patient(f"drawn_{k:02}", "population", unknowns=unknowns, alternatives=others)
+        found.append(record)
     return found
 
 
-def test_the_population_counts_how_often_intervals_hold(tmp_path):
-    write_population_tables(tmp_path, population())
-    text = (tmp_path / "population.md").read_text()
-    line = next(x for x in text.splitlines() if "with nuisances" in x and "anterior" in x)
-    assert "18 (90 %)" in line
-    assert "68 to 99 %" in line
-    assert "20 of 20" in line
+def test_the_population_counts_how_often_intervals_hold():
+    found = {row["estimation, unknown"]: row for row in rows(population())}
+    anterior = found["with nuisances, E_f.anterior"]
+    assert (anterior["inside"], anterior["n"], anterior["coverage"]) == (18, 20, 90.0)
+    # Clopper and Pearson's bounds of 18 of 20.
+    assert (anterior["coverage low"], anterior["coverage high"]) == pytest.approx(
+        (68.301731, 98.765146)
+    )
+    both = {row["estimation"]: row for row in rows(population(), "moduli")}
     # Both moduli: 18 + 20 of 40, without nuisances 20 + 0 of 40.
-    assert (
-        "Both moduli, with nuisances: the 95 % interval contains the truth 38 times of 40" in text
-    )
-    assert "Both moduli, without nuisances: the 95 % interval contains the truth 20 times" in text
-    shift = next(x for x in text.splitlines() if "shift.x" in x)
+    assert (both["with nuisances"]["inside"], both["without nuisances"]["inside"]) == (38, 20)
     # Errors of what may be zero are absolute: 0.1 - 0.4 mm.
-    assert "-0.30" in shift
-    scale = next(x for x in text.splitlines() if "pressure" in x)
+    shift = found["with nuisances, shift.x"]
+    assert (shift["unit"], shift["mean error"]) == ("mm", pytest.approx(-0.3))
     # (1.02 - 1.05) / 1.05 = -2.9 %, width 0.1 / 1.05 = 9.5 %.
-    assert "-2.9 %" in scale
-    assert "9.5 %" in scale
-    table = population_frame(population())
-    # Both moduli again as they are guessed.
-    assert len(table) == 20 * (4 + 2 + 2 + 2)
-    guesses = {"generic guess", "prior alone"}
-    assert set(table["estimation"]) == {"with nuisances", "without nuisances", *guesses}
-    # 1 for 6 is off by 83 %, and has no interval of its own; within exp(1.96) of 1 lies no 8.
-    guess, before = (
-        next(x for x in text.splitlines() if what in x and "anterior" in x)
-        for what in ("| generic guess", "| prior alone")
+    scale = found["with nuisances, pressure_scale"]
+    assert (scale["unit"], scale["mean error"]) == ("%", pytest.approx(-3 / 1.05))
+    assert scale["mean width"] == pytest.approx(10 / 1.05)
+    # 1 for 6 is off by 83 %; within exp(1.96) = 7.1 of 1 lies 6.
+    assert anterior["generic guess"] == pytest.approx(250 / 3)
+    assert anterior["inside prior"] == 20
+    tidy = rows(population(), "estimates")
+    assert len(tidy) == 20 * (4 + 2)
+    assert {row["estimation"] for row in tidy} == {"with nuisances", "without nuisances"}
+
+
+def test_failures_of_the_population_are_counted_and_not_averaged():
+    records = [*population(4, 1), lost_patient("drawn_98", "population")]
+    anterior = rows(records)[0]
+    assert (anterior["n"], anterior["estimated"], anterior["inside"]) == (5, 4, 3)
+    only = rows([lost_patient("drawn_98", "population")])[0]
+    assert (only["n"], only["estimated"], only["coverage"], only["median error"]) == (
+        1, 0, None, None
+    )  # fmt: skip
+
+
+def test_the_figure_of_the_population_draws_every_interval():
+    drawn = figure(of([*population(6, 2), lost_patient("drawn_98", "population")]))["moduli"]
+    assert [axes.get_xlabel() for axes in drawn.axes] == [
+        "E_f anterior, estimate / truth", "E_f posterior, estimate / truth"
+    ]  # fmt: skip
+    words = [text.get_text() for text in drawn.axes[0].texts]
+    assert words == ["no estimate"] * 3
+    labels = [tick.get_text() for tick in drawn.axes[0].get_yticklabels()]
+    assert labels == ["with nuisances", "without nuisances", "paper's filter"]
+
+
+# -- scenarios ------------------------------------------------------------------------------------
+SD = 0.1
+
+
+def modulus(name: str, z: float, truth: float = 5.0) -> Unknown:
+    """An estimate whose logarithm is off by z of its standard deviations of 0.1."""
+    estimate, reach = float(truth * np.exp(-z * SD)), float(np.exp(1.959964 * SD))
+    return Unknown(
+        name=name, unit="MPa", prior_mean=6.0, prior_std=3.0, estimate=estimate,
+        std=SD * estimate, low=estimate / reach, high=estimate * reach, truth=truth,
+    )  # fmt: skip
+
+
+def run(
+    scenario: str,
+    seed: int,
+    z: tuple[float, float],
+    trust: Any = TRUSTWORTHY,
+    correlation: float = 0.0,
+) -> Record:
+    grounds = () if trust == TRUSTWORTHY else (Ground("distance", trust, "it is far"),)
+    record = patient(
+        f"drawn_{seed}",
+        "calibration",
+        unknowns=(modulus("E_f.anterior", z[0]), modulus("E_f.posterior", z[1])),
+        correlation=((1.0, correlation), (correlation, 1.0)),
+        verdict=Verdict(trust, grounds),
+        alternatives={},
     )
-    assert guess.split(" | ")[3:] == ["–", "–", "-83.3 %", "83.3 %", "– |"]
-    assert before.split(" | ")[3:5] == ["20 (100 %)", "83 to 100 %"]
+    numbers = {"scenario": scenario, "nees": study._nees(record.estimates[0]), "unknowns": 2}
+    source = SOURCE.model_copy(update={"seed": seed})
+    return record.model_copy(
+        update={"numbers": {**record.numbers, **numbers}, "provenance": source}
+    )
 
 
-def test_failures_of_the_population_are_counted_and_not_drawn(tmp_path):
-    lost = [lost_patient("drawn_98", "population")]
-    write_population_tables(tmp_path, [*population(4, 1), *lost])
-    text = (tmp_path / "population.md").read_text()
-    assert "4 of 5" in text
-    assert "nan" not in text
-    only = tmp_path / "only"
-    only.mkdir()
-    write_population_tables(only, lost)
-    text = (only / "population.md").read_text()
-    assert "0 of 1" in text
-    assert "nan" not in text
+@pytest.fixture
+def runs() -> list[Record]:
+    """A scenario as it is assumed, and one with a wrong interval that is trusted."""
+    return [
+        run("open shape off", 1, (4.0, 1.0)),
+        run("open shape off", 2, (-5.0, -4.0), NONE),
+        run("open shape off", 3, (0.1, 0.2), DOUBTFUL),
+        run("reference", 1, (0.5, -0.5)),
+        run("reference", 2, (1.0, 2.5)),
+    ]
 
 
-def test_the_population_s_figure_draws_every_interval():
-    figure = population_figure(population_frame(population(6, 2)))
-    assert isinstance(figure, Figure)
-    assert len(figure.axes) == 4
-    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert legend == ["contains the truth (4)", "does not (2)"]
+def test_a_scenario_says_what_its_verdicts_are_worth(runs):
+    as_assumed, off = rows(runs)
+    assert (as_assumed["scenario"], off["scenario"]) == ("reference", "open shape off")
+    assert as_assumed["valves"] == 2
+    assert [off[verdict] for verdict in (TRUSTWORTHY, DOUBTFUL, NONE)] == [1, 1, 1]
+    # |z| of 0.5, 1.0 and 0.5, 2.5: all inside but the last.
+    assert (as_assumed["inside"], as_assumed["n"]) == (3, 4)
+    assert (as_assumed["trusted inside"], as_assumed["trusted n"]) == (3, 4)
+    assert (off["trusted inside"], off["trusted n"]) == (1, 2)
+    # 4, 5 and 4 SD off; the first is trusted.
+    assert (as_assumed["far off"], as_assumed["trusted far off"]) == (0, 0)
+    assert (off["far off"], off["trusted far off"]) == (3, 1)
+    # (0.25 + 0.25) / 2 and (1 + 6.25) / 2, on average; chi-squared of 4 degrees over 4.
+    assert as_assumed["NEES"] == pytest.approx(1.9375)
+    assert (as_assumed["NEES low"], as_assumed["NEES high"]) == pytest.approx(
+        (0.484419 / 4, 11.143287 / 4)
+    )
+    # Guessing 6 for 5 is off by 20 %; the prior's logarithm has an SD of 0.5, the estimate's 0.1.
+    assert as_assumed["generic guess"] == pytest.approx(20.0)
+    assert as_assumed["width over prior"] == pytest.approx(0.2)
+    grounds = rows(runs, "grounds")
+    assert [(row["against"], row["estimates"]) for row in grounds] == [("distance", 2)]
+    verdicts = {row["verdict"]: (row["inside"], row["n"]) for row in rows(runs, "verdicts")}
+    assert verdicts == {TRUSTWORTHY: (4, 6), DOUBTFUL: (2, 2), NONE: (0, 2)}
 
 
-def test_only_the_tables_parts_of_a_drawn_patient_are_kept(tmp_path, fields_file):
-    record = population(1, 0)[0]
-    published(tmp_path, "population-drawn-0", record, fields_file)
-    kept = json.loads((tmp_path / DRAWN / "population-drawn-0.json").read_text())
-    assert record.findings.case.settings
-    assert kept["findings"]["case"]["settings"] == kept["findings"]["case"]["measurements"] == {}
-    assert [path.suffix for path in (tmp_path / DRAWN).iterdir()] == [".json"]
+def test_a_scenario_in_which_nothing_is_trusted_has_no_coverage_of_trusted():
+    (row,) = rows([run("2 % outliers", 1, (0.1, 0.1), NONE)])
+    assert (row["inside"], row["trusted n"], row["trusted coverage"]) == (2, None, None)
 
 
-def test_a_finished_case_says_what_was_estimated():
-    text = case_text(patient())
-    assert text.startswith("normal_small: converged")
-    assert "5.8 (5.3 to 6.3) MPa  (hidden truth 6)" in text
-    assert "frame late (not shown to the filter): 1.00 mm generic, 0.40 registered, 0.80" in text
-    unknowns = patient().findings.case.unknowns
-    own = patient(unknowns=tuple(replace(row, truth=None) for row in unknowns))
-    assert "truth" not in case_text(own)
-    assert case_text(lost_patient()).startswith("prolapse: the model failed")
+def test_correlated_errors_are_judged_as_such():
+    table = rows([run("reference", 1, (1.0, 1.0), correlation=0.5)], "estimates")
+    # (1, 1) C⁻¹ (1, 1)ᵀ / 2 with C⁻¹ = 4/3 (1, -1/2; -1/2, 1): 2/3.
+    assert [row["NEES"] for row in table] == pytest.approx([2 / 3, 2 / 3])
+    assert [row["off by SD"] for row in table] == pytest.approx([1.0, 1.0])
+    assert [row["truth in posterior"] for row in table] == pytest.approx([0.841, 0.841], abs=1e-3)
 
 
-def test_unknowns_of_a_case_as_a_table(tmp_path):
-    (path,) = write_case_run(tmp_path, patient())
-    table = pd.read_csv(path)
-    assert list(table["name"]) == list(TRUTH)
-    assert table["estimate"].tolist() == [5.8, 2.1, 1.02, 0.1]
+def test_the_band_holds_a_curve_in_95_of_100_samples():
+    at, low, high = ecdf_band(20)
+    rng = np.random.default_rng(3)
+    empirical = (rng.random((3000, 20, 1)) <= at).mean(axis=1) - at
+    held = np.all((empirical >= low - 1e-12) & (empirical <= high + 1e-12), axis=1).mean()
+    # Counts are whole numbers: no band has 95 % exactly.
+    assert 0.94 < held < 0.985
+    # Pointwise bands would hold it less often.
+    assert np.all(high - low > 0)
+
+
+def test_there_is_a_panel_for_each_scenario(runs):
+    drawn = ranks_figure(study._by_scenario(study._patients(of(runs))))
+    titles = [axes.get_title() for axes in drawn.axes if axes.axison]
+    assert titles == ["reference\n2 of 2 trustworthy", "open shape off\n1 of 3 trustworthy"]
+
+
+def test_a_kept_record_has_what_its_tables_need(runs):
+    kept = [keep(one) for one in runs]
+    assert not kept[0].estimates[0].correlation
+    for name, table in summary(of(runs)).items():
+        assert summary(of(kept))[name].csv() == table.csv()

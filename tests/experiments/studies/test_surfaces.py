@@ -4,34 +4,33 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from experiments.common.building import patient_store
 from experiments.common.cases import blind
-from experiments.common.records.record import Outcome
 from experiments.common.schema import build
-from experiments.common.study import Job
-from experiments.studies.surfaces import study
-from experiments.studies.surfaces.doors import arrive
-from experiments.studies.surfaces.findings import SurfaceError, thickness_error
-from experiments.studies.surfaces.report import (
-    surfaces_answer,
-    surfaces_frame,
-    surfaces_words,
-    write_surfaces,
+from experiments.common.study import Job, Results
+from experiments.studies.surfaces import (
+    DoorSettings,
+    Settings,
+    arrive,
+    figure,
+    keep,
+    run_surfaces,
+    summary,
+    surface_error,
+    thickness_error,
 )
-from experiments.studies.surfaces.settings import DoorSettings, Settings
 from mvest.cases.case import Role
 from mvest.cases.folder import read_case
 from mvest.errors import ConfigurationError, InputError
+from mvest.problem.record import EstimateRecord
 from mvest.problem.verdict import DOUBTFUL, NONE, TRUSTWORTHY, Ground, Verdict
-from mvest.reporting.case.findings import PosteriorCheck
 from mvest.simulation.virtual_patient import Hidden, VirtualPatient
 from tests.cases.folders import template_case
 from tests.experiments.configured import composed, plain
 from tests.experiments.studies.made_up import made_up
-from tests.experiments.studies.made_up_patients import findings_of, patient
+from tests.experiments.studies.made_up_patients import a_result, moduli
 from tests.made_up_closure import TRUE, made_up_case
 
 PATIENT = template_case(64, 16)
@@ -86,9 +85,9 @@ def test_surfaces_arrive_where_they_are(door, corresponds, opened_mm, closed_mm,
         (case.frame(Role.REFERENCE), arrived.opened, opened_mm),
         (case.frame(Role.CLOSED), arrived.closed, closed_mm),
     ):
-        error = SurfaceError.of(frame, true)
-        assert low <= error.there_mm <= high
-        assert low <= error.back_mm <= high
+        there, back, _ = surface_error(frame, true).values()
+        assert low <= there <= high
+        assert low <= back <= high
         # The left tip is the antero-lateral one, in whatever axes.
         tips = case.frame(Role.REFERENCE).papillary_tips
         assert np.sort(tips, axis=0) == pytest.approx(
@@ -99,7 +98,7 @@ def test_surfaces_arrive_where_they_are(door, corresponds, opened_mm, closed_mm,
     moved = np.linalg.norm(tips - arrived.closed.papillary_tips, axis=1)
     assert moved == pytest.approx(1.0 if laid_out_by(door) else 0.0, abs=1e-2)
     off = thickness_error(case, arrived.opened, PATIENT.surface.thickness)
-    assert abs(off.mean_mm) < 0.1
+    assert abs(off["thickness_mean_mm"]) < 0.1
     laid_out = any("laid out" in sentence for sentence in case.derived)
     assert laid_out is laid_out_by(door)
 
@@ -142,22 +141,23 @@ def test_the_estimator_gets_the_case_and_not_the_truth(job, monkeypatch):
         text = b"".join(p.read_bytes() for p in folder.rglob("*") if p.is_file()).decode("latin-1")
         # Nothing of what is hidden lies outside the sealed folder.
         assert not [name for name in TRUE if name in text]
-        findings = findings_of(patient().findings.case)
-        rows = tuple(replace(row, truth=None) for row in findings.case.unknowns)
-        check = PosteriorCheck("curvature", 0.1, 0.25)
-        case = replace(findings.case, unknowns=rows, verdict=Verdict(TRUSTWORTHY), posterior=check)
-        return Outcome(findings=replace(findings, case=case), reason="converged")
+        found = a_result(5.8, 2.1)
+        details = {"check": ({"compared": "curvature", "value": 0.1, "limit": 0.25},)}
+        update = {"verdict": Verdict(TRUSTWORTHY), "details": details}
+        return replace(found, estimates=(found.estimates[0].model_copy(update=update),))
 
     monkeypatch.setattr(blind, "estimate_blindly", blindly)
-    outcome = study.run_surfaces(job)
-    found = outcome.findings
+    result = run_surfaces(job)
     assert not given["case"].frame(Role.CLOSED).corresponds
     assert json.loads((given["sealed"] / "hidden.json").read_text())["values"] == TRUE
-    assert [row.truth for row in found.moduli] == [TRUE["E_f.anterior"], TRUE["E_f.posterior"]]
-    assert [row.estimate for row in found.moduli] == [5.8, 2.1]
-    assert all(row.truth is None for row in found.nuisances)
-    assert found.closed.there_mm < 1e-6
-    assert (found.verdict.trust, found.posterior.value) == (TRUSTWORTHY, 0.1)
+    (estimate,) = result.estimates
+    assert [own.truth for own in estimate.moduli] == [TRUE["E_f.anterior"], TRUE["E_f.posterior"]]
+    assert [own.estimate for own in estimate.moduli] == [5.8, 2.1]
+    # Those of the patient's own case are not those of what was imported.
+    assert all(own.truth is None for own in estimate.unknowns if not own.is_modulus)
+    assert result.numbers["closed_there_mm"] < 1e-6
+    assert (result.numbers["check"], result.numbers["check_limit"]) == (0.1, 0.25)
+    assert (estimate.case, estimate.seed, result.row) == (given["case"].name, 1, "")
 
 
 def test_an_estimation_that_leaves_nothing_is_a_failure_with_its_prior(job, monkeypatch):
@@ -165,82 +165,76 @@ def test_an_estimation_that_leaves_nothing_is_a_failure_with_its_prior(job, monk
         raise InputError("does not close")
 
     monkeypatch.setattr(blind, "estimate_blindly", blindly)
-    outcome = study.run_surfaces(job)
-    assert (outcome.status, outcome.reason) == ("failed", "does not close")
-    found = outcome.findings
-    assert found.verdict is None
-    assert [(row.estimate, row.prior_mean) for row in found.moduli] == [(None, 6.23), (None, 2.09)]
-    assert [row.truth for row in found.moduli] == [TRUE["E_f.anterior"], TRUE["E_f.posterior"]]
+    result = run_surfaces(job)
+    assert (result.status, result.reason) == ("failed", "does not close")
+    (estimate,) = result.estimates
+    rows = estimate.moduli
+    assert [(own.estimate, own.prior_mean) for own in rows] == [(None, 6.23), (None, 2.09)]
+    assert [own.truth for own in rows] == [TRUE["E_f.anterior"], TRUE["E_f.posterior"]]
 
 
 def record_of(name, kind, trust, estimates):
     """A run with intervals of 10 % about its estimates; truths are 6 and 2."""
     rows = tuple(
-        replace(
-            row,
-            estimate=value,
-            low=value and 0.9 * value,
-            high=value and 1.1 * value,
-        )
-        for row, value in zip(patient().findings.case.unknowns[:2], estimates, strict=True)
+        own.model_copy(update={"low": 0.9 * own.estimate, "high": 1.1 * own.estimate})
+        if own.estimate is not None
+        else own
+        for own in moduli(*estimates)
     )
     grounds = () if trust == TRUSTWORTHY else (Ground("approximation", trust, "bent", "sample"),)
-    exact = SurfaceError(0.03, 0.05, 0.2)
-    found = study.Findings(
-        patient=name,
-        kind=kind,
-        door=DOORS[kind].label,
-        opened=exact,
-        closed=exact,
-        thickness=study.thickness_error(PATIENT, PATIENT.frame(Role.REFERENCE), np.ones(64 * 16)),
-        derived=(),
-        moduli=rows,
-        posterior=PosteriorCheck("curvature", 0.4, 0.25),
+    done = estimates[0] is not None
+    estimate = EstimateRecord(
+        case=name,
+        status="converged" if done else "failed",
+        reason="converged" if done else "does not close",
         verdict=Verdict(trust, grounds),
-        reason="converged",
-        cpu_s=61.0,
+        unknowns=rows,
     )
-    return made_up(found, experiment="surfaces", table="surfaces", title="Surfaces")
+    ways = ("there", "back", "largest")
+    off = {f"{frame}_{way}_mm": 0.05 for frame in ("open", "closed") for way in ways}
+    off |= {"thickness_mean_mm": 0.0, "thickness_rms_mm": 0.1, "cpu_s": 61.0}
+    return made_up(
+        study="surfaces",
+        experiment="surfaces",
+        table="surfaces",
+        reason=estimate.reason,
+        estimates=(estimate,),
+        numbers={"kind": kind, "geometry": DOORS[kind].label, "check": 0.4, "check_limit": 0.25}
+        | off,
+    )
 
 
-RECORDS = {
-    "c": record_of("drawn_1", "labels", NONE, (9.0, 2.0)),
-    "a": record_of("drawn_1", "vertices", TRUSTWORTHY, (6.3, 2.1)),
-    "b": record_of("drawn_1", "slicerheart", DOUBTFUL, (9.0, 2.0)),
-    "d": record_of("drawn_2", "labels", NONE, (None, None)),
-}
+RESULTS = Results(
+    {
+        "c": record_of("drawn_1", "labels", NONE, (9.0, 2.0)),
+        "a": record_of("drawn_1", "vertices", TRUSTWORTHY, (6.3, 2.1)),
+        "b": record_of("drawn_1", "slicerheart", DOUBTFUL, (9.0, 2.0)),
+        "d": record_of("drawn_2", "labels", NONE, (None, None)),
+    }
+)
 
 
-def test_what_is_not_stated_is_not_counted(tmp_path):
-    answer = surfaces_answer(RECORDS)
-    assert "Vertices: 1 trustworthy; 2 of 2 moduli inside, median error 5 %" in answer
-    assert "SlicerHeart: 1 doubtful; 1 of 2 moduli inside, median error 25 %" in answer
+def test_what_is_not_stated_is_not_counted():
+    found = {row["geometry"]: row for row in summary(RESULTS)["geometries"].rows}
+    vertices, slicer, labels = found["vertices"], found["SlicerHeart"], found["labels"]
+    assert (vertices["inside"], vertices["estimated"]) == (2, 2)
+    assert vertices["median error"] == pytest.approx(5.0)
+    assert (slicer["inside"], slicer["median error"]) == (1, pytest.approx(25.0))
     # Errors of estimates whose verdict is none would be 50 % and 0 %.
-    assert "Labels: 2 none." in answer
-    written = write_surfaces(tmp_path, RECORDS, {})
-    assert {path.suffix for path in written} >= {".csv", ".md", ".png"}
-    lines = (tmp_path / "surfaces.md").read_text().splitlines()
-    table = [line for line in lines if line.startswith("| drawn")]
-    # Patient by patient, doors in one order; no interval is without its verdict.
-    assert [line.split(" | ")[1] for line in table] == [
-        "vertices",
-        "SlicerHeart",
-        "labels",
-        "labels",
-    ]
-    assert "9 (8.1 to 9.9) ✗" in table[1]
-    assert "(9 (8.1 to 9.9) ✗)" in table[2]
-    assert "0.4 (0.25)" in table[1]
-    assert any("drawn 1, SlicerHeart: doubtful, since bent." in line for line in lines)
-    assert any("generic guess" in line for line in lines)
+    assert (labels["n"], labels["estimated"], labels["median error"]) == (4, 0, None)
+    assert (labels[NONE], slicer[DOUBTFUL], vertices[TRUSTWORTHY]) == (2, 1, 1)
 
 
-def test_the_table_has_every_modulus_of_every_run(tmp_path):
-    frame = surfaces_frame(list(RECORDS.values()))
-    assert len(frame) == 2 * len(RECORDS)
-    assert frame["inside"].isna().sum() == 2
-    write_surfaces(tmp_path, RECORDS, {})
-    kept = pd.read_csv(tmp_path / "surfaces.csv", comment="#")
-    assert kept["truth [MPa]"].tolist() == [6.0, 2.0] * 4
-    assert kept["grounds"].fillna("").str.contains("bent").sum() == 6
-    assert "drawn_1, SlicerHeart: doubtful" in surfaces_words(RECORDS["b"])
+def test_the_table_has_every_modulus_of_every_run_by_patient_and_way():
+    rows = summary(RESULTS)[""].rows
+    assert [row["geometry"] for row in rows[::2]] == ["vertices", "SlicerHeart", "labels", "labels"]
+    assert [row["truth"] for row in rows] == [6.0, 2.0] * 4
+    assert [row["stated"] for row in rows] == [6.3, 2.1, 9.0, 2.0, None, None, None, None]
+    assert rows[4]["estimate"] == 9.0
+    assert sum("bent" in row["grounds"] for row in rows) == 6
+    shown = summary(RESULTS)[""].readable()[2]
+    assert shown["estimate (MPa)"] == "9 (8.1 to 9.9) ✗"
+    assert [text.get_text() for text in figure(RESULTS).axes[0].texts] == ["no estimate"]
+    kept = Results({name: keep(record) for name, record in RESULTS.records.items()})
+    for name, table in summary(RESULTS).items():
+        assert summary(kept)[name].csv() == table.csv()

@@ -1,0 +1,558 @@
+"""Virtual patients in simulated volumes: imaged, estimated blindly, then revealed.
+
+A process of its own goes from the file of a volume to the moduli. Two others start from better
+geometries: from where the valve truly was (known geometry), and from that with the error of a voxel
+(perfect segmentation). What is left of the error there is not the images'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import linregress, sem
+
+from experiments.common.building.anatomy import template_of
+from experiments.common.building.closure import mechanics_of
+from experiments.common.building.store import Store
+from experiments.common.building.virtual_patients import (
+    EchoSettings,
+    PatientSettings,
+    draw_patient_values,
+    first_that_closes,
+    require_patient,
+)
+from experiments.common.cases.blind import estimated_or_reason
+from experiments.common.cases.own_case import case_words, write_report
+from experiments.common.cases.settings import ImagedInput, PersonalSettings
+from experiments.common.records.record import Record
+from experiments.common.skill import (
+    GENERIC,
+    interval,
+    interval_columns,
+    moduli_figure,
+    skill_table,
+    stated,
+    trust_of,
+    verdict_table,
+)
+from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.case import ErrorSamples, ValveCase
+from mvest.cases.chord_layout import SEEN_CLOSURE
+from mvest.cases.from_images.build import CaseTexts, case_of_sequence
+from mvest.cases.from_images.frame_choice import CaseFrames
+from mvest.cases.writer import write_case
+from mvest.errors import InputError
+from mvest.imaging.simulator.acquisition_ranges import draw_acquisition
+from mvest.imaging.simulator.probe import Probe, draw_probe
+from mvest.imaging.simulator.simulate import simulate_volume, true_sequence
+from mvest.imaging.valve_sequence import ValveSequence
+from mvest.imaging.volume import VolumeSequence
+from mvest.imaging.writing.slicer import write_sequence_nrrd
+from mvest.observation.errors import SpatialCorrelation
+from mvest.personalisation.error_budget import EVERYTHING
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.skill import generic_guess
+from mvest.provenance import write_json
+from mvest.reading.json_file import read_mapping
+from mvest.reporting.tables import Column, Table, table
+from mvest.simulation.motion.closing import MotionSettings
+from mvest.simulation.motion.patient import IMAGED, ImagedPatient, simulate_imaged_patient
+from mvest.simulation.motion.population import draw_tip_motion
+from mvest.typing import FloatArray
+from mvest.valve.anatomy.template import Template
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDY", "ImagedPlace", "make_imaged_patient", "run_imaged_patient"]
+
+Values = Mapping[str, Any]
+Made = tuple[ImagedPatient, Probe, VolumeSequence, int]
+"""A patient, how it was imaged, and how many anatomies were drawn for it."""
+
+VOLUME, TRUTH, HIDDEN = "volume.seq.nrrd", "truth", "hidden.json"
+KNOWN, SEGMENTED = "known", "segmented"
+"""Folders of the better geometries, and what a record calls the estimates from them."""
+
+SOURCES = {
+    "": "the volume",
+    SEGMENTED: "a perfect segmentation",
+    KNOWN: "the known geometry",
+}
+
+MAX_DRAWS = 10
+"""Anatomies that are drawn, one after another, until one closes as a valve does."""
+
+KNOWN_UNCERTAINTY = {"std_mm": 0.5, "correlation_length_mm": 10.0}
+"""What the case of the true positions states: about what the image step does."""
+
+VOXELS_CORRELATED = 10.0
+"""Voxels over which errors of a segmentation are correlated: surfaces of label maps are smoothed,
+and rougher ones cannot be meshed."""
+
+SAMPLES = 100
+"""Of the errors of a segmentation, that go with its case."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    patient: PatientSettings
+    echo: EchoSettings = field(default_factory=EchoSettings)
+    volume: str | None = None  # written by the study
+    imaged: ImagedInput = field(default_factory=ImagedInput)
+    personal: PersonalSettings
+
+
+@dataclass(frozen=True, slots=True)
+class ImagedPlace:
+    """Where an imaged patient lies: the file that an estimator is given, and what it cannot open.
+
+    Hidden are the truth, and the cases of the better geometries.
+    """
+
+    volume: Path
+    hidden: Path
+
+    @classmethod
+    def within(cls, root: Path) -> ImagedPlace:
+        """The places in the folder of a patient."""
+        return cls(root / VOLUME, root / "hidden")
+
+    @property
+    def truth(self) -> Path:
+        """Folder of what no estimation is given."""
+        return self.hidden / TRUTH
+
+
+# -- run ------------------------------------------------------------------------------------------
+def run_imaged_patient(job: Job[Settings]) -> Result:
+    """Simulate, estimate from the volume and from better geometries, reveal.
+
+    Raises
+    ------
+    InputError
+        If neither the volume nor the known geometry left an estimation.
+    """
+    values, folder = job.values, job.folder
+    place = make_imaged_patient(values, job.settings.patient, job.settings.echo)
+    hidden = read_mapping(place.truth / HIDDEN)
+    given = {**values, "imaged": {**values["imaged"], **hidden["stated"]}}
+    found = {"": estimated_or_reason(given, folder, place.volume, place.hidden)}
+    for name in (KNOWN, SEGMENTED):
+        (folder / name).mkdir(exist_ok=True)
+        found[name] = estimated_or_reason(values, folder / name, place.hidden / name, place.truth)
+    main = found[""]
+    run = found[KNOWN] if isinstance(main, str) else main
+    if isinstance(run, str):
+        raise InputError(run)
+    estimates = {name: _estimate(each, run.estimates[0]) for name, each in found.items()}
+    better = {name: estimates[name] for name in (KNOWN, SEGMENTED)}
+    estimate = estimates[""].model_copy(
+        update={
+            "case": job.settings.patient.name,
+            "seed": values["seed"],
+            "alternatives": {**estimates[""].alternatives, **better},
+        }
+    )
+    ratios = [
+        {"family": name, "ratio": one}
+        for name, each in hidden["chord_ratios"].items()
+        for one in each
+    ]
+    lost = main if isinstance(main, str) else ""
+    return replace(
+        run,
+        tables={"chordae": table(ratios)} if ratios else {},
+        numbers={"anatomies_drawn": hidden["anatomies_drawn"]},
+        arrays={} if lost else run.arrays,
+        estimates=(estimate.with_truth(hidden["values"]),),
+        status="failed" if lost else run.status,
+        reason=lost or run.reason,
+        detail="" if lost else run.detail,
+        row="",
+        gate=None,
+    )
+
+
+def _estimate(found: Result | str, other: EstimateRecord) -> EstimateRecord:
+    """What an estimation left; unknowns have no numbers where it did not converge."""
+    if isinstance(found, str):
+        record = EstimateRecord(status="failed", reason=found, unknowns=other.parameters)
+    else:
+        record = found.estimates[0]
+    if record.converged:
+        return record
+    nothing = dict.fromkeys(("estimate", "std", "low", "high", "bound"))
+    unknowns = tuple(own.model_copy(update=nothing) for own in record.unknowns)
+    return record.model_copy(update={"unknowns": unknowns})
+
+
+# -- the patient ----------------------------------------------------------------------------------
+def make_imaged_patient(
+    values: Values, patient: PatientSettings | None, echo: EchoSettings
+) -> ImagedPlace:
+    """Simulate and image the configured patient, unless that was done: where it lies.
+
+    Raises
+    ------
+    MvestError
+        If the configuration is inadmissible or no anatomy that is drawn closes.
+    """
+    patient = require_patient(patient)
+    described = {
+        "patient": {
+            key: values["patient"][key]
+            for key in ("name", "description", "moduli", "moduli_spread", "variation", "deviations")
+        },
+        "echo": values["echo"],
+        "valve": values["valve"],
+        "mechanics": values["mechanics"],
+        "uncertainty": KNOWN_UNCERTAINTY,
+        "seed": values["seed"],
+    }
+    store = Store(values["paths"]["outputs"])
+    entry = store.entry("virtual", described, (_simulate, _write), _place, "{key}")
+
+    def write(root: Path, made: Made) -> None:
+        _write(ImagedPlace.within(root), made, patient, described)
+
+    return entry.get_or_make(lambda: _simulate(values, patient, echo), write)
+
+
+def _place(root: Path) -> ImagedPlace:
+    place = ImagedPlace.within(root)
+    read_mapping(place.truth / HIDDEN)
+    return place
+
+
+def _simulate(values: Values, patient: PatientSettings, echo: EchoSettings) -> Made:
+    rng = np.random.default_rng(values["seed"])
+    hidden, mechanics = draw_patient_values(patient, rng), mechanics_of(values)
+
+    def simulate(drawn: Template) -> ImagedPatient:
+        motion = draw_tip_motion(drawn, echo.tip_motion_mm, rng)
+        return simulate_imaged_patient(
+            patient.name, drawn, hidden, IMAGED, MotionSettings(), mechanics, motion
+        )
+
+    made, draws = first_that_closes(
+        template_of(values), patient.variation, MAX_DRAWS, rng, simulate
+    )
+    acquisition = draw_acquisition(rng, spread=echo.spread)
+    probe = draw_probe(rng, acquisition)
+    return made, probe, simulate_volume(made.valve, acquisition, probe, values["seed"]), draws
+
+
+def _write(place: ImagedPlace, imaged: Made, patient: PatientSettings, described: Values) -> None:
+    made, probe, volume, draws = imaged
+    place.truth.mkdir(parents=True)
+    # The source of what is simulated names the patient; a file has its name alone.
+    write_sequence_nrrd(place.volume, volume)
+    frames = CaseFrames(0, made.closed, float(made.pressure_mmHg[made.closed]))
+    true = true_sequence(made.valve, probe)
+    write_case(place.hidden / KNOWN, _known_case(true, frames, patient))
+    segmented = _segmented_case(
+        true, frames, patient, float(volume.spacing.max()), described["seed"]
+    )
+    write_case(place.hidden / SEGMENTED, segmented)
+    write_json(
+        place.truth / HIDDEN,
+        {
+            "values": dict(made.hidden.values),
+            "stated": {"closed_frame": frames.closed, "pressure_mmHg": frames.pressure_mmHg},
+            "made_from": dict(described),
+            "anatomies_drawn": draws,
+            "chord_ratios": {name: each.tolist() for name, each in made.chord_ratios().items()},
+        },
+    )
+
+
+def _known_case(sequence: ValveSequence, frames: CaseFrames, patient: PatientSettings) -> ValveCase:
+    n = sequence.layout.size
+    stated = replace(
+        sequence,
+        std_mm=np.full(n, KNOWN_UNCERTAINTY["std_mm"]),
+        correlation_length_mm=KNOWN_UNCERTAINTY["correlation_length_mm"],
+    )
+    texts = CaseTexts(
+        patient.name, f"{patient.description}, its true positions", "simulated", "MIT", True
+    )
+    return case_of_sequence(stated, frames, texts)
+
+
+def _segmented_case(
+    true: ValveSequence, frames: CaseFrames, patient: PatientSettings, voxel_mm: float, seed: int
+) -> ValveCase:
+    """The true positions as a label map without mistakes has them: to the error of a voxel.
+
+    The error of a position that is rounded to a voxel, in open and closed frame and of the tips,
+    independent of each other, and samples of it.
+    """
+    rng = np.random.default_rng([seed, 3])
+    std, count = voxel_mm / np.sqrt(12.0), len(true.times)
+    length, n = VOXELS_CORRELATED * voxel_mm, true.layout.size
+    factor = SpatialCorrelation(true.vertices[frames.open], length).factor
+
+    def errors(samples: int) -> tuple[FloatArray, FloatArray]:
+        white = rng.standard_normal((samples, count, n, 3))
+        tips = rng.standard_normal((samples, count, 2, 3))
+        return std * np.einsum("nk,sfkd->sfnd", factor, white), std * tips
+
+    (leaflets,), (tips,) = errors(1)
+    seen = replace(
+        true,
+        vertices=true.vertices + leaflets,
+        tips=true.tips + tips,
+        std_mm=np.full(n, std),
+        correlation_length_mm=length,
+    )
+    vertices, tip_errors = (each[:, frames.in_order] for each in errors(SAMPLES))
+    texts = CaseTexts(
+        patient.name, f"{patient.description}, a perfect segmentation", "simulated", "MIT", True
+    )
+    return case_of_sequence(seen, frames, texts, error_samples=ErrorSamples(vertices, tip_errors))
+
+
+# -- tables ---------------------------------------------------------------------------------------
+def summary(results: Results) -> dict[str, Table]:
+    """Moduli beside the truth, what they are worth, and what costs them how much."""
+    estimates = _estimates(results)
+    medians, budgets = _budgets(estimates)
+    tables = {
+        "": _moduli_table(estimates),
+        "skill": _skill(estimates),
+        "bias": _bias(estimates),
+        "verdicts": verdict_table(estimates),
+        "chordae": _chordae(results) if "chordae" in results.table_names else None,
+        "budget": medians,
+        "budget_of_patients": budgets,
+    }
+    return {name: one for name, one in tables.items() if one is not None and len(one)}
+
+
+def _estimates(results: Results) -> list[EstimateRecord]:
+    return [one.estimates[0] for one in results.records.values() if one.estimates]
+
+
+def _moduli_table(estimates: Sequence[EstimateRecord]) -> Table:
+    """A row for each patient and modulus.
+
+    Errors have a sign: that from the known geometry and the part from the images add up to the
+    whole.
+    """
+    rows = []
+    for estimate in estimates:
+        for own in estimate.moduli:
+            better = {
+                name: estimate.alternatives[name].unknown(own.name) for name in (SEGMENTED, KNOWN)
+            }
+            error, of_known = _percent(own), _percent(better[KNOWN])
+            rows.append(
+                {
+                    "patient": estimate.case,
+                    "modulus": own.name,
+                    "truth": own.truth,
+                    "stated": own.estimate if estimate.is_stated else None,
+                    **interval("estimate", own),
+                    "verdict": trust_of(estimate),
+                    "error": error,
+                    **{f"error, {name}": _percent(one) for name, one in better.items()},
+                    "part from images": None
+                    if error is None or of_known is None
+                    else error - of_known,
+                    f"error, {GENERIC}": _percent(generic_guess(own)),
+                }
+            )
+    about = {"patient": Column(label="patient (simulated)"), "modulus": Column()}
+    about |= {"truth": Column("MPa")} | interval_columns("estimate", hidden=True)
+    about["stated"] = replace(about["estimate"], label="estimate", hidden=False)
+    percent = Column("%", "+.1f")
+    about |= {"verdict": Column(), "error": percent}
+    about[f"error, {SEGMENTED}"] = replace(percent, label="error from a perfect segmentation")
+    about[f"error, {KNOWN}"] = replace(percent, label="error from the known geometry")
+    about["part from images"] = percent
+    about[f"error, {GENERIC}"] = replace(percent, hidden=True)
+    return table(rows, **about)
+
+
+def _percent(unknown: Unknown) -> float | None:
+    error = unknown.relative_error
+    return None if error is None else 100.0 * error
+
+
+def _by_source(estimates: Sequence[EstimateRecord]) -> dict[str, list[Unknown]]:
+    """What a modulus was estimated from, and which -> those of all patients."""
+    groups: dict[str, list[Unknown]] = {}
+    for estimate in estimates:
+        for name, source in SOURCES.items():
+            one = estimate.alternatives[name] if name else estimate
+            for own in one.moduli:
+                groups.setdefault(f"{source}, {own.name}", []).append(own)
+    return groups
+
+
+def _skill(estimates: Sequence[EstimateRecord]) -> Table:
+    """What moduli are worth, together and each; those from volumes as far as they are stated."""
+    each = _by_source(
+        [one.model_copy(update={"unknowns": tuple(stated(one))}) for one in estimates]
+    )
+    both = {
+        source: [own for name, moduli in each.items() if name.startswith(source) for own in moduli]
+        for source in SOURCES.values()
+    }
+    return skill_table("estimated from", both | each)
+
+
+def _bias(estimates: Sequence[EstimateRecord]) -> Table:
+    """Mean error of each modulus' logarithm, and how far estimates follow the truth.
+
+    Of all that converged, also of those that the verdict denies: it does not see the truth.
+    """
+    rows = []
+    for source, moduli in _by_source(estimates).items():
+        known = [(own.truth, own.estimate) for own in moduli if own.estimate is not None]
+        truth, found = np.log(np.array(known, dtype=np.float64).reshape(-1, 2).T)
+        row = {"estimated from": source, "n": len(known)}
+        row |= dict.fromkeys(("bias", "bias SE", "slope", "slope SE"))
+        if len(known) > 1:
+            row |= {"bias": np.mean(found - truth), "bias SE": sem(found - truth)}
+        if len(known) > 2 and np.ptp(truth) > 0:
+            line = linregress(truth, found)
+            row |= {"slope": line.slope, "slope SE": line.stderr}
+        rows.append(row)
+    about = {"estimated from": Column(), "n": Column()}
+    about["bias"] = Column(digits=".2f", std="bias SE", label="mean error of the logarithm ± SE")
+    about["slope"] = Column(digits=".2f", std="slope SE", label="slope over the truth's ± SE")
+    return table(rows, **about)
+
+
+def _chordae(results: Results) -> Table:
+    """True rest length over the distance of a chord's ends in the closed valve, by family.
+
+    Beside it the ratio by which estimators lay chordae out.
+    """
+    laid_out = {"marginal": SEEN_CLOSURE.marginal_slack, "basal": SEEN_CLOSURE.basal_slack}
+    ratios: dict[str, list[list[float]]] = {}
+    for record in results.records.values():
+        if "chordae" in record.tables:
+            rows = record.table_of("chordae").rows
+            for family in dict.fromkeys(row["family"] for row in rows):
+                own = [row["ratio"] for row in rows if row["family"] == family]
+                ratios.setdefault(family, []).append(own)
+    rows = [
+        {
+            "family": family,
+            "patients": len(each),
+            "ratio": np.mean(np.concatenate(each)),
+            "SD": np.std(np.concatenate(each), ddof=1),
+            "SD of patients": np.std([np.mean(own) for own in each], ddof=1 if each[1:] else 0),
+            "laid out": laid_out[family],
+        }
+        for family, each in ratios.items()
+    ]
+    about = {"family": Column(), "patients": Column(), "ratio": Column(digits=".3f", std="SD")}
+    return table(
+        rows, **about, **dict.fromkeys(("SD of patients", "laid out"), Column(digits=".3f"))
+    )
+
+
+# -- what costs how much --------------------------------------------------------------------------
+def _budgets(estimates: Sequence[EstimateRecord]) -> tuple[Table, Table]:
+    """SD of each modulus' logarithm, to first order: medians over patients, and of each.
+
+    ``without`` a part: it is known exactly and all else as it is; ``alone``: all else is known
+    exactly (everything alone: nothing but the noise of single points).
+    """
+    rows = [
+        {"patient": estimate.case, **row}
+        for estimate in estimates
+        for row in estimate.detail_rows("budget")
+    ]
+    groups = dict.fromkeys((row["part"], row["modulus"]) for row in rows)
+    medians = []
+    for part, modulus in groups:
+        own = [row for row in rows if (row["part"], row["modulus"]) == (part, modulus)]
+        sizes = {kind: median(row[kind] for row in own) for kind in ("without", "alone")}
+        medians.append({"part": part, "modulus": modulus, **sizes})
+    return table(medians, part="", modulus="", without=":.3f", alone=":.3f"), table(rows)
+
+
+def figure(results: Results) -> dict[str, Figure]:
+    """Estimates from all sources over their truths, and the budget."""
+    groups: dict[str, list[tuple[Unknown, str]]] = {}
+    for estimate in _estimates(results):
+        for name, source in SOURCES.items():
+            one = estimate.alternatives[name] if name else estimate
+            own = [(modulus, trust_of(estimate)) for modulus in one.moduli]
+            groups.setdefault(source, []).extend(own)
+    drawn = {"moduli": moduli_figure(groups)}
+    rows = _budgets(_estimates(results))[0].rows
+    return drawn | ({"budget": budget_figure(rows)} if rows else {})
+
+
+def budget_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """What is left of each modulus' uncertainty without each part, and with it alone."""
+    from mvest.reporting.style import SMALL, headline, panels
+
+    moduli = dict.fromkeys(row["modulus"] for row in rows)
+    parts = [part for part in dict.fromkeys(row["part"] for row in rows) if part != EVERYTHING]
+    drawn, axes = panels(1, len(moduli), 0.27 * len(parts) + 1.6, sharex=True, sharey=True)
+    places = range(len(parts))
+    for one, modulus in zip(axes[0], moduli, strict=True):
+        sizes = {row["part"]: row for row in rows if row["modulus"] == modulus}
+        one.axvline(sizes[EVERYTHING]["without"], color="0.5", lw=0.9, ls="--")
+        for kind, colour, marker in (("alone", "#31446B", "o"), ("without", "#C8553D", "D")):
+            values = [sizes[part][kind] for part in parts]
+            one.plot(values, places, marker, color=colour, ms=4.5, label=kind)
+        one.set_yticks(list(places), parts)
+        one.set_ylim(len(parts) - 0.5, -0.5)
+        one.set_title(modulus.replace(".", " "), loc="left", fontsize=SMALL + 0.5)
+        one.set_xlabel("SD of the modulus' logarithm")
+    axes[0, 0].set_xlim(left=0.0)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower right", ncols=2, fontsize=SMALL, frameon=False)
+    headline(
+        drawn,
+        "Where the information dies between a volume and a modulus",
+        "Each part of what is not known, alone and taken away; dashed: with all of it.",
+    )
+    return drawn
+
+
+def keep(record: Record) -> Record:
+    """What tables and figures need of a record."""
+    kept = []
+    for estimate in record.estimates:
+        short = estimate.without_details("budget")
+        better = {
+            name: other.model_copy(update={"unknowns": other.moduli})
+            for name, other in short.alternatives.items()
+        }
+        update = {"unknowns": short.moduli, "alternatives": better}
+        kept.append(short.model_copy(update=update))
+    return record.model_copy(update={"estimates": tuple(kept)})
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run_imaged_patient,
+    summary=summary,
+    figure=figure,
+    captions={
+        "moduli": "Estimates with their 95 % intervals over the truth, in the colour of the "
+        "verdict on the one from the volume. Simulated.",
+        "budget": "What each part of what is not known costs a modulus, to first order at the "
+        "estimate; medians over simulated volumes.",
+    },
+    words=case_words,
+    files=write_report,
+    keep=keep,
+    keeps_failures=True,
+)

@@ -1,1 +1,0 @@
-"""Virtual patients in simulated volumes."""

@@ -1,1 +1,0 @@
-"""Virtual patients: cases that hide their truth."""

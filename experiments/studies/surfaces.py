@@ -1,0 +1,582 @@
+"""Virtual patients whose geometry arrives as another program or a segmentation brings it.
+
+The valve of a virtual patient is exported (as surfaces, as a folder of SlicerHeart, as label maps),
+imported, and estimated as any own valve is. No reader or writer of this project takes part in the
+exports: VTK (through PyVista) cuts and writes surfaces, pandas tables, nibabel label maps.
+"""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from experiments.common.building.patient_store import make_patient
+from experiments.common.building.virtual_patients import PatientSettings
+from experiments.common.cases.blind import estimated_or_reason
+from experiments.common.cases.own_case import case_words
+from experiments.common.cases.settings import PersonalSettings
+from experiments.common.records.record import Number, Record
+from experiments.common.skill import (
+    VERDICTS,
+    interval,
+    interval_columns,
+    moduli_figure,
+    skill_table,
+    stated,
+    trust_of,
+)
+from experiments.common.study import Job, Result, Results, Study
+from mvest.cases.case import Frame, Role, ValveCase
+from mvest.cases.folder import read_case
+from mvest.cases.importing.labels import LabelsOptions, import_labels
+from mvest.cases.importing.slicerheart import SlicerheartOptions, import_slicerheart
+from mvest.cases.paths import CASE_FILE
+from mvest.cases.writer import write_case
+from mvest.errors import ConfigurationError
+from mvest.problem.record import EstimateRecord, Unknown
+from mvest.problem.registration import REGISTRATION, displace
+from mvest.problem.skill import prior_alone
+from mvest.quantities import Length
+from mvest.reporting.tables import Column, Table, table
+from mvest.typing import FloatArray, IntArray
+from mvest.valve.anatomy.valve import LeafletSurface
+from mvest.valve.geometry.proximity import closest_points
+from mvest.valve.geometry.thickening import smooth_vertex_normals
+from mvest.valve.io.leaflet_surfaces import write_surface
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["FINE_MM", "STUDY", "DoorSettings", "arrive", "drawn_leaflets", "run_surfaces"]
+
+POSE = Rotation.from_euler("xz", [1.0, 0.4]).as_matrix()
+SHIFT = np.array([31.0, -12.0, 140.0])
+"""From the axes of a simulated valve to LPS mm: so that nothing lies along an axis."""
+
+SCENE = "simulated"
+LANDMARKS = {
+    "A": (0.0, 1.0), "P": (0.0, -1.0), "AL": (-1.0, 0.0), "PM": (1.0, 0.0), "ALC": (-1.0, 0.25),
+    "PMC": (1.0, 0.25),
+}  # fmt: skip
+"""Direction (x, y) of SlicerHeart's landmarks from the middle of the template's annulus."""
+
+FINE_MM, MARGIN_MM = 0.2, 6.0
+"""Of the grid on which leaflets are drawn before they are sampled at voxels."""
+
+PRIOR = "prior alone"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoorSettings:
+    """How the geometry of a virtual patient arrives."""
+
+    kind: str  # vertices, surfaces, slicerheart or labels
+    label: str  # what tables call it
+    seen_with_errors: bool = False  # the closed surface has the errors of the patient's case
+    voxel_mm: Length | None = None  # of a label map
+    closed: bool = False  # the closed frame is a label map as well
+    std_mm: Length = 0.6  # of the closed surface, where the case itself does not say it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    patient: PatientSettings
+    personal: PersonalSettings
+    door: DoorSettings
+
+
+# -- run ------------------------------------------------------------------------------------------
+def run_surfaces(job: Job[Settings]) -> Result:
+    """Simulate, export, import, estimate in a process of its own, reveal the truth.
+
+    Raises
+    ------
+    MvestError
+        If the patient's valve does not close, or an importer refuses it.
+    """
+    door, folder = job.settings.door, job.folder
+    place = make_patient(job.values, job.settings.patient)
+    hidden, positions = place.truth()
+    patient = read_case(place.case)
+    for name in ("door", "case"):
+        # Of an earlier run.
+        shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / "door").mkdir()
+    registration = np.array([hidden["values"][name] for name in REGISTRATION])
+    arrived = arrive(patient, positions["closed"], registration, door, folder / "door")
+    case = write_case(folder / "case", arrived.case)
+    before = _cpu_of_children()
+    found = estimated_or_reason(job.values, folder, case, place.hidden)
+    numbers: dict[str, Number] = {"kind": door.kind, "geometry": door.label}
+    numbers |= {"cpu_s": _cpu_of_children() - before}
+    if isinstance(found, str):
+        unknowns = _believed(job.settings.personal)
+        estimate = EstimateRecord(status="failed", reason=found, unknowns=unknowns)
+        found = Result(status="failed", reason=found)
+    else:
+        (estimate,) = found.estimates
+    for check in estimate.detail_rows("check"):
+        numbers |= {"check": check["value"], "check_limit": check["limit"]}
+    for role, true in ((Role.REFERENCE, arrived.opened), (Role.CLOSED, arrived.closed)):
+        numbers |= surface_error(arrived.case.frame(role), true)
+    numbers |= thickness_error(arrived.case, arrived.opened, patient.surface.thickness)
+    # What is displaced in the case of the patient is not in what was imported.
+    truth = {name: hidden["values"][name] for name in hidden["values"] if name.startswith("E_f.")}
+    about = {"case": patient.name, "seed": job.values["seed"]}
+    revealed = estimate.model_copy(update=about).with_truth(truth)
+    return replace(found, tables={}, numbers=numbers, estimates=(revealed,), arrays={}, row="")
+
+
+def surface_error(found: Frame, true: Frame) -> dict[str, Number]:
+    """Distances (mm) of a midsurface from the true one: root mean squares and the largest.
+
+    ``there`` from its vertices, ``back`` from those of the true one to it.
+    """
+    there, back = (
+        closest_points(a.vertices, b.vertices, b.triangles).distance
+        for a, b in ((found, true), (true, found))
+    )
+    frame = "closed" if true.role is Role.CLOSED else "open"
+    largest = float(max(there.max(), back.max()))
+    return {
+        f"{frame}_there_mm": _rms(there),
+        f"{frame}_back_mm": _rms(back),
+        f"{frame}_largest_mm": largest,
+    }
+
+
+def thickness_error(case: ValveCase, true: Frame, thickness_mm: FloatArray) -> dict[str, Number]:
+    """Thickness of the open midsurface less the true one at the nearest point, mm.
+
+    ``thickness_mm`` ``(n,)`` is that of the vertices of the true frame.
+    """
+    nearest = closest_points(case.surface.vertices, true.vertices, true.triangles)
+    off = case.surface.thickness - nearest.interpolate(thickness_mm, true.triangles)
+    return {"thickness_mean_mm": float(off.mean()), "thickness_rms_mm": _rms(off)}
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _believed(personal: PersonalSettings) -> tuple[Unknown, ...]:
+    """The moduli before anything was seen."""
+    return tuple(
+        Unknown(name=name, unit="MPa", prior_mean=about.mean, prior_std=about.std)
+        for name, about in personal.unknowns.items()
+        if name.startswith("E_f.")
+    )
+
+
+def _cpu_of_children() -> float:
+    """S of all processes that were started from here and have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+# -- on its way -----------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrived:
+    """A case, and where its open and closed midsurfaces truly were, in the axes of the case."""
+
+    case: ValveCase
+    opened: Frame
+    closed: Frame
+
+
+def arrive(
+    case: ValveCase,
+    positions: FloatArray,
+    registration: FloatArray,
+    door: DoorSettings,
+    folder: Path,
+) -> Arrived:
+    """What becomes of a virtual patient's geometry on its way.
+
+    Parameters
+    ----------
+    case : ValveCase
+        Of the patient, whose vertices correspond.
+    positions : ndarray
+        ``(n, 3)`` mm, where these truly were in the closed frame.
+    registration : ndarray
+        ``(6,)`` by which they are displaced against the annulus and the tips that the case states.
+    door : DoorSettings
+    folder : Path
+        Empty; what is exported and imported is left there.
+
+    Raises
+    ------
+    MvestError
+        If there is no such door, or what was exported is refused.
+    """
+    if door.kind not in DOORS:
+        raise ConfigurationError(f"door.kind = {door.kind!r}, expected one of {', '.join(DOORS)}")
+    opened, closed = case.frame(Role.REFERENCE), case.frame(Role.CLOSED)
+    drawn = closed.vertices if door.seen_with_errors else positions
+    true = replace(closed, vertices=positions)
+    closed = replace(closed, vertices=drawn, free_edge=drawn[case.free_edge], corresponds=False)
+    if door.kind in ("slicerheart", "labels"):
+        # Leaflets, annulus and tips are drawn in one image.
+        tips = displace(closed.papillary_tips, registration, closed.annulus.mean(axis=0))
+        closed = replace(closed, annulus=drawn[case.annulus], papillary_tips=tips)
+    return DOORS[door.kind](Arrived(case, opened, true), closed, door, folder)
+
+
+def _vertices(patient: Arrived, _closed: Frame, _door: DoorSettings, _folder: Path) -> Arrived:
+    return patient
+
+
+def _surfaces(patient: Arrived, closed: Frame, _door: DoorSettings, _folder: Path) -> Arrived:
+    return replace(patient, case=replace(patient.case, frames=(patient.opened, closed)))
+
+
+def _slicerheart(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -> Arrived:
+    export = folder / "slicerheart"
+    frames = {"MD": _in_lps(patient.opened), "MS": _in_lps(closed)}
+    annulus = patient.opened.annulus[:, :2] - patient.opened.annulus[:, :2].mean(axis=0)
+    landmarks = {name: int(np.argmax(annulus @ np.array(to))) for name, to in LANDMARKS.items()}
+    write_slicerheart(export, frames, patient.case.surface, landmarks)
+    options = SlicerheartOptions(pressure_mmHg=closed.pressure_mmHg, std_mm=door.std_mm)
+    return _posed(patient, import_slicerheart(export, options))
+
+
+def _labels(patient: Arrived, closed: Frame, door: DoorSettings, folder: Path) -> Arrived:
+    if door.voxel_mm is None:
+        raise ConfigurationError("door.voxel_mm is not given; a label map has voxels")
+    frames = [_in_lps(patient.opened), _in_lps(closed)]
+    files = [folder / f"{frame.name}.nii.gz" for frame in frames]
+    for frame, file in list(zip(frames, files, strict=True))[: 1 + door.closed]:
+        write_label_map(file, frame, patient.case.surface.thickness, door.voxel_mm)
+    tips = [tuple(frame.papillary_tips.ravel().tolist()) for frame in frames]
+    options = LabelsOptions(tips=tips[0], observer_mm=0.0)
+    if not door.closed:
+        imported = import_labels(files[0], options)
+        case = _with_closed(imported, frames[1], door.std_mm, folder / "by_hand")
+        return _posed(patient, case)
+    options = replace(
+        options, closed=str(files[1]), tips_closed=tips[1], pressure_mmHg=closed.pressure_mmHg
+    )
+    return _posed(patient, import_labels(files[0], options))
+
+
+DOORS: dict[str, Callable[[Arrived, Frame, DoorSettings, Path], Arrived]] = {
+    "vertices": _vertices,
+    "surfaces": _surfaces,
+    "slicerheart": _slicerheart,
+    "labels": _labels,
+}
+"""Kind of a door -> what it makes of a patient, whose closed frame was drawn so."""
+
+
+def _with_closed(case: ValveCase, closed: Frame, std_mm: float, folder: Path) -> ValveCase:
+    """A case of an open frame with a closed one added by hand, as midsurface.
+
+    Its chordae are laid out again, by both frames.
+    """
+    write_case(folder, case)
+    document = yaml.safe_load((folder / CASE_FILE).read_text(encoding="utf-8"))
+    region = {"region": np.asarray(closed.region)}
+    write_surface(folder / "closed.vtp", closed.vertices, closed.triangles, {}, region)
+    document["frames"].append(
+        {
+            "name": closed.name,
+            "time": closed.time,
+            "role": closed.role.value,
+            "surface": "closed.vtp",
+            "papillary_tips": closed.papillary_tips.tolist(),
+            "pressure": closed.pressure_mmHg,
+            "corresponds": False,
+        }
+    )
+    document["observation"] = {"std_mm": std_mm, "correlation_length_mm": 10.0}
+    del document["chordae"]
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    (folder / CASE_FILE).write_text(text, encoding="utf-8")
+    return read_case(folder)
+
+
+def _in_lps(frame: Frame) -> Frame:
+    """A frame in the axes of an image, LPS, the left tip first."""
+    tips = frame.papillary_tips[np.argsort(frame.papillary_tips[:, 0])]
+    shapes = {"vertices": frame.vertices, "annulus": frame.annulus, "free_edge": frame.free_edge}
+    moved = {name: points @ POSE.T + SHIFT for name, points in shapes.items()}
+    return replace(frame, papillary_tips=tips @ POSE.T + SHIFT, **moved)
+
+
+def _posed(patient: Arrived, case: ValveCase) -> Arrived:
+    true = (_in_lps(frame) for frame in (patient.opened, patient.closed))
+    return Arrived(replace(case, simulated=True), *true)
+
+
+# -- exports --------------------------------------------------------------------------------------
+def write_slicerheart(
+    folder: Path,
+    frames: Mapping[str, Frame],
+    surface: LeafletSurface,
+    landmarks: Mapping[str, int],
+) -> None:
+    """Write what ValveBatchExport writes with -vls, -acc and -lc, and the papillary muscles.
+
+    Parameters
+    ----------
+    folder : Path
+        Which does not exist.
+    frames : mapping of str to Frame
+        Phase (MD, MS, ...) -> midsurface, LPS mm; tips antero-lateral first.
+    surface : LeafletSurface
+        With the leaflets' names and thickness: the atrial side of one lies half its mean from the
+        midsurface.
+    landmarks : mapping of str to int
+        Which points of the annulus they are.
+
+    Raises
+    ------
+    ConfigurationError
+        If PyVista is not installed.
+    """
+    import pandas as pd
+
+    folder.mkdir()
+    contour: list[dict[str, str]] = []
+    marks: list[dict[str, str]] = []
+    for number, (phase, frame) in enumerate(frames.items()):
+        index, ring = str(3 + 9 * number), frame.annulus
+        about = {"Filename": SCENE, "Phase": phase, "FrameNumber": index, "Valve": "mitral"}
+        for label, name in enumerate(surface.region_names):
+            thick = float(surface.thickness[surface.vertex_region == label].mean())
+            stem = f"{SCENE}_mitral_frame_{index}_{phase}_atrial_mitral_{name}_leaflet"
+            _write_model(folder / f"{stem}.vtk", _atrial_side(frame, label, thick))
+        between = 0.5 * (ring + np.roll(ring, -1, axis=0))
+        for point in np.stack([ring, between], axis=1).reshape(-1, 3):
+            contour.append(about | _in_ras("AnnulusContour", "XYZ", point))
+        for name, k in landmarks.items():
+            marks.append(about | {"LandmarkLabel": name} | _in_ras("Landmark", "RAS", ring[k]))
+        muscles = ("antero-lateral", "postero-medial")
+        for muscle, tip in zip(muscles, frame.papillary_tips, strict=True):
+            middle = ring.mean(axis=0)
+            points = (tip + 0.4 * (tip - middle), tip, middle)
+            _write_points(folder / f"PapillaryMarkup-{muscle}-{phase}.fcsv", points)
+    table_of = pd.DataFrame(contour).assign(AnnulusContourLabel="")
+    table_of.to_csv(folder / "AnnulusContourPoints.csv", index=False)
+    pd.DataFrame(marks).to_csv(folder / "ValveLandmarkPoints.csv", index=False)
+
+
+def _in_ras(name: str, axes: str, point: FloatArray) -> dict[str, str]:
+    """R, A, S of a point, as exported tables have them."""
+    values = point * (-1, -1, 1)
+    return {f"{name}{axis}": f"{value:.2f}" for axis, value in zip(axes, values, strict=True)}
+
+
+def _atrial_side(frame: Frame, label: int, thickness_mm: float) -> Any:
+    """One leaflet with triangles of its own, moved to the atrium by half its thickness."""
+    try:
+        import pyvista
+    except ImportError as error:
+        raise ConfigurationError(
+            "folders of SlicerHeart are written by VTK: pip install mvest[viz]"
+        ) from error
+
+    def surface(points: FloatArray, triangles: IntArray) -> Any:
+        return pyvista.PolyData.from_regular_faces(points, triangles)
+
+    normals = surface(frame.vertices, frame.triangles).compute_normals(
+        cell_normals=False, split_vertices=False, consistent_normals=False
+    )
+    points = frame.vertices - 0.5 * thickness_mm * np.asarray(normals.point_data["Normals"])
+    leaflet = surface(points, frame.triangles[frame.region == label]).clean()
+    return leaflet.subdivide(1, subfilter="linear").decimate_pro(0.4, preserve_topology=True)
+
+
+def _write_model(file: Path, model: Any) -> None:
+    """A binary legacy model with the header of 3D Slicer, which names its axes."""
+    model.clear_data()
+    model.save(file, binary=True)
+    version, _, *rest = file.read_bytes().split(b"\n", 2)
+    file.write_bytes(b"\n".join([version, b"3D Slicer output. SPACE=LPS", *rest]))
+
+
+def _write_points(file: Path, points: Sequence[FloatArray]) -> None:
+    rows = [f"{k},{x},{y},{z},0,0,0,1,1,1,0,muscle-{k + 1},," for k, (x, y, z) in enumerate(points)]
+    head = (
+        "# Markups fiducial file version = 5.0",
+        "# CoordinateSystem = LPS",
+        "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID",
+    )
+    file.write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
+
+
+def write_label_map(file: Path, frame: Frame, thickness_mm: FloatArray, voxel_mm: float) -> None:
+    """Write thick leaflets as a NIfTI of labels: 1 anterior, 2 posterior, 0 elsewhere.
+
+    A voxel belongs to the leaflets if more than half of it does, to the larger part of the two.
+
+    Parameters
+    ----------
+    file : Path
+    frame : Frame
+        Midsurface, LPS mm; its regions are anterior and posterior.
+    thickness_mm : ndarray
+        ``(n,)``
+    voxel_mm : float
+    """
+    import nibabel
+
+    normals = smooth_vertex_normals(frame.vertices, frame.triangles)
+    drawn, low = drawn_leaflets(frame, normals, thickness_mm)
+    shape = [int(np.ceil(n * FINE_MM / voxel_mm)) for n in drawn.shape]
+    # Voxels lie anywhere against the leaflets.
+    start = 0.37 * voxel_mm
+    at = np.indices(shape).reshape(3, -1) * voxel_mm / FINE_MM + start / FINE_MM
+    share = []
+    for label in (1, 2):
+        # The mean over a voxel, as far as a normal distribution of its variance is one.
+        blurred = gaussian_filter((drawn == label).astype(np.float32), voxel_mm / FINE_MM / 12**0.5)
+        share.append(map_coordinates(blurred, at, order=1).reshape(shape))
+    anterior, posterior = share
+    labels = np.where(anterior + posterior > 0.5, 1 + (posterior > anterior), 0)
+    # Axes of NIfTI are R, A, S.
+    turned = np.array([-1.0, -1.0, 1.0])
+    affine = np.diag([*(turned * voxel_mm), 1.0])
+    affine[:3, 3] = turned * (low + start)
+    image: Any = nibabel.Nifti1Image  # its constructor has no types
+    nibabel.save(image(labels.astype(np.uint8), affine), file)
+
+
+def drawn_leaflets(
+    frame: Frame | LeafletSurface, normals: FloatArray, thickness_mm: FloatArray
+) -> tuple[NDArray[np.uint8], FloatArray]:
+    """Labels on a fine grid, and where its first point is (LPS mm)."""
+    vertices, triangles = frame.vertices, frame.triangles
+    corner = vertices[triangles]
+    longest = np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max()
+    k = int(np.ceil(longest / (0.8 * FINE_MM)))
+    i, j = np.meshgrid(np.arange(k + 1), np.arange(k + 1))
+    inside = i + j <= k
+    weights = np.column_stack([i[inside], j[inside], k - i[inside] - j[inside]]) / k
+    points = np.einsum("ka,tai->tki", weights, corner).reshape(-1, 3)
+    along = np.einsum("ka,tai->tki", weights, normals[triangles]).reshape(-1, 3)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    # Points are drawn as cells of the fine grid, half of one beyond where they are.
+    reach = np.einsum("ka,ta->tk", weights, thickness_mm[triangles]).ravel() - FINE_MM
+    leaflet = np.repeat(frame.region + 1, len(weights)).astype(np.uint8)
+    low = vertices.min(axis=0) - MARGIN_MM
+    shape = np.ceil((np.ptp(vertices, axis=0) + 2 * MARGIN_MM) / FINE_MM).astype(int) + 1
+    drawn: NDArray[np.uint8] = np.zeros(shape, dtype=np.uint8)
+    for zeta in np.linspace(-0.5, 0.5, int(np.ceil(thickness_mm.max() / (0.8 * FINE_MM))) + 1):
+        cell = np.round((points + zeta * reach[:, None] * along - low) / FINE_MM).astype(int)
+        drawn[tuple(cell.T)] = leaflet
+    return drawn, low
+
+
+# -- tables ---------------------------------------------------------------------------------------
+def summary(results: Results) -> dict[str, Table]:
+    """Each modulus by how the geometry arrived, and what estimates of each way are worth."""
+    runs = _runs(results)
+    rows = []
+    for record, estimate in runs:
+        for own in estimate.moduli:
+            grounds = () if estimate.verdict is None else estimate.verdict.grounds
+            rows.append(
+                {
+                    "patient": estimate.case,
+                    "geometry": record.numbers["geometry"],
+                    **{name: record.numbers[f"{name}_mm"] for name in OFF},
+                    "modulus": own.name,
+                    "truth": own.truth,
+                    "stated": own.estimate if estimate.is_stated else None,
+                    **interval("estimate", own),
+                    "error": None if own.relative_error is None else 100 * own.relative_error,
+                    **interval(PRIOR, prior_alone(own)),
+                    "check": record.numbers.get("check"),
+                    "its limit": record.numbers.get("check_limit"),
+                    "verdict": trust_of(estimate),
+                    "grounds": "; ".join(f"{one.check}: {one.text}" for one in grounds),
+                    "ended": record.reason,
+                }
+            )
+    about = {"patient": Column(label="patient (simulated)"), "geometry": Column()}
+    about |= {name: Column("mm", ".2f", hidden=name not in SHOWN) for name in OFF}
+    about |= {"modulus": Column(), "truth": Column("MPa")}
+    about |= interval_columns("estimate", hidden=True) | interval_columns(PRIOR, hidden=True)
+    about["stated"] = replace(about["estimate"], label="estimate", hidden=False)
+    about |= {"error": Column("%", "+.0f"), "verdict": Column()}
+    about["check"] = Column(label="check of the posterior")
+    about |= dict.fromkeys(("grounds", "ended"), Column(hidden=True))
+    return {"": table(rows, **about), "geometries": _geometries(runs)}
+
+
+OFF = tuple(
+    f"{frame}_{way}" for frame in ("open", "closed") for way in ("there", "back", "largest")
+)
+OFF += ("thickness_mean", "thickness_rms")
+"""How far geometries are off, in mm, by their names in a record."""
+SHOWN = ("open_back", "closed_back", "thickness_mean")
+
+
+def _runs(results: Results) -> list[tuple[Record, EstimateRecord]]:
+    """Record and estimate of each run, by patient and way."""
+
+    def place(record: Record) -> tuple[str, int, str]:
+        kind = list(DOORS).index(str(record.numbers["kind"]))
+        return record.estimates[0].case, kind, str(record.numbers["geometry"])
+
+    runs = [one for one in results.records.values() if one.estimates]
+    return [(record, record.estimates[0]) for record in sorted(runs, key=place)]
+
+
+def _geometries(runs: Sequence[tuple[Record, EstimateRecord]]) -> Table:
+    """What estimates are worth by how the geometry arrived, as far as they are stated."""
+    moduli: dict[str, list[Unknown]] = {}
+    verdicts: dict[str, list[str]] = {}
+    for record, estimate in runs:
+        name = str(record.numbers["geometry"])
+        moduli.setdefault(name, []).extend(own for own in stated(estimate) if own.is_modulus)
+        verdicts.setdefault(name, []).append(trust_of(estimate))
+    skill = skill_table("geometry", moduli)
+    counts = [{v: verdicts[row["geometry"]].count(v) for v in VERDICTS} for row in skill.rows]
+    rows = [row | own for row, own in zip(skill.rows, counts, strict=True)]
+    return table(rows, **skill.columns)
+
+
+def figure(results: Results) -> Figure:
+    """Estimates over their truths, by how the geometry arrived."""
+    groups: dict[str, list[tuple[Unknown, str]]] = {}
+    for record, estimate in _runs(results):
+        own = groups.setdefault(str(record.numbers["geometry"]), [])
+        own += [(modulus, trust_of(estimate)) for modulus in estimate.moduli]
+    return moduli_figure(groups)
+
+
+def keep(record: Record) -> Record:
+    """What tables and the figure need of a record."""
+    kept = (estimate.without_details() for estimate in record.estimates)
+    few = tuple(one.model_copy(update={"unknowns": one.moduli}) for one in kept)
+    return record.model_copy(update={"estimates": few})
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run_surfaces,
+    summary=summary,
+    figure=figure,
+    captions={
+        "": "Moduli over their true values, by how the geometry arrived, with 95 % intervals. "
+        "Simulated."
+    },
+    words=case_words,
+    keep=keep,
+    keeps_failures=True,
+)

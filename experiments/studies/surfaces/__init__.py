@@ -1,1 +1,0 @@
-"""What moduli come from surfaces as other programs and segmentations bring them."""
