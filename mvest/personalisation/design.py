@@ -25,19 +25,6 @@ from mvest.personalisation.model import build_model
 from mvest.personalisation.settings import PersonaliseSettings, PressureErrors, Treatment
 from mvest.problem.expectation import Expectation, expect
 
-__all__ = [
-    "ERRORS_MMHG",
-    "GROUPS",
-    "HALF",
-    "KINDS",
-    "SHARES",
-    "FrameDesigns",
-    "StatedErrors",
-    "design_case",
-    "design_text",
-    "expect_case",
-]
-
 SHARES = (1.0, 0.875, 0.75, 0.625, 0.5)
 """Of the closed frame's pressure, under which the frames of designs are: 120 to 60 mmHg."""
 

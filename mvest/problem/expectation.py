@@ -18,8 +18,6 @@ from mvest.estimation.transform import to_filter
 from mvest.problem.problem import Observed, Problem
 from mvest.typing import FloatArray
 
-__all__ = ["Expectation", "expect"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expectation:

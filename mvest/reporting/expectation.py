@@ -13,8 +13,6 @@ from mvest.problem.registration import unit_of
 from mvest.reporting.markup import MISSING, listed, number
 from mvest.typing import FloatArray
 
-__all__ = ["alike_words", "expectation_text", "measurement_words", "unknown_text"]
-
 MEASURED = {
     "pressure_scale": (0.02, "2 % (2.4 mmHg of 120)"),
     "chord_rest_length": (0.005, "0.5 %"),

@@ -1,11 +1,12 @@
 """The whole cycle on a few elements: its frames, its steps, and its derivatives in every frame."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from mvest.closure.cycle import CycleModel, CycleProtocol
+from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps
 from mvest.closure.model import ClosureModel
 from mvest.errors import InputError
 from mvest.mechanics.settings import MechanicsSettings, TissueSettings
@@ -53,7 +54,18 @@ def test_steps_meet_every_frame_and_are_no_larger_than_dt():
     # 0.05 in two steps, 0.01 in one, 0.09 in ceil(3.6) = 4.
     assert times == pytest.approx([0.025, 0.05, 0.06, 0.0825, 0.105, 0.1275, 0.15])
     assert p.frame_steps == (0, 2, 3, 7)
-    assert [step.time for step in p.steps(1)] == times[:2]
+    assert p.frames == ("0 s", "0.05 s", "0.06 s", "0.15 s")
+
+
+def test_sets_of_frames_are_spread_over_the_cycle():
+    p = CycleProtocol(rise=0.3, hold=0.1, fall=0.3, times=tuple(0.05 * k for k in range(15)))
+    sets = p.frame_sets()
+    assert sets["open and closed"] == [0, 8]
+    assert sets["3 frames, evenly"] == [0, 7, 14]
+    assert sets["5 frames, evenly"] == [0, 4, 7, 10, 14]
+    assert [len(s) for s in sets.values()] == [2, 3, 5, 8, 15, 5, 3, 6]
+    with pytest.raises(InputError, match="expected one on the plateau"):
+        CycleProtocol(times=(0.0, 0.1)).frame_sets()
 
 
 @pytest.mark.parametrize(
@@ -76,14 +88,6 @@ def test_frames_are_the_open_valve_and_those_of_the_motion(cycle):
     # Unloaded, but held back by the damping of the tissue: on its way, not at home.
     assert 0.1 * moved[2] < moved[3] < moved[2]
     np.testing.assert_array_equal(model.frames(AT), frames)
-
-
-def test_a_frame_by_itself_is_that_of_the_whole_cycle(cycle):
-    model, prediction = cycle
-    alone = model.frame(2, AT)
-    rows = slice(sum(model.sizes[:2]), sum(model.sizes[:3]))
-    np.testing.assert_allclose(alone.y, prediction.y[rows], atol=1e-10)
-    np.testing.assert_allclose(alone.jacobian, prediction.jacobian[rows], atol=1e-8)
 
 
 def test_derivatives_of_every_frame_agree_with_differences(cycle):
@@ -109,13 +113,38 @@ def test_derivatives_of_every_frame_agree_with_differences(cycle):
 
 def test_frames_converge_with_the_first_order_in_the_time_step():
     # Backward Euler: the difference between steps dt and dt/2 halves with dt.
+    model = model_of()
     frames = [
-        model_of(CycleProtocol(20.0, 0.1, 0.02, 0.08, dt, TIMES)).frames(AT)
+        replace(model, protocol=replace(PROTOCOL, dt=dt)).frames(AT)
         for dt in (0.0125, 0.00625, 0.003125)
     ]
     first, second = (np.linalg.norm(a - b, axis=(1, 2))[1:] for a, b in pairwise(frames))
     orders = np.log2(first / second)
     assert np.all(np.abs(orders - 1) < 0.15), orders
+    found = compare_time_steps(model, (0.0125, 0.00625, 0.003125), np.array([AT, 1.01 * AT]))
+    changes = [float(np.sqrt(np.mean((b - a) ** 2))) for a, b in pairwise(frames)]
+    assert [one.change for one in found] == pytest.approx([*changes, None])
+    assert found[0].order == pytest.approx(np.log2(changes[0] / changes[1]))
+    assert [one.unevenness for one in found] == [1.0] * 3
+
+
+def test_time_steps_that_are_not_halves_are_refused():
+    with pytest.raises(InputError, match="each to be half of the one before"):
+        compare_time_steps(model_of(), (0.05, 0.02), AT[None])
+
+
+def test_a_time_step_that_cannot_be_followed_is_said(monkeypatch):
+    def frames(self, m):
+        if m[0] < 2:
+            raise InputError("no cycle with the parameters")
+        return np.full((1, 1, 3), m[0])
+
+    monkeypatch.setattr(CycleModel, "frames", frames)
+    path = np.array([[3.0], [2.5], [1.0], [0.5]])
+    found = compare_time_steps(model_of(), (0.05, 0.025), path)
+    assert [one.reason for one in found] == ["no cycle with the parameters"] * 2
+    assert [one.unevenness for one in found] == [None, None]
+    assert found[0].change == 0.0
 
 
 def test_inadmissible_tissue_is_a_failed_prediction(cycle):

@@ -5,7 +5,6 @@ import pytest
 
 from mvest.errors import InputError, MaterialError
 from mvest.estimation import (
-    DriftSmoother,
     EnsembleFilter,
     ExtendedFilter,
     Gaussian,
@@ -15,9 +14,7 @@ from mvest.estimation import (
     PaperFilter,
     Prediction,
     SchmidtFilter,
-    SequentialFilter,
     UnscentedFilter,
-    profile,
 )
 from mvest.estimation.prediction import as_prediction, predict
 from mvest.estimation.wrappers import Remembered, SharedStart, of_some, rows_of, stacked
@@ -34,7 +31,6 @@ FILTERS = (
     IteratedFilter(),
     UnscentedFilter(),
     EnsembleFilter(),
-    SequentialFilter((2, 4)),
     SchmidtFilter(IteratedFilter(), ("m[1]",)),
     MonteCarloFilter(),
 )
@@ -57,18 +53,6 @@ def run_filter(filter_):
     return lambda model: filter_(model, PRIOR, Y, 0.1)
 
 
-class Frames:
-    def __init__(self, model) -> None:
-        self.model = model
-
-    def frame(self, k: int, m: np.ndarray):
-        return self.model(m)
-
-
-def run_profile(model):
-    return profile(model, Y, 0.1, np.ones(2), 0, np.array([-1.0, 1.0]))
-
-
 def run_expectation(model):
     problem = Problem(("a", "b"), model, PRIOR, IteratedFilter(), Identity(), {})
     return expect(problem, Observation(("closed",), Y.reshape(1, 2, 3), 0.1, predicted=("closed",)))
@@ -76,8 +60,6 @@ def run_expectation(model):
 
 USES = {
     **{named(f): run_filter(f) for f in FILTERS},
-    "drift": lambda model: DriftSmoother((3, 3), 0.01)(Frames(model), PRIOR, Y, 0.1),
-    "profile": run_profile,
     "expectation": run_expectation,
     "some parameters": lambda model: of_some(model, np.ones(2), np.array([0]))(np.ones(1)),
     "some rows": lambda model: rows_of(model, np.ones(6, dtype=bool))(np.ones(2)),
@@ -105,7 +87,7 @@ def test_another_return_is_one_line_that_says_what_is_expected(use: str, returne
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("use", ["IteratedFilter", "profile", "expectation", "some parameters"])
+@pytest.mark.parametrize("use", ["IteratedFilter", "expectation", "some parameters"])
 def test_derivatives_by_other_parameters_are_refused(use: str) -> None:
     with pytest.raises(InputError, match=r"2 parameters.*shape \(6, 3\)"):
         USES[use](lambda m: (Y, np.ones((6, 3))))

@@ -4,27 +4,47 @@ import numpy as np
 import pytest
 
 from mvest.errors import InputError
-from mvest.estimation import Gaussian, IteratedFilter, Prediction
-from mvest.estimation.information.model_error import shift_by_model_error
+from mvest.estimation import Gaussian, IteratedFilter, Log, Prediction
+from mvest.estimation.information.model_error import shift_by_model_error, with_shift
 
 PRIOR = Gaussian(np.array([1.0, -1.0]), np.array([[0.5, 0.1], [0.1, 2.0]]))
 R = np.linspace(0.1, 0.4, 6)
 
 
+def estimated(H, y, prior=PRIOR, R=R):
+    return IteratedFilter(1e-12)(lambda m: Prediction(H @ m, H), prior, y, R)
+
+
 def test_the_shift_is_the_difference_of_two_estimates_of_a_linear_model():
     rng = np.random.default_rng(2)
     H, y, offset = rng.normal(size=(6, 2)), rng.normal(size=6), rng.normal(size=6)
-    estimate = [
-        IteratedFilter(1e-12)(lambda m: Prediction(H @ m, H), PRIOR, seen, R).mean
+    found, moved = estimated(H, y), estimated(H, y + offset)
+    shift = shift_by_model_error(found, R, offset)
+    np.testing.assert_allclose(shift, moved.mean - found.mean, rtol=1e-9)
+    wider = with_shift(found, shift)
+    np.testing.assert_allclose(wider.std, np.hypot(found.std, shift))
+    np.testing.assert_array_equal(wider.mean, found.mean)
+
+
+def test_the_shift_is_in_the_coordinates_of_the_filter():
+    rng = np.random.default_rng(6)
+    H, y, offset = (rng.normal(size=shape) for shape in ((6, 2), 6, 6))
+    prior = Gaussian.from_variance(np.ones(2), np.ones(2))
+    # Linear in the logarithms.
+    found, moved = (
+        IteratedFilter(1e-12)(
+            lambda m: Prediction(H @ np.log(m), H / m), prior, seen, R, transform=Log()
+        )
         for seen in (y, y + offset)
-    ]
-    shift = shift_by_model_error(H, R, offset, PRIOR)
-    np.testing.assert_allclose(shift, estimate[1] - estimate[0], rtol=1e-9)
+    )
+    difference = moved.transformed.mean - found.transformed.mean
+    np.testing.assert_allclose(shift_by_model_error(found, R, offset), difference, rtol=1e-8)
 
 
 def test_what_the_prior_holds_is_not_shifted():
     held = Gaussian.from_variance(np.zeros(2), np.array([1.0, 0.0]))
-    shift = shift_by_model_error(np.ones((3, 2)), 0.01, np.ones(3), held)
+    found = estimated(np.ones((3, 2)), np.zeros(3), held, 0.01)
+    shift = shift_by_model_error(found, 0.01, np.ones(3))
     assert shift[1] == 0.0
     # One parameter, three observations: 300 of 300 + 1.
     assert shift[0] == pytest.approx(300 / 301)
@@ -34,5 +54,6 @@ def test_what_the_prior_holds_is_not_shifted():
     ("offset", "message"), [(np.ones(4), r"shape \(4,\)"), (np.array([1, 2, np.nan]), "finite")]
 )
 def test_inadmissible_offsets_are_refused(offset, message):
+    found = estimated(np.ones((3, 2)), np.zeros(3), R=0.01)
     with pytest.raises(InputError, match=message):
-        shift_by_model_error(np.ones((3, 2)), 0.01, offset, PRIOR)
+        shift_by_model_error(found, 0.01, offset)

@@ -1,4 +1,4 @@
-"""The studies of chordae by family and of a stiff patch, on a few elements that hardly move."""
+"""The study of a stiff patch, on a few elements that hardly move."""
 
 import re
 from dataclasses import replace
@@ -6,11 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.common.building.whole_cycle import Bound
-from experiments.common.records.record import Record
-from experiments.studies.chord.findings import Findings as ChordFindings
-from experiments.studies.chord.findings import Fit as ChordFit
-from experiments.studies.chord.study import STUDY as CHORD
 from experiments.studies.patch.findings import Compared, Places
 from experiments.studies.patch.findings import Findings as PatchFindings
 from experiments.studies.patch.findings import Fit as PatchFit
@@ -89,23 +84,6 @@ def test_a_patch_is_compared_with_the_truth_where_it_is(run):
     assert "half the patch's radius" in said.out
 
 
-def test_every_chordal_family_is_estimated_from_both_sets_of_frames(run):
-    status, record, folder, said = run(
-        "experiment=chord", "truth.values=[6,2,0.9,1.1,0.97,0.97]", "cycle.noise_mm=0.05"
-    )
-    assert status == 0, said.err
-    found = record["findings"]
-    first = [entry for entry in found["results"] if entry["seed"] == 0]
-    assert [entry["frames"] for entry in first] == ["open and closed", "whole cycle"]
-    prior, (two, whole) = np.array(found["prior_std"]), (np.array(e["std"]) for e in first)
-    # Data never widen the posterior by more than its change of place, and more data tell more.
-    assert np.all(two < 1.2 * prior)
-    assert np.sum(np.log(whole)) < np.sum(np.log(two))
-    assert len([e for e in found["results"] if e["frames"] == "whole cycle"]) == 2
-    assert logged(folder)["std.chord_stiffness.basal"] == whole[3]
-    assert (folder / "chord.png").is_file()
-
-
 def test_tables_say_what_missed_its_target(tmp_path):
     compared = Compared(
         truth=(6.0, 12.0, 6.0), modulus=(6.0, 9.0, 6.0), log_std=(0.1, 0.2, 0.1),
@@ -130,35 +108,3 @@ def test_tables_say_what_missed_its_target(tmp_path):
     assert re.search(r"Place 4\.0 mm off, target 3\.5 mm .*: missed", text)
     files = PATCH.write(tmp_path, {"made_up": record}, {})
     assert {path.suffix for path in files} == {".csv", ".md", ".png", ".pdf"}
-
-
-def chord_record() -> Record[ChordFindings]:
-    def fit(frames: str, *std: float) -> ChordFit:
-        correlation = ((1.0, -0.7), (-0.7, 1.0))
-        return ChordFit(
-            frames, 0, "converged", "converged", (6.1, 1.01), (0.01, 0.01), std, correlation, 2.1, 4
-        )
-
-    def bound(frames: str, *std: float | None) -> Bound:
-        return Bound(frames, 2, std, (), 1.0, ())
-
-    findings = ChordFindings(
-        truth=(6.0, 1.0), start=(5.0, 1.1), prior_std=(0.5, 0.3), noise_mm=0.5, times=(0.0, 1.0),
-        vertices=9,
-        results=(fit("open and closed", 0.3, 0.29), fit("whole cycle", 0.1, 0.14)),
-        bounds=(bound("open and closed", 0.4, None), bound("whole cycle", 0.1, 0.16)),
-        measures={},
-    )  # fmt: skip
-    return made_up(findings, parameters=("E_f.anterior", "chord_stiffness.basal"))
-
-
-def test_identified_is_what_the_data_make_twice_as_sure(tmp_path):
-    record = chord_record()
-    text = CHORD.words(record)
-    # 10 % of 50 % is, 30 % of 50 % is not; 14 % of 30 % is, 29 % of 30 % is not.
-    modulus, chord = (line for line in text.splitlines() if line.startswith(("| ant", "| bas")))
-    assert modulus.endswith("| whole cycle |")
-    assert chord.endswith("| whole cycle |")
-    assert "(unbounded)" in chord
-    assert "-0.70" in text
-    assert len(CHORD.write(tmp_path, {"made_up": record}, {})) == 4

@@ -1,1 +1,0 @@
-"""Chordae by family: what of them is identified."""

@@ -1,0 +1,383 @@
+"""What a whole cycle tells: what its frames could tell, what time steps do, and estimates from it.
+
+Everything follows from one simulated cycle of a valve whose parameters are known. The experiments
+`cycle`, `joint`, `joint_open` and `chord` differ in the unknowns and in what is estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.common.building.closure import closure_model
+from experiments.common.building.filters import build_filter
+from experiments.common.building.gate import gate_of
+from experiments.common.expectation import noise_words
+from experiments.common.progress import TYPICAL_SOLVES, SolveBar
+from experiments.common.records.record import Mesh, Number
+from experiments.common.schema import build
+from experiments.common.study import Job, Result, Results, Study
+from mvest.closure.cycle import CycleModel, CycleProtocol, compare_time_steps, with_mesh_error
+from mvest.errors import ConfigurationError, InputError
+from mvest.estimation.filters.iterated import IteratedFilter
+from mvest.estimation.information.consistency import nees
+from mvest.estimation.information.identifiability import identifiability
+from mvest.estimation.prediction import predict
+from mvest.estimation.wrappers import Remembered
+from mvest.observation.vertices import Observation
+from mvest.problem.estimate import StudyResult, estimate
+from mvest.problem.expectation import expect
+from mvest.problem.problem import Problem
+from mvest.problem.record import finite, record_of
+from mvest.problem.synthetic import Truth
+from mvest.quantities import AxisCount, Count, Length, Logarithm, Share, TimeStep, Tolerance
+from mvest.reporting.expectation import expectation_text
+from mvest.reporting.tables import Column, Table, table
+from mvest.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDY", "run_cycle"]
+
+Values = Mapping[str, Any]
+Row = dict[str, Any]
+EXACT, TWO, WHOLE, OTHER = "no noise", "open and closed", "whole cycle", "another mesh"
+"""Observations that parameters are estimated from; all but the second are of all frames."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CycleSettings:
+    """What is simulated, and what is estimated from it.
+
+    Meshes are columns and rows of cells, then of contact points.
+    """
+
+    protocol: CycleProtocol = field(default_factory=CycleProtocol)
+    noise_mm: Length = 0.5  # SD of each coordinate
+    estimated: tuple[str, ...] = ()  # of no noise, open and closed, whole cycle, another mesh
+    exact_assumed_mm: Length = 0.1  # SD that the filter assumes of coordinates without noise
+    seeds: Count = 8  # of the noise of the whole cycle
+    # Decrease of the objective below which a search ends that starts near its end: 0.02 moves no
+    # parameter by more than a fifth of its standard deviation, 0.05 by a third.
+    objective_tolerance: Tolerance = 0.02
+    finer: tuple[AxisCount, ...] = (32, 4, 96, 21)  # mesh of a truth that is not the estimator's
+    check: tuple[AxisCount, ...] = (40, 5, 120, 26)  # mesh that shows what the estimator's does
+    finer_dt_factor: Share = 0.5  # of the time step on both
+    time_steps: tuple[TimeStep, ...] = ()  # s, each half of the last, to be compared
+    path_steps: Count = 16  # along which frames are looked at for jumps
+    path_change: Logarithm = -0.3  # of the first parameter along it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the study adds to the configuration."""
+
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """An estimate from errors of a seed; ``shift (p,)`` by its mesh, in parts of the truth."""
+
+    label: str
+    seed: int
+    result: StudyResult
+    shift: FloatArray | None = None
+
+
+def run_cycle(job: Job[Settings]) -> Result:
+    """Simulate a cycle; say what its frames could tell, and estimate what is to be estimated.
+
+    Raises
+    ------
+    InputError
+        If the truth has no cycle, on whichever mesh, or a setting is inadmissible.
+    """
+    values, settings = job.values, job.settings.cycle
+    truth = np.array(values["truth"]["values"], dtype=float)
+    model = CycleModel(closure_model(values), settings.protocol)
+    with _bar("true cycle", model, 1):
+        true = predict(model, truth, derivatives=True)
+    if not true.converged:
+        raise InputError(f"the truth has no cycle: {true.reason}")
+    frames = true.y.reshape(len(settings.protocol.times), -1, 3)
+    bounds = list(_bounds(settings, true.jacobian.reshape(*frames.shape, -1), model.names, truth))
+    tables = {"": table(bounds, frames="", count="", parameter="", bound="%")}
+    numbers: dict[str, Number] = {"vertices": frames.shape[1], "noise_mm": settings.noise_mm}
+    fits, solves = list[Fit](), 1
+    if dts := settings.time_steps:
+        path = np.tile(truth, (settings.path_steps + 1, 1))
+        path[:, 0] *= np.linspace(1.0, 1.0 + settings.path_change, len(path))
+        with _bar("time steps", model, len(dts) * len(path)):
+            steps = compare_time_steps(model, dts, path)
+        tables["time_steps"] = table(
+            [asdict(step) for step in steps], dt="s", change="mm", unevenness=":.1f"
+        )
+        solves += len(dts) * len(path)
+    if settings.estimated:
+        fits = _estimates(values, settings, frames, truth, numbers)
+        rows = list(_rows(fits, bounds))
+        tables |= {"estimates": table(rows, **ESTIMATES), "over_seeds": _over_seeds(rows)}
+        own = (one.result.filtered for one in fits if one.shift is None)
+        solves += sum(found.forward_solves for found in own if found is not None)
+    failed = [f"{one.label}: {one.result.reason}" for one in fits if not one.result.converged]
+    return Result(
+        tables=tables,
+        numbers=numbers,
+        estimates=tuple(
+            record_of(one.result, seed=one.seed, case=one.label, simulated=True) for one in fits
+        ),
+        status="failed" if failed else "converged",
+        reason="; ".join(failed) or "completed",
+        mesh=Mesh.of(model.closure.mesh),
+        forward_solves=solves,
+        gate=gate_of(values),
+    )
+
+
+def _bounds(
+    settings: CycleSettings, H: FloatArray, names: Sequence[str], truth: FloatArray
+) -> Iterator[Row]:
+    """Cramér-Rao bounds of sets of frames, and which other parameter each is correlated with.
+
+    ``H (f, n, 3, p)`` are the derivatives of the frames at the truth ``(p,)``.
+    """
+    for label, chosen in settings.protocol.frame_sets().items():
+        rows = H[chosen].reshape(-1, len(truth))
+        bound = identifiability(rows, settings.noise_mm**2, truth, names=names)
+        others = np.nan_to_num(bound.correlation * (1.0 - np.eye(len(names))))
+        for k, name in enumerate(names):
+            most = int(np.argmax(np.abs(others[k])))
+            yield {
+                "frames": label,
+                "count": len(chosen),
+                "parameter": name,
+                "bound": finite(100 * bound.std[k] / truth[k]),
+                "largest correlation": float(others[k, most]),
+                "with": names[most],
+            }
+
+
+def _estimates(
+    values: Values,
+    settings: CycleSettings,
+    frames: FloatArray,
+    truth: FloatArray,
+    numbers: dict[str, Number],
+) -> list[Fit]:
+    """Estimates of all parameters from observations of one true cycle."""
+    if not set(settings.estimated) <= {EXACT, TWO, WHOLE, OTHER}:
+        known = f"{EXACT}, {TWO}, {WHOLE}, {OTHER}"
+        raise ConfigurationError(
+            f"cycle.estimated = {settings.estimated}, expected some of {known}"
+        )
+    model, problem = _problem(values, settings)
+    fits = list[Fit]()
+    for what in settings.estimated:
+        at = settings.protocol.frame_sets()[TWO if what == TWO else WHOLE]
+        shown, noise = frames, 0.0 if what == EXACT else settings.noise_mm
+        if what == OTHER:
+            shown = _on_mesh(values, settings, settings.finer).frames(truth)
+            apart = np.linalg.norm(shown - frames, axis=-1)
+            numbers["meshes_apart_mm"] = float(apart.mean())
+        for k in range(settings.seeds if what == WHOLE else 1):
+            seed = values["seed"] + k
+            positions = shown + noise * np.random.default_rng(seed).normal(size=shown.shape)
+            seen = _observation(settings, positions, noise or settings.exact_assumed_mm, at)
+            label = f"{what}, errors {seed}" if what == WHOLE else what
+            with _bar(label, model, TYPICAL_SOLVES, problem.parameters) as bar:
+                result = estimate(problem, seen, on_iterate=bar.iterate)
+            result = result.against(Truth(problem.parameters, truth, frames[at]))
+            fits.append(Fit(label, seed, result))
+            found, search = result.filtered, problem.filter
+            first = what == WHOLE and not k and result.converged
+            if first and found is not None and isinstance(search, IteratedFilter):
+                # The mode does not depend on where its search starts.
+                start, enough = tuple(found.mean.tolist()), settings.objective_tolerance
+                nearer = replace(search, start=start, objective_tolerance=enough)
+                problem = replace(problem, filter=nearer)
+            if what == OTHER:
+                fits += _with_mesh_error(values, settings, fits[-1], numbers)
+    return fits
+
+
+def _with_mesh_error(
+    values: Values, settings: CycleSettings, one: Fit, numbers: dict[str, Number]
+) -> Iterator[Fit]:
+    """An estimate with what its own mesh may have done to it, from one run on a third mesh."""
+    found, seen, truth = one.result.filtered, one.result.observation, one.result.truth
+    if found is None or seen is None or truth is None:
+        return
+    finer = _on_mesh(values, settings, settings.check)
+    try:
+        wider, shift, numbers["check_mesh_apart_mm"] = with_mesh_error(found, seen.R, finer)
+    except InputError as error:
+        numbers["check_mesh"] = str(error)
+        return
+    result, label = replace(one.result, filtered=wider), f"{OTHER}, with the mesh's error"
+    yield Fit(label, one.seed, result, shift / truth.values)
+
+
+def _on_mesh(values: Values, settings: CycleSettings, mesh: tuple[int, ...]) -> CycleModel:
+    """The cycle on another mesh, with a shorter time step."""
+    columns, rows, around, along = mesh
+    changed = {
+        **values,
+        "mesh": {**values["mesh"], "columns": columns, "rows": rows},
+        "mechanics": {**values["mechanics"], "contact_points": {"columns": around, "rows": along}},
+    }
+    dt = settings.protocol.dt * settings.finer_dt_factor
+    return CycleModel(closure_model(changed), replace(settings.protocol, dt=dt))
+
+
+def _bar(title: str, model: CycleModel, solves: int, names: Sequence[str] = ()) -> SolveBar:
+    """A progress bar that follows a model."""
+    bar = SolveBar(title, len(model.protocol.steps()), solves, names)
+    model.closure.on_step = bar.step
+    return bar
+
+
+def _problem(values: Values, settings: CycleSettings) -> tuple[CycleModel, Problem]:
+    """The estimator's own model, and what is to be estimated with it."""
+    names = tuple(values["parameters"])
+    filter_, transform, prior = build_filter(values["filter"], names)
+    model = CycleModel(closure_model(values), settings.protocol)
+    tissue = model.closure.settings.tissue
+    return model, Problem(names, Remembered(model), prior, filter_, transform, tissue)
+
+
+def _observation(
+    settings: CycleSettings, positions: FloatArray, std_mm: float, at: list[int]
+) -> Observation:
+    """Some of the frames ``(f, n, 3)`` mm of a cycle."""
+    names = settings.protocol.frames
+    frames = tuple(names[k] for k in at)
+    return Observation(frames, positions[at], np.array(std_mm**2), predicted=names)
+
+
+def expect_cycle(values: Values, _folder: Path | None = None) -> str:
+    """What ``check=true`` says of all frames of a cycle: the answer of the Fisher information."""
+    settings = build(CycleSettings, values["cycle"])
+    model, problem = _problem(values, settings)
+    at = settings.protocol.frame_sets()[WHOLE]
+    rest = model.closure.valve.surface.vertices
+    seen = _observation(settings, np.tile(rest, (len(at), 1, 1)), settings.noise_mm, at)
+    with _bar(values["name"], model, 1):
+        expected = expect(problem, seen)
+    noise = noise_words("assumed", [settings.noise_mm], 0.0)
+    return expectation_text(f"{values['name']}, {values['row']}", expected, noise)
+
+
+ESTIMATES: dict[str, Column | str] = {
+    "estimate from": "",
+    "parameter": "",
+    "estimate": Column(std="SD"),
+    "error": Column("%", std="relative SD"),
+    "relative SD": "%",
+    "shift": "%",
+    "bound": "%",
+    "prior SD": "%",
+    "residual": "mm",
+}
+
+
+def _rows(fits: Sequence[Fit], bounds: Sequence[Row]) -> Iterator[Row]:
+    """A row for each estimate and parameter; relative values in percent."""
+    best = {(row["frames"], row["parameter"]): row["bound"] for row in bounds}
+    for one in fits:
+        found, truth = one.result.filtered, one.result.truth
+        if found is None or truth is None or one.result.observation is None:
+            continue
+        z, true = found.transformed, truth.values
+        # In filter coordinates, where the posterior is nearly normal.
+        squared = nees(z.mean - found.transform.forward(true), z.covariance)
+        for k, name in enumerate(found.names):
+            yield {
+                "estimate from": one.label,
+                "parameter": name,
+                "truth": true[k],
+                "start": found.prior.mean[k],
+                "prior SD": 100 * found.prior.std[k] / found.prior.mean[k],
+                "estimate": found.mean[k],
+                "SD": found.std[k],
+                "error": 100 * (found.mean[k] / true[k] - 1),
+                "relative SD": 100 * found.std[k] / found.mean[k],
+                "shift": None if one.shift is None else 100 * one.shift[k],
+                "bound": best[TWO if one.label == TWO else WHOLE, name],
+                "NEES": squared,
+                "runs": found.forward_solves,
+                "residual": found.residual_rms(one.result.observation.y),
+                "status": "converged" if one.result.converged else "failed",
+            }
+
+
+def _over_seeds(rows: Sequence[Row]) -> Table:
+    """Root mean square error over the seeds of the whole cycle in parts of the bound."""
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row["estimate from"].startswith(f"{WHOLE},") and row["status"] == "converged":
+            found.setdefault(row["parameter"], []).append(row["error"] / row["bound"])
+    return table(
+        {"parameter": name, "seeds": len(v), "RMS error / bound": np.sqrt(np.mean(np.square(v)))}
+        for name, v in found.items()
+    )
+
+
+def figure(results: Results) -> Figure:
+    """What sets of frames could tell, beside the estimates if there are any."""
+    from mvest.reporting.style import COLOURS, MARKERS, SMALL, log_axis, panels
+
+    estimated = "estimates" in results.table_names
+    drawn, (axes,) = panels(1, 1 + estimated, 4.6)
+    for k, (name, own) in enumerate(results.table().frame.groupby("parameter", sort=False)):
+        style = {"color": COLOURS[k % 6], "marker": MARKERS[k % 6], "ms": 5}
+        axes[0].plot(own["bound"], own["frames"], ls="", label=name, **style)
+    axes[0].set(xscale="log", xlabel="smallest possible SD (%)")
+    if estimated:
+        _draw_estimates(axes[1], results.table("estimates").frame)
+    for one in axes:
+        one.invert_yaxis()
+        log_axis(one.xaxis)
+        one.legend(fontsize=SMALL - 1, frameon=False, loc="lower center",
+                   bbox_to_anchor=(0.4, 1.0), ncols=2)  # fmt: skip
+    return drawn
+
+
+def _draw_estimates(axes: Any, rows: Any) -> None:
+    """Errors ± 2 standard deviations, a group for each parameter."""
+    from mvest.reporting.style import COLOURS
+
+    kinds: list[str] = []
+    groups = list(rows.groupby("estimate from", sort=False))
+    for j, (label, own) in enumerate(groups):
+        kind = label.partition(", errors")[0]
+        kinds += [] if kind in kinds else [kind]
+        y = np.arange(len(own)) + 0.7 * ((j + 0.5) / len(groups) - 0.5)
+        axes.errorbar(
+            own["error"], y, xerr=2 * own["relative SD"], fmt="o", ms=3, lw=1,
+            color=COLOURS[kinds.index(kind) % 6],
+        )  # fmt: skip
+    for colour, kind in zip(COLOURS, kinds, strict=False):
+        axes.plot([], [], "o", color=colour, label=kind)
+    axes.axvline(0.0, color="black", lw=0.8)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_yticks(range(len(own)), own["parameter"])
+    axes.set_xlabel("error ± 2 SD (%)")
+
+
+STUDY = Study(
+    settings=Settings,
+    run=run_cycle,
+    figure=figure,
+    captions={
+        "": "The smallest possible standard deviation (Cramér-Rao) of each parameter from sets of "
+        "frames, and estimates with 2 standard deviations. Simulated."
+    },
+    keeps_failures=True,
+    checks=lambda: (expect_cycle,),
+)

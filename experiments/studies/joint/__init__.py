@@ -1,1 +1,0 @@
-"""Chordal length and moduli from a whole cycle."""

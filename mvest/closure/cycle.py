@@ -1,0 +1,341 @@
+"""A valve over a whole cycle, open to closed and back: all observed frames and their derivative.
+
+The state of the valve (positions, velocities, strains with their history) follows from the
+parameters through the dynamics. It is no unknown of its own: where parameters are updated, the
+state is that of the cycle run again with them, so that parameters and state are consistent at every
+frame. What is not estimated is a disturbance of the state that no parameter explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, zip_longest
+
+import numpy as np
+
+from mvest.closure.model import ClosureModel
+from mvest.errors import InputError, MaterialError
+from mvest.estimation.estimate import Estimate
+from mvest.estimation.information.model_error import shift_by_model_error, with_shift
+from mvest.estimation.noise import NoiseCovariance
+from mvest.estimation.prediction import Prediction
+from mvest.mechanics.integrate import simulate
+from mvest.mechanics.settings import smooth_step
+from mvest.mechanics.steps import Simulation, Step
+from mvest.mechanics.valve_system import boundary_loading
+from mvest.quantities import BeatTime, Pressure, TimeStep
+from mvest.typing import FloatArray
+
+DEFAULT_TIMES = tuple(round(0.05 * k, 2) for k in range(21))
+"""s, from the open valve until it is open again."""
+
+
+@dataclass(frozen=True, slots=True)
+class CycleProtocol:
+    """Pressure, boundary motion, time steps and observed times of one cycle.
+
+    Pressure, annulus and papillary tips follow one phase: a smooth rise from the open valve's 0 to
+    the closed valve's 1, a plateau, and a smooth fall.
+
+    Attributes
+    ----------
+    pressure_mmHg : float
+        Transmitral, on the plateau.
+    rise, hold, fall : float
+        s, of the three parts.
+    dt : float
+        s, the largest time step: the time between two frames is divided evenly into steps no
+        larger than this.
+        Leaflets flip within some milliseconds; where a step leaps over that, frames jump with the
+        parameters (`experiment=cycle` measures it).
+    times : tuple of float
+        s at which the valve is looked at, strictly increasing from >= 0; the run ends at the last.
+    """
+
+    pressure_mmHg: Pressure = 120.0
+    rise: BeatTime = 0.3
+    hold: BeatTime = 0.2
+    fall: BeatTime = 0.3
+    dt: TimeStep = 0.00625
+    times: tuple[BeatTime, ...] = field(default=DEFAULT_TIMES)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"time step of a cycle dt = {self.dt} s, expected > 0")
+        if not np.isfinite(self.pressure_mmHg):
+            raise InputError(f"pressure {self.pressure_mmHg} mmHg, expected a finite number")
+        if not (self.rise > 0 and self.hold >= 0 and self.fall > 0):
+            raise InputError(
+                f"cycle with rise = {self.rise}, hold = {self.hold}, fall = {self.fall} s, "
+                f"expected rise and fall > 0 and hold >= 0"
+            )
+        times = np.asarray(self.times, dtype=float)
+        if not (
+            times.ndim == 1
+            and times.size
+            and np.all(np.isfinite(times))
+            and times[0] >= 0
+            and np.all(np.diff(times) > 0)
+            and times[-1] > 0
+        ):
+            raise InputError(
+                f"observed times {self.times} s, expected increasing ones from 0 on, "
+                f"at least one after it"
+            )
+
+    def phase(self, t: float, /) -> float:
+        """Share of the closure at time ``t`` (s)."""
+        return smooth_step(t / self.rise) - smooth_step((t - self.rise - self.hold) / self.fall)
+
+    def pressure(self, t: float, /) -> float:
+        """Transmitral pressure (mmHg) at time ``t`` (s)."""
+        return self.pressure_mmHg * self.phase(t)
+
+    def steps(self) -> tuple[Step, ...]:
+        """The time steps to the last observed frame."""
+        steps: list[Step] = []
+        last = 0.0
+        for time, n in zip(self.times, self._steps_between(), strict=True):
+            steps += [Step(last + (time - last) * (k + 1) / n) for k in range(n)]
+            last = time
+        return tuple(steps)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the observed frames, ``(f,)``."""
+        return tuple(f"{time:g} s" for time in self.times)
+
+    @property
+    def frame_steps(self) -> tuple[int, ...]:
+        """Number of steps taken when each frame is reached, ``(f,)``."""
+        return tuple(np.cumsum(self._steps_between()).tolist())
+
+    def frame_sets(self) -> dict[str, list[int]]:
+        """Sets of observed frames by name: ever more of them, and parts of the cycle.
+
+        Raises
+        ------
+        InputError
+            If the valve is not held closed in any frame.
+        """
+        total = len(self.times)
+        held = [k for k, time in enumerate(self.times) if self.phase(time) > 1 - 1e-9]
+        if not held:
+            raise InputError(f"observed times {self.times} s, expected one on the plateau")
+        evenly = {
+            f"{n} frames, evenly": sorted({round(k * (total - 1) / (n - 1)) for k in range(n)})
+            for n in (3, 5, 8)
+            if n < total
+        }
+        sets = {
+            "open and closed": [0, held[-1]],
+            **evenly,
+            "whole cycle": list(range(total)),
+            "only closing": list(range(1, held[0])),
+            "only held closed": held,
+            "only opening": list(range(held[-1] + 1, total)),
+        }
+        return {name: frames for name, frames in sets.items() if frames}
+
+    def _steps_between(self) -> list[int]:
+        # A gap that is a multiple of dt but for rounding is not given one step more.
+        gaps = np.diff([0.0, *self.times]) / self.dt
+        return np.ceil(gaps * (1 - 1e-9)).astype(int).tolist()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CycleModel:
+    """Predicted positions of the observed vertices in every frame of a cycle.
+
+    Attributes
+    ----------
+    closure : ClosureModel
+        Valve, mesh, mechanics and names of the parameters; its own protocol plays no part.
+    protocol : CycleProtocol
+    """
+
+    closure: ClosureModel
+    protocol: CycleProtocol
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.closure.names
+
+    def run(self, m: FloatArray, *, sensitivities: bool = True) -> Simulation:
+        """Run the cycle with parameters ``m (p,)`` from the open valve at rest.
+
+        Parameters
+        ----------
+        m : ndarray
+        sensitivities : bool
+            Whether all frames are differentiated.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        """
+        closure = self.closure
+        system, parameters = closure.tuned(m)
+        return simulate(
+            system,
+            boundary_loading(
+                system, closure.valve, closure.contact_valve, closure.settings, self.protocol
+            ),
+            self.protocol.steps(),
+            damping=closure.damping(m),
+            newton=closure.settings.newton,
+            parameters=parameters if sensitivities else (),
+            solver=closure.solver,
+            on_step=closure.on_step,
+        )
+
+    def frames(self, m: FloatArray) -> FloatArray:
+        """Positions ``(f, n, 3)`` mm of the observed vertices with parameters ``m (p,)``.
+
+        Raises
+        ------
+        MaterialError
+            If a modulus is inadmissible.
+        InputError
+            If the cycle cannot be followed to its end.
+        """
+        simulation = self.run(m, sensitivities=False)
+        if not simulation.converged:
+            raise InputError(f"no cycle with the parameters {m}: {_failure(simulation)}")
+        at = self.protocol.frame_steps
+        return np.stack([self.closure.observed(simulation.frames[k]) for k in at])
+
+    def __call__(self, m: FloatArray, /) -> Prediction:
+        """All frames, one after another, and their Jacobian.
+
+        Inadmissible moduli and cycles that do not converge are failed predictions, not errors.
+        """
+        try:
+            simulation = self.run(m)
+        except MaterialError as error:
+            return Prediction.failed(str(error))
+        if not simulation.converged:
+            return Prediction.failed(_failure(simulation))
+        observed, at = self.closure.observed, self.protocol.frame_steps
+        y = np.concatenate([observed(simulation.frames[k]).ravel() for k in at])
+        columns = [
+            np.concatenate([observed(simulation.sensitivities[k, i]).ravel() for k in at])
+            for i in range(len(self.names))
+        ]
+        return Prediction(y, np.stack(columns, axis=-1))
+
+
+@dataclass(frozen=True, slots=True)
+class StepEffect:
+    """What a time step does to the frames of a cycle.
+
+    Attributes
+    ----------
+    dt : float
+        s.
+    change : float or None
+        mm, root mean square of all frames, when the step is halved; None where that is not known.
+    order : float or None
+        Binary logarithm of the ratio of two such changes.
+    unevenness : float or None
+        Largest change of all frames over the median one, along equal steps of the parameters: large
+        where frames jump.
+    reason : str
+        Why the parameters could not be followed to their end; empty if they could.
+    """
+
+    dt: float
+    change: float | None
+    order: float | None
+    unevenness: float | None
+    reason: str
+
+
+def compare_time_steps(
+    model: CycleModel, dts: Sequence[float], path: FloatArray
+) -> tuple[StepEffect, ...]:
+    """Run cycles with several time steps along a path of parameters.
+
+    Parameters
+    ----------
+    model : CycleModel
+    dts : sequence of float
+        s, each half of the one before.
+    path : (n, p)
+
+    Raises
+    ------
+    InputError
+        If steps are not halved.
+    """
+    if any(not np.isclose(b, 0.5 * a) for a, b in pairwise(dts)):
+        raise InputError(f"time steps {list(dts)} s, expected each to be half of the one before")
+    first, uneven, reasons = list[FloatArray | None](), list[float | None](), list[str]()
+    for dt in dts:
+        frames, reason = _followed(replace(model, protocol=replace(model.protocol, dt=dt)), path)
+        along = [_rms(b - a) for a, b in pairwise(frames)]
+        first.append(frames[0] if frames else None)
+        uneven.append(None if reason else max(along) / float(np.median(along)))
+        reasons.append(reason)
+    change = [None if a is None or b is None else _rms(b - a) for a, b in pairwise(first)]
+    order = [float(np.log2(a / b)) if a and b else None for a, b in pairwise(change)]
+    return tuple(StepEffect(*row) for row in zip_longest(dts, change, order, uneven, reasons))
+
+
+def with_mesh_error(
+    found: Estimate, R: NoiseCovariance, other: CycleModel
+) -> tuple[Estimate, FloatArray, float]:
+    """An estimate from a whole cycle with what its own mesh may have done to it.
+
+    Parameters
+    ----------
+    found : Estimate
+        With a prediction of all vertices in all frames.
+    R : noise covariance
+        Of the observation.
+    other : CycleModel
+        The same cycle on another, finer mesh; it is run once.
+
+    Returns
+    -------
+    Estimate
+        Its covariance includes the shift.
+    ndarray, (p,)
+        Shift by the mesh, in units of the parameters.
+    float
+        mm, mean distance between the frames of the two meshes.
+
+    Raises
+    ------
+    InputError
+        If there is no prediction, or no cycle on the other mesh.
+    """
+    frames = other.frames(found.mean)
+    if found.prediction is None:
+        raise InputError("an estimate without a prediction has no derivatives")
+    off = frames - found.prediction.y.reshape(frames.shape)
+    shift = shift_by_model_error(found, R, off.ravel())
+    moved = shift * found.transform.derivative(found.transformed.mean)
+    return with_shift(found, shift), moved, float(np.linalg.norm(off, axis=-1).mean())
+
+
+def _followed(model: CycleModel, path: FloatArray) -> tuple[list[FloatArray], str]:
+    """Frames of the parameters along a path, up to the first that has none, and why it has none."""
+    frames: list[FloatArray] = []
+    try:
+        for m in path:
+            frames.append(model.frames(m))
+    except InputError as error:
+        return frames, str(error)
+    return frames, ""
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _failure(simulation: Simulation) -> str:
+    return f"{simulation.reason.value} (t = {simulation.times[-1]:.3f} s)"
