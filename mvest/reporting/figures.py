@@ -41,7 +41,7 @@ curves show their moduli, light enough to be shaded."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DISTANCE_MAP = "viridis"
-DPI = 200
+DPI = 140
 
 PNG_LEVEL = 4
 """Of compression: files 4 % larger than at the usual 6, in half the time."""
