@@ -4,7 +4,7 @@ The detectors are stood for by the valve that is in the volume; they have tests 
 """
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,9 +57,10 @@ def run(run, monkeypatch, volume):
         told.append((volume, landmarks))
         return sequence()
 
-    monkeypatch.setattr("experiments.common.cases.volume.load_model", lambda path: model)
-    monkeypatch.setattr("experiments.common.cases.volume.default_model", lambda: model)
-    monkeypatch.setattr("experiments.common.cases.volume.detect_valve", detect)
+    detected = "mvest.cases.from_images.detected"
+    monkeypatch.setattr(f"{detected}.load_model", lambda path: model)
+    monkeypatch.setattr(f"{detected}.default_model", lambda: model)
+    monkeypatch.setattr(f"{detected}.detect_valve", detect)
 
     def call(*arguments, pressure=True):
         given = [*arguments, "imaged.pressure_mmHg=110"] if pressure else arguments
@@ -174,7 +175,7 @@ def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reas
     def nothing(*arguments, **more):
         raise NoValveError("my_tee.seq.nrrd: no valve found")
 
-    monkeypatch.setattr("experiments.common.cases.volume.detect_valve", nothing)
+    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
     status, _, err = run("check=true")
     assert status == 2
     assert "no valve found" in err
@@ -187,21 +188,22 @@ def test_a_volume_without_a_valve_and_a_model_without_accuracy_end_in_their_reas
 def test_the_case_is_personalised_and_its_record_says_of_the_images(run, volume, monkeypatch):
     asked = []
 
-    def personalised(values, personal, case, folder, image_step):
-        asked.append((case, image_step))
+    def personalised(values, personal, case, images):
+        asked.append((case, images))
         raise InputError("not tried here")
 
-    monkeypatch.setattr("experiments.common.cases.volume.run_case", personalised)
+    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
     status, _, err = run("figures=false", "tracking.enabled=false")
     assert status == 2
     assert "not tried here" in err
-    ((case, step),) = asked
+    ((case, images),) = asked
     # By its content: a file may be called after a patient.
     assert case.name == f"volume {sha256_of(volume)[:12]}"
-    assert step.pictures["montage"].file == "montage.png"
-    assert len(step.frames) == len(step.confidence) == 4
-    assert (step.open_frame, step.volume.shape) == (0, (4, 20, 20, 20))
-    assert json.dumps(asdict(step), allow_nan=False)
+    assert [row["file"] for row in images["pictures"]] == ["montage.png", "measures_over_time.png"]
+    (step,) = images["image_step"]
+    assert len(images["image_frames"]) == len(step["confidence"]) == 4
+    assert (step["open_frame"], step["shape"]) == (0, [4, 20, 20, 20])
+    assert json.dumps(images, allow_nan=False)
 
 
 def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wider(
@@ -209,20 +211,21 @@ def test_a_volume_unlike_those_of_training_is_said_to_be_and_its_errors_are_wide
 ):
     asked, seen = [], sequence().confidence
 
-    def personalised(values, personal, case, folder, image_step):
-        asked.append((case, image_step))
+    def personalised(values, personal, case, images):
+        asked.append((case, images))
         raise InputError("not tried here")
 
-    monkeypatch.setattr("experiments.common.cases.volume.run_case", personalised)
+    monkeypatch.setattr("experiments.common.cases.own_case.run_case", personalised)
     measured = run.model.accuracy
     for like_from, widening in ((seen - 0.05, (1.0, 0.0)), (seen + 0.05, (1.0, 7.0))):
         run.model.accuracy = replace(measured, like_from=like_from, widening=widening)
         assert run("figures=false", "tracking.enabled=false")[0] == 2
-    (like, step), (unlike, other) = asked
-    assert step.unlike == ""
-    assert f"{seen:.2f} in the median frame, expected at least {seen + 0.05:.2f}" in other.unlike
-    assert "4.8 % of volumes" in other.unlike  # one in twenty-one
-    assert any("unlike those that the detectors" in said for said in other.sentences)
+    (like, step), (unlike, other) = ((case, images["image_step"][0]) for case, images in asked)
+    assert step["unlike"] == ""
+    expected = f"{seen:.2f} in the median frame, expected at least {seen + 0.05:.2f}"
+    assert expected in other["unlike"]
+    assert "4.8 % of volumes" in other["unlike"]  # one in twenty-one
+    assert any("unlike those that the detectors" in said for said in other["sentences"])
     spread = [np.std(case.error_samples.vertices, axis=0).mean() for case in (like, unlike)]
     assert spread[1] / spread[0] == pytest.approx(np.exp(7.0 * (1.0 - seen)))
 
@@ -255,7 +258,7 @@ def test_a_candidate_that_is_not_accepted_is_drawn_as_such(run, monkeypatch, tmp
     def titled(figure, title, note):
         titles.append(title)
 
-    monkeypatch.setattr("experiments.common.cases.volume.detect_valve", nothing)
+    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", nothing)
     monkeypatch.setattr("mvest.reporting.images.montage.headline", titled)
     status, _, err = run("check=true")
     assert status == 2
@@ -274,7 +277,7 @@ def test_the_confidence_below_which_there_is_no_valve_is_a_setting(run, monkeypa
         asked.append(settings.min_confidence)
         return sequence()
 
-    monkeypatch.setattr("experiments.common.cases.volume.detect_valve", detect)
+    monkeypatch.setattr("mvest.cases.from_images.detected.detect_valve", detect)
     assert run("check=true", "imaged.min_confidence=0.1")[0] == 0
     assert asked == [0.1]
 
