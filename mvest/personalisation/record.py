@@ -311,7 +311,7 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
     """The arrays (mm) that `mvest.reporting.case` draws; empty without an estimate."""
     if not fit.distances:
         return {}
-    case, surface, filtered = fit.case, fit.case.surface, fit.result.filtered
+    case, surface = fit.case, fit.case.surface
     frames = [d.frame for d in fit.distances]
     by_name = {frame.name: frame for frame in case.frames}
     seen = [by_name[name] for name in frames]
@@ -343,17 +343,9 @@ def arrays_of_case(fit: Personalised) -> dict[str, Any]:
         reals["observed"] = np.stack([frame.vertices for frame in seen])
         if fit.settings.correspondence:
             arrays["distance_generic"] = np.stack([d.generic for d in fit.distances])
-            arrays["distance_registered"] = np.stack([d.registered for d in fit.distances])
             arrays["distance_fitted"] = np.stack([d.personalised for d in fit.distances])
     else:
         reals |= {f"observed_points_{frame.name}": frame.vertices for frame in seen}
-    if filtered is not None and filtered.prediction is not None:
-        sensitivity, own = filtered.prediction.jacobian, surface.vertices.size
-        # Of the closed frame, which comes last.
-        if len(sensitivity) == own * (1 + len(case.fitted)):
-            reals["sensitivity"] = sensitivity[-own:].reshape(-1, 3, len(fit.names))
-            if filtered.innovation is not None:
-                arrays["innovation"] = filtered.innovation.standardised[-own:].reshape(-1, 3)
     return (
         arrays
         | {name: np.asarray(values, dtype=np.int32) for name, values in whole.items()}

@@ -131,7 +131,6 @@ def test_arrays_are_those_that_a_report_reads(tmp_path, fit, corresponds):
     assert fields.seen.tolist() == [True, False]
     assert fields.truth is None
     if corresponds:
-        assert fields.sensitivity.shape == (288, 3, 11)
         distance = np.linalg.norm(fields.fitted - fields.observed, axis=2)
         np.testing.assert_allclose(distance, fields.distance_fitted, atol=1e-4)
     else:

@@ -3,8 +3,9 @@
 import copy
 from typing import Any
 
-from experiments.common.records.record import Record, record_from
 from experiments.studies.twin.findings import Findings
+
+from experiments.common.records.record import Record, record_from
 
 RECORD: dict[str, Any] = {
     "schema": 1,

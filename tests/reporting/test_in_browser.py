@@ -4,7 +4,6 @@ import base64
 import io
 import re
 import shutil
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -13,11 +12,16 @@ from PIL import Image
 
 from experiments.results.page import write_report
 from experiments.runner.tracking.screenshot import look_at
-from mvest.reporting.case.findings import ImageStep, Picture, VolumeAbout
-from mvest.reporting.case.report import write_case_report
+from mvest.reporting.case.report import report
 from tests.experiments.results.test_report import publish
 from tests.experiments.sweeps.synthetic_sweeps import TRUTH, job, run, sweep
-from tests.reporting.case.made_up_case import LINE, PROVENANCE, made_up_case, poisoned
+from tests.reporting.case.made_up_case import (
+    LINE,
+    PROVENANCE,
+    made_up_case,
+    poisoned,
+    poisoned_record,
+)
 
 needs_browser = pytest.mark.skipif(
     not (shutil.which("chromium") or shutil.which("chromium-browser")),
@@ -75,39 +79,39 @@ def widths(page: Path) -> tuple[int, int]:
     return int(held), int(window)
 
 
-def images(folder: Path) -> ImageStep:
-    """From images to a valve, all of whose words are an attack."""
-    return ImageStep(
-        volume=VolumeAbout(LONG, LONG, LONG, (9, 10, 10, 10), (1.0, 1.0, 1.0)),
-        pictures={LONG: Picture("missing.png", LONG)},
-        sentences=(LONG,),
-        frames=({"frame": 1},),
-        files=(LONG, f"javascript:{RUN}"),
-        model={LONG: LONG},
-        open_frame=0,
-        closed_frame=5,
-        confidence=(0.9,),
-        std_mm=0.5,
-        correlation_length_mm=5.0,
-    )
+STEP = {
+    "unlike": LONG,
+    "sentences": [LONG],
+    "files": [LONG, f"javascript:{RUN}"],
+    "volume": LONG,
+}
+"""From images to a valve, all of whose words are an attack."""
 
 
 @pytest.fixture(scope="module")
 def case_page(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("case")
-    findings, shapes = made_up_case(folder)
-    hostile = replace(
-        poisoned(findings, LONG),
-        settings={LONG: LONG},
-        measurements={LONG: {LONG: {LONG: 1.0}}},
-        image_step=images(folder),
+    record, shapes = made_up_case(folder)
+    hostile = poisoned_record(
+        record,
+        LONG,
+        settings=[{"setting": LONG, "value": LONG}],
+        measurements=[{"frame": LONG, "shape": LONG, LONG: 1.0}],
+        image_step=[STEP],
+        image_frames=[{"frame": 1}],
+        pictures=[{"file": LONG, "caption": LONG}, {"file": "missing.png", "caption": LONG}],
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvest.reporting.figures.DPI", 30)
         patch.setattr("mvest.reporting.case.drawing.MAX_SPLITS", 0)
-        return write_case_report(
-            folder, hostile, shapes, poisoned(LINE, LONG), poisoned(PROVENANCE, LONG)
-        )[0]
+        written = report(
+            hostile,
+            folder,
+            arrays=shapes,
+            line=poisoned(LINE, LONG),
+            provenance=poisoned(PROVENANCE, LONG),
+        )
+    return written[1]
 
 
 @pytest.fixture(scope="module")

@@ -53,10 +53,6 @@ class CaseFields:
         ``(q, 3)`` mm for a frame that does not correspond to the reference frame.
     distance_generic, distance_fitted : ndarray or None
         ``(f, n)`` mm from what was observed; NaN where nothing was.
-    sensitivity : ndarray or None
-        ``(n, 3, p)`` mm per unit of each parameter, of the closed frame at the estimate.
-    innovation : ndarray or None
-        ``(n, 3)`` standardised innovation of the closed frame.
     reach_mm : float or None
         Distance of midsurfaces within which leaflets touch.
     """
@@ -79,8 +75,6 @@ class CaseFields:
     truth: FloatArray | None = None
     distance_generic: FloatArray | None = None
     distance_fitted: FloatArray | None = None
-    sensitivity: FloatArray | None = None
-    innovation: FloatArray | None = None
     reach_mm: float | None = None
 
     def __post_init__(self) -> None:
@@ -93,9 +87,7 @@ class CaseFields:
             _check(name, getattr(self, name), (f, n, 3))
         for name in ("distance_generic", "distance_fitted"):
             _check(name, getattr(self, name), (f, n))
-        _check("innovation", self.innovation, (n, 3))
         _check("tips", self.tips, (f + 1, None, 3))
-        _check("sensitivity", self.sensitivity, (n, 3, None))
         for name in ("triangles", "annulus", "free_edge", "chord_insertion"):
             index = getattr(self, name)
             if index.size and not 0 <= index.min() <= index.max() < n:
@@ -195,8 +187,6 @@ def _fields(arrays: Mapping[str, Any], points: Mapping[str, FloatArray]) -> Case
         truth=reals("truth"),
         distance_generic=reals("distance_generic"),
         distance_fitted=reals("distance_fitted"),
-        sensitivity=reals("sensitivity"),
-        innovation=reals("innovation"),
         reach_mm=float(arrays["reach_mm"]) if "reach_mm" in arrays else None,
     )
 

@@ -5,24 +5,19 @@ higher the pressure, and whose edge sinks with longer chordae. Distances, sensit
 innovations are those of this formula, so that they fit each other; they say nothing about valves.
 """
 
-from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mvest.reporting.case.findings import (
-    About,
-    CaseFindings,
-    ErrorRow,
-    FrameDistances,
-    ModuliAlone,
-    ModulusRow,
-    Narrower,
-    ToTruth,
-    UnknownRow,
-    WhitenessTest,
+from mvest.problem.record import (
+    Confounded,
+    EstimateRecord,
+    FrameFit,
+    Innovation,
+    Spread,
+    Unknown,
 )
-from mvest.reporting.findings import Alike, Identified, Innovation, Spread
 from mvest.valve.anatomy.template import Template
 
 COLUMNS, ROWS = 40, 12
@@ -61,11 +56,6 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
     observed = truth + rng.normal(0.0, NOISE_MM, truth.shape)
     # A corner of the image: these were not seen.
     observed[:, :4] = np.nan
-    columns = []
-    for name, value in FITTED.items():
-        h = 1e-4 * max(abs(value), 1e-2)
-        up, down = FITTED | {name: value + h}, FITTED | {name: value - h}
-        columns.append((closed_shape(up) - closed_shape(down)) / (2 * h))
     insertion = [
         int(np.argmin(np.linalg.norm(valve.surface.vertices - p, axis=1)))
         for p in valve.chordae.insertion
@@ -88,16 +78,14 @@ def arrays(rng: np.random.Generator) -> dict[str, np.ndarray]:
         "tips": np.repeat(valve.papillary_tips[None], 3, axis=0),
         "chord_tip": valve.chordae.tip,
         "chord_insertion": np.array(insertion),
-        "sensitivity": np.stack(columns, axis=-1),
-        "innovation": (observed[0] - generic[0]) / (1.5 * NOISE_MM),
     }
 
 
 def _unknown(
     name: str, label: str, unit: str, treatment: str, prior: tuple[float, float], std: float
-) -> UnknownRow:
+) -> Unknown:
     estimate = FITTED[name] if treatment == "estimated" else prior[0]
-    return UnknownRow(
+    return Unknown(
         name=name,
         label=label,
         unit=unit,
@@ -121,25 +109,33 @@ UNKNOWNS = (
 )
 
 
-def _alone(unknown: UnknownRow) -> UnknownRow:
+def _alone(unknown: Unknown) -> Unknown:
     """The same as estimated with the nuisances taken as known."""
     estimate, half = unknown.estimate - 0.3, 0.4 * 1.96 * unknown.std
-    return replace(
-        unknown, estimate=estimate, std=0.4 * unknown.std, low=estimate - half, high=estimate + half
+    return unknown.model_copy(
+        update={
+            "estimate": estimate,
+            "std": 0.4 * unknown.std,
+            "low": estimate - half,
+            "high": estimate + half,
+        }
     )
 
 
-def _distances(fields: dict[str, np.ndarray], k: int, frame: str) -> FrameDistances:
+def _frame(fields: dict[str, np.ndarray], k: int, frame: str) -> FrameFit:
     def off(shape: str, what: str) -> Spread:
         return Spread.of(np.linalg.norm(fields[shape][k] - fields[what][k], axis=1))
 
-    models = ("generic", "registered", "fitted")
-    first, second, third = (off(name, "observed") for name in models)
-    truth = ToTruth(*(off(name, "truth") for name in models))
-    return FrameDistances(frame, bool(fields["seen"][k]), first, second, third, truth)
+    models = {"generic": "generic", "registered": "registered", "personalised": "fitted"}
+    return FrameFit(
+        frame=frame,
+        seen=bool(fields["seen"][k]),
+        **{name: off(shape, "observed") for name, shape in models.items()},
+        **{f"{name}_to_truth": off(shape, "truth") for name, shape in models.items()},
+    )
 
 
-def _case(fields: dict[str, np.ndarray]) -> CaseFindings:
+def _record(fields: dict[str, np.ndarray]) -> EstimateRecord:
     shape = {
         "ap_diameter_mm": 26.4,
         "commissural_diameter_mm": 35.7,
@@ -148,76 +144,83 @@ def _case(fields: dict[str, np.ndarray]) -> CaseFindings:
         "tenting_volume_mm3": 2210.0,
         "coaptation_length_mm": None,
     }
-    return CaseFindings(
-        about=About(
-            "made_up",
-            "A valve by a formula, for tests of the report.",
-            "tests",
-            "MIT",
-            True,
-            ("Thickness of the leaflets: taken from the literature.",),
-            "ef" * 32,
-            ("anterior", "posterior"),
-        ),
-        converged=True,
+    return EstimateRecord(
+        case="made_up",
+        simulated=True,
+        status="converged",
         reason="the change of every parameter is below the tolerance",
         unknowns=UNKNOWNS,
-        moduli=tuple(
-            ModulusRow(
-                region=region,
-                name="E_f",
-                estimate=unknown.estimate,
-                std=unknown.std,
-                low=unknown.low,
-                high=unknown.high,
-                truth=unknown.truth,
+        alternatives={
+            "moduli_only": EstimateRecord(
+                status="converged", reason="converged", unknowns=tuple(map(_alone, UNKNOWNS[:2]))
             )
-            for region, unknown in zip(("anterior", "posterior"), UNKNOWNS, strict=False)
-        ),
-        without_nuisances=ModuliAlone(True, "converged", "", 4, tuple(map(_alone, UNKNOWNS[:2]))),
-        distances=tuple(_distances(fields, k, frame) for k, frame in enumerate(("closed", "late"))),
+        },
+        frames=tuple(_frame(fields, k, frame) for k, frame in enumerate(("closed", "late"))),
         iterates=((4.0, 3.0, 0.0), (5.2, 2.4, 0.02), (5.7, 2.2, 0.025), (5.8, 2.2, 0.026)),
         iterate_std=((2.0, 1.5, 0.02), (1.0, 0.4, 0.01), (0.8, 0.3, 0.008), (0.8, 0.3, 0.008)),
         objective=(920.0, 340.0, 301.0, 300.2),
-        innovation=Innovation(1428, 1.02, 3.1, 1485.0, (1325.0, 1535.0)),
-        errors=(
-            ErrorRow(
-                name="rough part",
-                unit="mm",
-                believed=0.12,
-                believed_low=0.014,
-                believed_high=1.03,
-                learned=0.205,
-                low=0.198,
-                high=0.212,
-                stretch=0.5,
+        innovation=Innovation(
+            size=1428, rms=1.02, max_abs=3.1, nis=1485.0, nis_band=(1325.0, 1535.0)
+        ),
+        condition_number=48.0,
+        confounded=(
+            Confounded(
+                parameters=("E_f.anterior", "chord_slack"),
+                changes=(0.58, -0.0031),
+                relative=(0.1, -0.031),
+                correlation=0.9578,
             ),
         ),
-        whiteness=(
-            WhitenessTest("Kolmogorov–Smirnov", 0.03, 0.21, "ok"),
-            WhitenessTest("runs", -0.4, 0.69, "ok"),
-        ),
-        identifiability=Identified(
-            (0.9, 0.32, 0.009),
-            48.0,
-            (),
-            (Alike(("E_f.anterior", "chord_slack"), (0.58, -0.0031), (0.1, -0.031), 0.9578),),
-        ),
-        observation_std_mm=NOISE_MM,
-        narrow=(
-            Narrower("E_f anterior, if the pressure were known", "E_f.anterior", 0.8, 0.71),
-            Narrower("E_f anterior, if the chordae were known", "E_f.anterior", 0.8, 0.5),
-        ),
-        measurements={
-            "open": {"observed": shape | {"annulus_area_mm2": 801.0}},
-            "closed": {
-                "observed": shape,
-                "generic": shape | {"tenting_volume_mm3": 1840.0},
-                "personalised": shape | {"tenting_volume_mm3": 2190.0},
-            },
+        details={
+            "about": (
+                {
+                    "description": "A valve by a formula, for tests of the report.",
+                    "source": "tests",
+                    "licence": "MIT",
+                    "sha256": "ef" * 32,
+                    "regions": ["anterior", "posterior"],
+                    "derived": ["Thickness of the leaflets: taken from the literature."],
+                    "implausible": [],
+                    "confirmed_mm": 0.089,
+                    "law_share": None,
+                },
+            ),
+            "errors": (
+                {
+                    "name": "rough part",
+                    "unit": "mm",
+                    "believed": 0.12,
+                    "believed_low": 0.014,
+                    "believed_high": 1.03,
+                    "learned": 0.205,
+                    "low": 0.198,
+                    "high": 0.212,
+                    "stretch": 0.5,
+                },
+            ),
+            "whiteness": ({"name": "mean zero", "statistic": 0.03, "p_value": 0.21},),
+            "narrower": (
+                {
+                    "what": "E_f anterior, if the pressure were known",
+                    "parameter": "E_f.anterior",
+                    "std_now": 0.8,
+                    "std_if_known": 0.71,
+                },
+                {
+                    "what": "E_f anterior, if the chordae were known",
+                    "parameter": "E_f.anterior",
+                    "std_now": 0.8,
+                    "std_if_known": 0.5,
+                },
+            ),
+            "measurements": (
+                {"frame": "open", "shape": "observed", **shape, "annulus_area_mm2": 801.0},
+                {"frame": "closed", "shape": "observed", **shape},
+                {"frame": "closed", "shape": "generic", **shape, "tenting_volume_mm3": 1840.0},
+                {"frame": "closed", "shape": "personalised", **shape},
+            ),
+            "settings": ({"setting": "tolerance", "value": 1e-4},),
         },
-        confirmed_mm=0.089,
-        settings={"filter": {"name": "iterated", "tolerance": 1e-4}, "seeds": [1, 2]},
     )
 
 
@@ -231,23 +234,29 @@ PROVENANCE = {
 }
 
 
-def made_up_case(folder: Path) -> tuple[CaseFindings, Path]:
-    """Write ``fields.npz`` into a folder; returns the findings that go with it, and its path."""
+def made_up_case(folder: Path) -> tuple[EstimateRecord, Path]:
+    """Write ``fields.npz`` into a folder; returns the record that goes with it, and its path."""
     fields = arrays(np.random.default_rng(1))
     path = folder / "fields.npz"
     np.savez(path, **fields)
-    return _case(fields), path
+    return _record(fields), path
 
 
-def poisoned(value, attack: str, key: str = ""):
-    """Findings in which every text ends in an attack, but for what a page decides by."""
-    if is_dataclass(value):
-        names = [field.name for field in fields(value)]
-        return replace(value, **{k: poisoned(getattr(value, k), attack, k) for k in names})
+CHOICES = ("kind", "treatment", "status", "trust", "shape", "name", "parameters")
+"""Texts by which a page or a record decides something."""
+
+
+def poisoned(value: Any, attack: str, key: str = "") -> Any:
+    """Plain data in which every text ends in an attack, but for what something is decided by."""
     if isinstance(value, dict):
         return {k: poisoned(v, attack, k) for k, v in value.items()}
     if isinstance(value, tuple | list):
         return type(value)(poisoned(v, attack, key) for v in value)
-    if not isinstance(value, str) or key in ("kind", "treatment"):
-        return value
-    return value + attack
+    return value + attack if isinstance(value, str) and key not in CHOICES else value
+
+
+def poisoned_record(record: EstimateRecord, attack: str, **details: Any) -> EstimateRecord:
+    """The record with an attack at the end of every text, and with further details."""
+    plain = poisoned(record.model_dump(mode="json"), attack)
+    plain["details"] |= details
+    return EstimateRecord.model_validate(plain)

@@ -20,23 +20,16 @@ from mvest.reporting.case.fields import read_case_fields
 from mvest.reporting.case.figures import (
     case_figure,
     distance_top,
+    estimates_figure,
     figure3_caption,
     fitted_figure,
-    information_figure,
-    innovation_map_figure,
+    frames_figure,
+    narrower_figure,
     shapes_figure,
 )
-from mvest.reporting.case.findings import UnknownRow
-from mvest.reporting.case.information import columns_of, information, where_words
-from mvest.reporting.case.plots import (
-    distances_figure,
-    estimates_figure,
-    innovation_figure,
-    iterations_figure,
-    narrow_figure,
-)
 from mvest.reporting.case.view import _states, case_view, small
-from tests.reporting.case.made_up_case import COLUMNS, NOISE_MM, made_up_case
+from tests.made_up_closure import made_up_case as case_of_frames
+from tests.reporting.case.made_up_case import COLUMNS, made_up_case
 
 NAMES = ("anterior", "posterior")
 
@@ -236,83 +229,6 @@ def test_missing_or_damaged_fields_of_a_fitted_valve_are_named(case, tmp_path) -
         fitted_figure(tmp_path / "half.npz")
 
 
-# --- information --------------------------------------------------------------------------------
-
-
-def parameters(count: int) -> list[UnknownRow]:
-    return [
-        UnknownRow(
-            name=f"p{k}",
-            label=f"p{k}",
-            unit="",
-            kind="modulus" if k == 0 else "nuisance",
-            treatment="estimated",
-            prior_mean=2.0,
-            prior_std=0.5,
-            estimate=2.0,
-        )
-        for k in range(count)
-    ]
-
-
-def test_information_of_a_modulus_alone_by_hand(fields) -> None:
-    # One vertex moves by 0.3 mm per unit; m = 2, sigma = 0.5: (2 x 0.3 / 0.5)^2 = 1.44.
-    S = np.zeros((len(fields.rest), 3, 1))
-    S[100, 1, 0] = 0.3
-    found = information(replace(fields, sensitivity=S), parameters(1), 0.5)[0]
-    assert found.raw[100] == pytest.approx(1.44)
-    assert np.nansum(found.raw) == pytest.approx(1.44)
-    assert found.kept == pytest.approx(1.0)
-    # What was not seen informs of nothing.
-    assert np.isnan(found.raw[0])
-
-
-@pytest.mark.parametrize("std", [None, 0.4])
-def test_what_remains_is_the_schur_complement_of_the_information(fields, std) -> None:
-    S = np.random.default_rng(3).normal(size=(len(fields.rest), 3, 3))
-    found = information(replace(fields, sensitivity=S), parameters(3), std)[0]
-    seen = np.isfinite(fields.distance_fitted[0])
-    A = S[seen].reshape(-1, 3) / (std or 1.0)
-    # On log m, m = 2; nuisances with prior precision 1 / 0.5^2 where the noise is known.
-    F = A.T @ A + np.diag([0.0, 4.0, 4.0]) * (std is not None)
-    schur = F[0, 0] - F[0, 1:] @ np.linalg.solve(F[1:, 1:], F[1:, 0])
-    assert found.kept == pytest.approx(schur / F[0, 0], rel=1e-10)
-
-
-def test_a_nuisance_that_moves_everything_alike_leaves_nothing(fields) -> None:
-    own = np.random.default_rng(3).normal(size=(len(fields.rest), 3))
-    S = np.stack([own, -3.0 * own], axis=-1)
-    found = information(replace(fields, sensitivity=S), parameters(2), None)[0]
-    assert found.kept == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_modulus_is_found_where_it_acts(case, fields) -> None:
-    found = information(fields, case[0].unknowns, NOISE_MM)
-    assert [one.name for one in found] == ["E_f.anterior", "E_f.posterior"]
-    for one, leaflet in zip(found, NAMES, strict=True):
-        place, share = where_words(fields, one.raw, NAMES)[0]
-        # The made-up belly rises most in the middle of its leaflet.
-        assert place == f"belly of the {leaflet} leaflet"
-        assert share > 0.5
-
-
-def test_columns_belong_to_the_parameters_that_fit(case) -> None:
-    all_of_them = case[0].unknowns
-    assert columns_of(all_of_them, 3) == list(all_of_them[:3])
-    assert len(columns_of(all_of_them, 4)) == 4
-    assert columns_of(all_of_them, 2) == [p for p in all_of_them if p.is_modulus]
-    assert columns_of(all_of_them, 1) == []
-
-
-def test_both_maps_of_a_modulus_have_one_scale(case, fields) -> None:
-    found = information(fields, case[0].unknowns, NOISE_MM)
-    figure = information_figure(fields, found)
-    bars = [axes for axes in figure.axes if axes.get_xlabel() == "information per point"]
-    assert [axes.get_xlim()[1] for axes in bars] == pytest.approx(
-        [np.nanmax(one.raw) for one in found]
-    )
-
-
 # --- the other pictures -------------------------------------------------------------------------
 
 
@@ -345,7 +261,7 @@ def test_panels_of_a_view_have_one_scale_in_mm(fields) -> None:
         assert all(axes.get_aspect() == 1.0 for axes in row)
 
 
-def test_intervals_are_where_the_findings_have_them(case) -> None:
+def test_intervals_are_where_the_record_has_them(case) -> None:
     axes = estimates_figure(case[0]).axes[0]
     lines = [line for line in axes.lines if len(line.get_xdata()) == 2]
     ends = {tuple(np.round(line.get_xdata(), 3)) for line in lines}
@@ -363,42 +279,21 @@ def test_nuisances_are_drawn_in_standard_deviations(case) -> None:
     assert dots == pytest.approx([1.3])
 
 
-def test_iterations_that_fit_no_parameters_are_refused(case) -> None:
-    with pytest.raises(InputError, match="fit no choice"):
-        iterations_figure(replace(case[0], iterates=((1.0,),)))
-    titles = [axes.get_title() for axes in iterations_figure(case[0]).axes]
-    assert len(titles) == 3
-
-
-def test_the_histogram_is_of_the_innovation(fields) -> None:
-    values = np.full_like(fields.innovation, 1.1)
-    left = innovation_figure(replace(fields, innovation=values)).axes[0]
-    highest = max(left.patches, key=lambda bar: bar.get_height())
-    assert highest.get_x() <= 1.1 <= highest.get_x() + highest.get_width()
-    assert sum(bar.get_height() * bar.get_width() for bar in left.patches) == pytest.approx(1.0)
-
-
-def test_the_map_of_the_innovation_is_its_rms(fields) -> None:
-    large = replace(fields, innovation=np.full_like(fields.innovation, 4.0))
-    figure = innovation_map_figure(large, NAMES)
-    assert figure.axes[-1].get_ylim()[1] == pytest.approx(4.0)
-
-
-def test_bars_of_distances_are_in_the_order_of_the_legend(case) -> None:
-    figure = distances_figure(case[0].distances)
-    axes = figure.axes[0]
-    heights = [[bar.get_height() for bar in group] for group in axes.containers if len(group) == 2]
-    expected = [
-        [getattr(d, name).mean for d in case[0].distances]
-        for name in ("generic", "registered", "personalised")
-    ]
-    assert heights[:3] == expected
-    labels = [label.get_text() for label in axes.get_xticklabels()]
-    assert labels == ["closed\n(shown to the filter)", "late\n(held out)"]
+@pytest.mark.parametrize("corresponds", [True, False])
+def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds):
+    case = case_of_frames(0.3, corresponds=corresponds)
+    figure = frames_figure(case, reach_mm=2.0)
+    titles = [axes.get_title() for axes in figure.axes[:3]]
+    assert [title.split()[0] for title in titles] == ["open", "closed", "late"]
+    assert "100 mmHg" in titles[1]
+    for row in (figure.axes[:3], figure.axes[3:]):
+        assert len({np.round(np.ptp(axes.get_xlim()), 6) for axes in row}) == 1
+    # The gap is drawn of the closed frame alone.
+    assert [len(leaks(axes)) for axes in figure.axes] == [0, 1, 0, 0, 0, 0]
 
 
 def test_what_narrows_most_is_on_top(case) -> None:
-    axes = narrow_figure(case[0].narrow).axes[0]
+    axes = narrower_figure(case[0].details["narrower"]).axes[0]
     widths = [bar.get_width() for bar in axes.patches]
     # 0.71 and 0.5 over 0.8, in per cent; bars are counted from below.
     assert widths == pytest.approx([88.75, 62.5])
@@ -431,9 +326,7 @@ def test_a_slit_of_touching_leaflets_is_told_from_a_leak_where_their_reach_is_kn
 
 def test_every_picture_of_a_closed_valve_shows_its_leak(case, fields, tmp_path):
     valve = replace(fields, reach_mm=2.0)
-    found = information(fields, case[0].unknowns, NOISE_MM)
-    assert [len(leaks(axes)) for axes in information_figure(valve, found).axes[:4]] == [1] * 4
-    assert [len(leaks(axes)) for axes in innovation_map_figure(valve, NAMES).axes[:2]] == [1, 0]
+    assert [len(leaks(axes)) for axes in case_figure(valve).axes[:4]] == [1, 1, 0, 0]
     with np.load(case[1]) as stored:
         np.savez(tmp_path / "reach.npz", **stored, reach_mm=2.0)
     images = [len(leaks(axes)) for axes in fitted_figure(tmp_path / "reach.npz").axes[:4]]
