@@ -9,13 +9,11 @@ import nibabel
 import numpy as np
 import pytest
 
-from experiments.common.cases.report import write_case_run
 from experiments.common.config import hash_of, without_places
-from experiments.common.records.record import stamp, write_record
+from experiments.common.records.record import FIELDS, stamp, write_record
 from experiments.common.schema import build
 from experiments.common.study import Job
-from experiments.studies.case.settings import Settings
-from experiments.studies.case.study import run_own_case
+from experiments.studies.case import STUDY, Settings
 from mvest.imaging.reading.reader import read_volume
 from mvest.imaging.volume import Modality
 from mvest.provenance import write_json
@@ -108,11 +106,12 @@ def test_no_name_of_a_folder_is_in_the_report_of_a_case(tmp_path: Path, monkeypa
     out = tmp_path / "out"
     out.mkdir()
     values = plain(composed(*own_case(patient), f"paths.outputs={out}"))
-    outcome = run_own_case(Job(values, build(Settings, values), out))
-    record = stamp(values, hash_of(values), outcome, 0.0)
+    result = STUDY.run(Job(values, build(Settings, values), out))
+    record = stamp(values, hash_of(values), result, 0.0)
+    np.savez(out / FIELDS, **result.arrays)
     write_json(out / "config.json", without_places(values))
     write_record(out / "result.json", record)
-    names = {path.name for path in write_case_run(out, record)}
+    names = {path.name for path in STUDY.files(out, record)}
     assert "report.html" in names
     assert leaks(out) == []
     assert "DOE_JANE" in json.dumps(values)

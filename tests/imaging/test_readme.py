@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import pytest
 
-from experiments.common.cases.settings import ImagedSettings
+from experiments.common.cases.settings import ImagedInput
 from experiments.studies.imaging.detectors import ImagingSettings
 from mvest.imaging.detection.trained_model import STAGES
 from mvest.imaging.landmarks import LANDMARKS
@@ -13,7 +13,7 @@ from mvest.imaging.layout import ValveLayout
 from tests.places import ROOT
 
 OWN, PAGE = ROOT / "mvest" / "imaging" / "README.md", ROOT / "docs" / "volume.md"
-SETTINGS = {"imaged": ImagedSettings, "imaging": ImagingSettings}
+SETTINGS = {"imaged": ImagedInput, "imaging": ImagingSettings}
 
 
 @pytest.mark.parametrize(

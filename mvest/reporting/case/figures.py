@@ -1,4 +1,4 @@
-"""Figures of one case: shapes, distances, intervals, and what would narrow them."""
+"""Figures of one case: shapes, distances and intervals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from mvest.cases.case import Role, ValveCase
 from mvest.errors import InputError
-from mvest.problem.record import EstimateRecord, Row, Spread, Unknown
+from mvest.problem.record import EstimateRecord, Spread, Unknown
 from mvest.reporting.case.drawing import (
     ATRIUM,
     SIDE,
@@ -39,7 +39,6 @@ __all__ = [
     "figure3_caption",
     "fitted_figure",
     "frames_figure",
-    "narrower_figure",
     "shapes_figure",
 ]
 
@@ -341,35 +340,3 @@ def _intervals(axes: Any, row: int, unknown: Unknown, without: Unknown | None, i
     if unknown.truth is not None:
         axes.plot(place(unknown.truth), [row], "x", color="black", markersize=9,
                   markeredgewidth=2, label="truth of the simulation", zorder=5)  # fmt: skip
-
-
-def narrower_figure(rows: Sequence[Row]) -> Figure:
-    """By how much the standard deviation of a modulus would fall if more were measured.
-
-    Parameters
-    ----------
-    rows : sequence of mapping
-        ``what``, ``std_now`` and ``std_if_known`` (see `mvest.personalisation.record`).
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if not rows:
-        raise InputError("the run did not compute what else would narrow the intervals")
-    share = {row["what"]: 100 * row["std_if_known"] / row["std_now"] for row in rows}
-    share = dict(sorted(share.items(), key=lambda one: -one[1]))
-    figure = Figure(figsize=(7.6, 1.1 + 0.42 * len(share)), layout="constrained")
-    axes = figure.subplots()
-    axes.barh(range(len(share)), list(share.values()), color=COLOURS[0], height=0.62)
-    for row, value in enumerate(share.values()):
-        axes.annotate(f"{value:.0f} %", (value, row), xytext=(3, 0), textcoords="offset points",
-                      va="center", fontsize=8)  # fmt: skip
-    axes.axvline(100.0, color="0.4", linewidth=1, linestyle="--")
-    axes.set_yticks(range(len(share)), list(share))
-    axes.set_xlim(0.0, max(112.0, *(1.08 * value for value in share.values())))
-    axes.set_xlabel("width of the interval if this were measured, % of its width now")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    return figure

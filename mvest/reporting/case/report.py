@@ -28,7 +28,6 @@ from mvest.reporting.case.figures import (
     case_figure,
     estimates_figure,
     figure3_caption,
-    narrower_figure,
     shapes_figure,
 )
 from mvest.reporting.case.tables import report_tables, unknown_table
@@ -212,10 +211,5 @@ def _figures(
             "estimates",
             lambda: estimates_figure(record),
             lambda: "What was known before the images (grey) and what they add (blue).",
-        ),
-        (
-            "narrower",
-            lambda: narrower_figure(record.detail_rows("narrower")),
-            lambda: "Standard deviation of each modulus if one more thing were measured.",
         ),
     ]

@@ -78,14 +78,7 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
         "frames": frame_table(record.frames),
         "steps": _steps(record, free),
         "measurements": _measurements(rows("measurements")),
-        "narrower": table(
-            [row | {"change": _change(row)} for row in map(dict, rows("narrower"))],
-            what=Column(label="if this were measured"),
-            parameter=HIDDEN,
-            std_now=Column(label="SD of its logarithm now"),
-            std_if_known=Column(label="then"),
-            change=Column("%", ".0f"),
-        ),
+        "narrower": _narrower(rows("narrower"), record.moduli),
         "errors": table(
             rows("errors"),
             name=Column(label="errors of the closed frame"),
@@ -100,7 +93,12 @@ def report_tables(record: EstimateRecord) -> dict[str, Table]:
             unit=Column(),
             stretch=Column(label="largest [SD]"),
         ),
-        "whiteness": table(rows("whiteness"), name=Column(label="test"), p_value=Column("", ".2g")),
+        "whiteness": table(
+            rows("whiteness"),
+            name=Column(label="test"),
+            statistic=Column(),
+            p_value=Column("", ".2g"),
+        ),
         "budget": table(
             rows("budget"),
             part=Column(label="source of error"),
@@ -132,8 +130,19 @@ def estimate_text(record: EstimateRecord) -> str:
     return "\n".join(lines)
 
 
-def _change(row: Row) -> float:
-    return 100.0 * (row["std_if_known"] / row["std_now"] - 1.0)
+def _narrower(rows: Sequence[Row], moduli: Sequence[Unknown]) -> Table:
+    """A row for each measurement: how wide each modulus' interval would be, in % of now."""
+    shares: dict[str, dict[str, float]] = {}
+    labels = {one.name: one.label or one.name for one in moduli}
+    columns: dict[str, Column] = {}
+    for row in rows:
+        label = labels.get(row["parameter"]) or str(row["parameter"])
+        columns[label] = Column("%", ".0f")
+        what = str(row["what"]).removeprefix(f"{label}, ")
+        shares.setdefault(what, {})[label] = 100.0 * row["std_if_known"] / row["std_now"]
+    ordered = sorted(shares.items(), key=lambda one: min(one[1].values()))
+    known = Column(label="if this were known")
+    return table(({"what": what, **share} for what, share in ordered), what=known, **columns)
 
 
 def _steps(record: EstimateRecord, free: Sequence[Unknown]) -> Table:

@@ -230,7 +230,7 @@ def test_the_moduli_are_found_wherever_the_valve_lies(run, tmp_path, seen):
         records = (tmp_path / "outputs" / "own_valve").glob("*/result.json")
         record = json.loads(max(records, key=lambda path: path.stat().st_mtime).read_text())
         assert record["status"] == "converged"
-        found.append({row["name"]: row for row in record["findings"]["case"]["unknowns"]})
+        found.append({row["name"]: row for row in record["estimates"][0]["unknowns"]})
     for unknowns in found:
         for region, true in zip(REGIONS, TRUE, strict=True):
             row = unknowns[f"E_f.{region}"]

@@ -24,7 +24,6 @@ from mvest.reporting.case.figures import (
     figure3_caption,
     fitted_figure,
     frames_figure,
-    narrower_figure,
     shapes_figure,
 )
 from mvest.reporting.case.view import _states, case_view, small
@@ -290,13 +289,6 @@ def test_every_frame_of_a_case_is_drawn_from_two_sides_on_one_scale(corresponds)
         assert len({np.round(np.ptp(axes.get_xlim()), 6) for axes in row}) == 1
     # The gap is drawn of the closed frame alone.
     assert [len(leaks(axes)) for axes in figure.axes] == [0, 1, 0, 0, 0, 0]
-
-
-def test_what_narrows_most_is_on_top(case) -> None:
-    axes = narrower_figure(case[0].details["narrower"]).axes[0]
-    widths = [bar.get_width() for bar in axes.patches]
-    # 0.71 and 0.5 over 0.8, in per cent; bars are counted from below.
-    assert widths == pytest.approx([88.75, 62.5])
 
 
 def test_positions_of_the_scene_are_rounded_and_in_single_precision(fields) -> None:
