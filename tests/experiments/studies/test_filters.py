@@ -1,25 +1,21 @@
-"""The study of all filters, on a valve that is computed in no time, and how a filter is named."""
+"""The study of all filters, on models that are computed in no time."""
 
-import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.common.building.filters import build_filter
 from experiments.common.config import plain
-from experiments.common.records.record import read_record
+from experiments.common.records.record import Mesh, read_record
 from experiments.run import main
-from experiments.studies.filters.findings import Findings
-from experiments.studies.filters.problem import (
-    ComparedProblem,
-    SurrogateModel,
-    TimedModel,
+from experiments.studies.filters import (
+    Problem,
+    SurrogateDesign,
+    figure,
     fit_to_prior,
+    summarised,
 )
-from experiments.studies.filters.settings import SurrogateDesign
-from experiments.studies.filters.study import _summary
 from mvest.errors import ConfigurationError
 from mvest.estimation import (
     EnsembleFilter,
@@ -27,54 +23,41 @@ from mvest.estimation import (
     Gaussian,
     MonteCarloFilter,
     Prediction,
-    SamplerSettings,
     UnscentedFilter,
 )
-from mvest.kept import Entry
+from mvest.reporting.style import BAD, GOOD
+from mvest.reporting.tables import table
 from tests.experiments.configured import composed
-from tests.experiments.studies.test_gate_study import SMALL
+from tests.experiments.studies.test_gate import SMALL
 
 SHORT = "{chains: 2, walkers: 8, steps: 60}"
 NAMES = ("E_f.anterior", "E_f.posterior")
-
-
-def filter_settings(name: str, *overrides: str) -> dict:
-    return plain(composed(f"filter={name}", *overrides))["filter"]
 
 
 @pytest.mark.parametrize(
     ("name", "overrides", "expected"),
     [
         ("extended", [], ExtendedFilter()),
-        ("unscented", ["filter.max_iterations=1"], UnscentedFilter(1e-3, 1)),
-        ("unscented", ["filter.spread=0.5"], UnscentedFilter(1e-3, 15, 0.5)),
-        ("ensemble", ["filter.ensemble.seed=5"], EnsembleFilter(24, 1, "square_root", 5)),
+        ("unscented", ["filter.method.max_iterations=1"], UnscentedFilter(1e-3, 1)),
+        ("unscented", ["filter.method.spread=0.5"], UnscentedFilter(1e-3, 15, 0.5)),
+        ("ensemble", ["+filter.method.seed=5"], EnsembleFilter(24, 1, "square_root", 5)),
         ("ensemble_smoother", [], EnsembleFilter(24, 4)),
-        (
-            "monte_carlo",
-            ["filter.monte_carlo.sampler.steps=99"],
-            MonteCarloFilter(sampler=SamplerSettings(steps=99)),
-        ),
+        ("monte_carlo", ["+filter.method.runs=20"], MonteCarloFilter(runs=20)),
     ],
 )
 def test_a_configured_filter_is_the_filter(name, overrides, expected) -> None:
-    found, transform, prior = build_filter(filter_settings(name, *overrides), NAMES)
+    settings = plain(composed(f"filter={name}", *overrides))["filter"]
+    found, transform, prior = build_filter(settings, NAMES)
     assert found == expected
     # Prior and coordinates are those of the iterated filter, so that results compare.
     assert prior.covariance[0, 0] == 9.0
     assert transform.forward(np.ones(2)).tolist() == [0.0, 0.0]
 
 
-def test_a_filter_that_does_not_exist_is_refused_with_those_that_do() -> None:
-    with pytest.raises(ConfigurationError, match="unscented, ensemble, monte_carlo"):
-        build_filter({**filter_settings("iterated"), "mode": "particle"}, NAMES)
-
-
-def made_up(model) -> ComparedProblem:
+def made_up(model) -> Problem:
     prior = Gaussian.from_variance(np.array([2.0, 3.0]), np.array([1.0, 0.81]))
-    return ComparedProblem(
-        "made_up", NAMES, TimedModel(model, list), prior, prior.mean, 0.1, 3, "none"
-    )
+    mesh = Mesh(sha256="none", nodes=1)
+    return Problem("made_up", NAMES, None, model, prior, prior.mean, 0.1, mesh)
 
 
 def quadratic(m):
@@ -87,41 +70,31 @@ def quadratic(m):
 DESIGN = SurrogateDesign(surrogate_runs=8, held_out=3, reach=3.0, degree=3, surrogate_seed=1)
 
 
-def test_a_surrogate_over_the_prior_is_a_model_of_the_parameters(tmp_path: Path) -> None:
-    problem = made_up(quadratic)
-    fitted = fit_to_prior(problem, DESIGN, tmp_path / "runs")
-    assert (fitted.runs, fitted.held_out, problem.model.runs) == (8, 3, 11)
-    assert fitted.largest_mm < 1e-10
+def test_a_surrogate_over_the_prior_is_a_model_of_the_parameters() -> None:
+    fitted = fit_to_prior(made_up(quadratic), DESIGN)
+    assert (fitted.about["runs"], fitted.about["held out"]) == (8, 3)
+    assert fitted.about["largest"] < 1e-10
     m = np.array([2.5, 2.0])
-    found, expected = fitted.model(m), quadratic(m)
+    found, expected = fitted(m), quadratic(m)
     np.testing.assert_allclose(found.y, expected.y, atol=1e-10)
     np.testing.assert_allclose(found.jacobian, expected.jacobian, atol=1e-9)
     # The standard deviation of the logarithms is 1/2 and 0.3; three of them are a factor 4.48.
-    assert fitted.model(np.array([8.9, 3.0])).converged
-    assert not fitted.model(np.array([9.0, 3.0])).converged
+    assert fitted(np.array([8.9, 3.0])).converged
+    assert not fitted(np.array([9.0, 3.0])).converged
 
 
-def test_runs_of_the_model_are_read_where_they_are(tmp_path: Path) -> None:
-    fit_to_prior(made_up(quadratic), DESIGN, tmp_path / "runs")
-    again = made_up(quadratic)
-    fitted = fit_to_prior(again, DESIGN, tmp_path / "runs")
-    assert again.model.runs == 0
-    assert isinstance(fitted.model, SurrogateModel)
-
-
-def test_an_error_of_the_surrogate_is_told(tmp_path: Path) -> None:
+def test_an_error_of_the_surrogate_is_told() -> None:
     # A cubic of the logarithms cannot follow |a|; held-out runs must say so.
     def kinked(m):
         a = np.log(m[0]) - np.log(2.0)
         return Prediction(np.abs([a, a]), np.array([[np.sign(a) / m[0], 0.0]] * 2))
 
-    fitted = fit_to_prior(made_up(kinked), DESIGN, tmp_path / "runs")
-    assert fitted.rms_mm > 0.02
+    assert fit_to_prior(made_up(kinked), DESIGN).about["rms"] > 0.02
 
 
-def test_a_model_that_fails_too_often_is_refused(tmp_path: Path) -> None:
+def test_a_model_that_fails_too_often_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="fails at too many of 11 points"):
-        fit_to_prior(made_up(lambda m: Prediction.failed("leaks")), DESIGN, tmp_path / "runs")
+        fit_to_prior(made_up(lambda m: Prediction.failed("leaks")), DESIGN)
 
 
 def test_coverage_counts_failures_as_misses() -> None:
@@ -129,12 +102,44 @@ def test_coverage_counts_failures_as_misses() -> None:
     held = (0.5 * one, 0 * one, one, 0.7 * one)
     missed = (0.5 * one, 0 * one, one, 1.5 * one)
     wide = (0.5 * one, -one, one, 0.7 * one)
-    repeats = _summary([held, missed, None, held], [wide] * 4, 2.0 * one)
+    found = summarised([held, missed, None, held], [wide] * 4, 2.0 * one)
     # Two of four hold; errors 0.2, 1, 0.2 times 2; half as wide as the reference.
-    assert repeats.coverage == (0.5,)
-    assert repeats.failed == 1
-    assert repeats.log_rms_error[0] == pytest.approx(2.0 * np.sqrt((0.04 + 1 + 0.04) / 3))
-    assert repeats.width_ratio == (0.5,)
+    assert found["coverage"] == 0.5
+    assert (found["repeats"], found["failed"]) == (4, 1)
+    assert found["rms error"][0] == pytest.approx(200.0 * np.sqrt((0.04 + 1 + 0.04) / 3))
+    assert found["repeats width ratio"] == 0.5
+    lost = summarised([None] * 2, [wide] * 2, one)
+    assert (lost["failed"], lost["coverage"]) == (2, None)
+
+
+class MadeUpResults:
+    """A reference of a logarithm 1.386 ± 0.1, and a filter beside it."""
+
+    def __init__(self, width: float) -> None:
+        same = {"problem": "p", "parameter": "E_f.anterior", "truth": 5.0}
+        low, high = (4.0 * np.exp(sign * width / 2) for sign in (-1, 1))
+        row = {**same, "filter": "iterated", "low": low, "high": high, "width ratio": width / 0.4}
+        by = {**same, "filter": "monte_carlo", "log mean": np.log(4.0), "log std": 0.1}
+        by |= {"low": 4.0 * np.exp(-0.2), "high": 4.0 * np.exp(0.2)}
+        self.tables = {"": table([row]), "reference": table([by])}
+
+    def table(self, name: str = ""):
+        return self.tables[name]
+
+
+@pytest.mark.parametrize(("width", "colour", "words"), [(0.42, GOOD, []), (0.48, BAD, ["+20 %"])])
+def test_every_filter_has_an_interval_on_that_of_the_draws(width, colour, words) -> None:
+    (axes,) = figure(MadeUpResults(width)).axes
+    # The truth, and the filter's interval and middle.
+    truth, interval, middle = axes.lines
+    assert truth.get_xdata()[0] == pytest.approx(np.log(5.0 / 4.0) / 0.1)
+    assert list(interval.get_xdata()) == pytest.approx([-width / 0.2, width / 0.2])
+    assert middle.get_xdata()[0] == pytest.approx(0.0, abs=1e-12)
+    assert {interval.get_color(), middle.get_color()} == {colour}
+    assert [text.get_text() for text in axes.texts] == words
+    (band,) = axes.patches
+    assert band.get_x() == pytest.approx(-2.0)
+    assert band.get_width() == pytest.approx(4.0)
 
 
 def test_the_study_runs_and_its_tables_follow_from_the_record(
@@ -147,13 +152,17 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
         *SMALL,
         "~filters.problems.chordae",
         "~filters.problems.rest_length",
-        "~filters.methods.paper",
         "~filters.methods.perturbed",
         "~filters.methods.smoother",
         "~filters.methods.importance",
         "filters.problems.moduli.noise_mm=0.05",
-        "filters.methods.ensemble.ensemble.members=6",
-        f"filters.methods.monte_carlo.monte_carlo.sampler={SHORT}",
+        "filters.methods.ensemble.members=6",
+        "filters.methods.paper.max_iterations=3",
+        "+filters.methods.monte_carlo.sampler._target_="
+        "mvest.estimation.filters.sampler.SamplerSettings",
+        "+filters.methods.monte_carlo.sampler.steps=60",
+        "+filters.methods.monte_carlo.sampler.walkers=8",
+        "+filters.methods.monte_carlo.sampler.chains=2",
         "filters.design.surrogate_runs=7",
         "filters.design.held_out=2",
         "filters.repeats=3",
@@ -162,37 +171,25 @@ def test_the_study_runs_and_its_tables_follow_from_the_record(
     ]
     monkeypatch.setattr(sys, "argv", arguments)
     assert main() == 0
-    record = read_record(tmp_path / "here" / "result.json", Findings)
-    (problem,) = record.findings.problems
-    found = problem.filters
+    record = read_record(tmp_path / "here" / "result.json")
     assert record.mesh is not None
     assert record.provenance.mesh_hash == record.mesh.sha256
-    assert list(found) == ["extended", "iterated", "unscented", "ensemble", "monte_carlo"]
+    found = {row["filter"]: row for row in record.table_of().rows if row["parameter"] == NAMES[0]}
+    assert list(found) == ["paper", "extended", "iterated", "unscented", "ensemble"]
     # What each costs is what the model was run: 2; 6 members and the estimate.
-    assert found["extended"].forward_solves == 2
-    check = found["iterated"].check
-    assert check is not None
-    assert check.holds
-    assert found["ensemble"].forward_solves == 7
-    assert all(0 < row.model_seconds <= row.seconds for row in found.values())
+    assert found["extended"]["runs"] == 2
+    assert found["iterated"]["check"] <= found["iterated"]["check limit"]
+    assert found["ensemble"]["runs"] == 7
     # Little is asked of so few draws: it is recorded that they are not enough.
-    assert not found["monte_carlo"].converged
-    assert problem.repeats["iterated"].runs == 3
+    by = record.table_of("reference").rows[0]
+    assert not by["ended"].startswith("converged")
+    assert (by["width ratio"], by["lower end off"]) == (1.0, 0.0)
+    assert found["iterated"]["repeats"] == 3
     # The unscented and the extended filter agree where the data are strong.
-    np.testing.assert_allclose(found["unscented"].log_mean, found["iterated"].log_mean, atol=0.01)
-    folder = tmp_path / "here"
-    assert {"filters.csv", "filters.md", "filters.png", "filters.pdf"} <= {
-        path.name for path in folder.iterdir()
-    }
-    said = capsys.readouterr().out
-    assert "iterated extended" in said
-    # The second run of the same reads what the first computed.
-    store = next((tmp_path / "outputs" / "filter_store").glob("moduli_iterated_*.json"))
-    changed = json.loads(store.read_text())
-    changed["detail"] = "from the store"
-    entry = Entry(store, lambda path: json.loads(path.read_text()))
-    entry.keep(changed, lambda path, value: path.write_text(json.dumps(value)))
-    monkeypatch.setattr(sys, "argv", [*arguments, "force=true"])
-    assert main() == 0
-    again = read_record(folder / "result.json", Findings).findings
-    assert again.problems[0].filters["iterated"].detail == "from the store"
+    shift = found["unscented"]["log mean"] - found["iterated"]["log mean"]
+    assert shift == pytest.approx(0.0, abs=0.01)
+    (surrogate,) = record.table_of("surrogate").rows
+    assert (surrogate["runs"], surrogate["held out"]) == (7, 2)
+    names = {path.name for path in (tmp_path / "here").iterdir()}
+    assert {"filters.csv", "filters.md", "filters.png", "filters_reference.csv"} <= names
+    assert "unscented" in capsys.readouterr().out

@@ -1,1 +1,0 @@
-"""All filters on the same problems."""
